@@ -1,0 +1,1 @@
+"""Rigid motions, device models, rays, triangulation and epipolar geometry."""

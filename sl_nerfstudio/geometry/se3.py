@@ -1,0 +1,132 @@
+"""Rigid motions SE(3) as 4x4 matrices, with exact behaviour at small angles.
+
+A pose `T_a_b` maps points of frame b to frame a: `p_a = transform(T_a_b, p_b)`.
+Tangent vectors are ordered `(v, w)`: three of translation, then three of rotation (radian).
+Every function takes any leading batch shape.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_SERIES_BELOW = 1e-2  # angle below which Taylor series replace the quotients
+
+
+def hat(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Skew-symmetric matrix of `w`: `hat(w) @ p = w x p`."""
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*w.shape[:-1], 3, 3)
+
+
+def _so3_coefficients(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(t)/t, (1 - cos(t))/t^2 and (t - sin(t))/t^3 of t = sqrt(theta2), smooth at 0."""
+    small = theta2 < _SERIES_BELOW**2
+    t2 = torch.where(small, torch.ones_like(theta2), theta2)
+    t = t2.sqrt()
+    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), t.sin() / t)
+    b = torch.where(
+        small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), (1 - t.cos()) / t2
+    )
+    c = torch.where(
+        small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)), (t - t.sin()) / (t2 * t)
+    )
+    return a, b, c
+
+
+def exp_so3(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation by |w| radian about w (Rodrigues)."""
+    a, b, _ = _so3_coefficients((w * w).sum(-1))
+    W = hat(w)
+    eye = torch.eye(3, dtype=w.dtype, device=w.device)
+    return eye + a[..., None, None] * W + b[..., None, None] * (W @ W)
+
+
+def log_so3(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector of `R`, angle in [0, pi]; by way of the unit quaternion, good near 0 and pi."""
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    candidates = torch.stack(  # each row is 4 q_i * q for one i: the one with the largest q_i is stable
+        [
+            torch.stack(
+                [1 + m00 + m11 + m22, R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+                -1,
+            ),
+            torch.stack(
+                [R[..., 2, 1] - R[..., 1, 2], 1 + m00 - m11 - m22, R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0]],
+                -1,
+            ),
+            torch.stack(
+                [R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] + R[..., 0, 1], 1 - m00 + m11 - m22, R[..., 2, 1] + R[..., 1, 2]],
+                -1,
+            ),
+            torch.stack(
+                [R[..., 1, 0] - R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2], 1 - m00 - m11 + m22],
+                -1,
+            ),
+        ],
+        dim=-2,
+    )
+    best = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    q = torch.gather(candidates, -2, index).squeeze(-2)
+    q = q / q.norm(dim=-1, keepdim=True)
+    q = torch.where(q[..., :1] < 0, -q, q)
+    real, v = q[..., 0], q[..., 1:]
+    s2 = (v * v).sum(-1)
+    small = s2 < 1e-10
+    s = torch.where(small, torch.ones_like(s2), s2).sqrt()
+    # theta / sin(theta / 2) = 2 atan2(s, w) / s -> 2 / w (1 - s^2 / (3 w^2))
+    safe = torch.where(small, real, torch.ones_like(real))
+    scale = torch.where(small, 2 / safe * (1 - s2 / (3 * safe**2)), 2 * torch.atan2(s, real) / s)
+    return scale[..., None] * v
+
+
+def exp_se3(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """Rigid motion of the twist `xi = (v, w)`."""
+    v, w = xi[..., :3], xi[..., 3:]
+    a, b, c = _so3_coefficients((w * w).sum(-1))
+    W = hat(w)
+    W2 = W @ W
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    R = eye + a[..., None, None] * W + b[..., None, None] * W2
+    V = eye + b[..., None, None] * W + c[..., None, None] * W2
+    return pose(R, (V @ v[..., None]).squeeze(-1))
+
+
+def log_se3(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """Twist `(v, w)` with `exp_se3(twist) = T`; the angle must be below pi."""
+    w = log_so3(T[..., :3, :3])
+    theta2 = (w * w).sum(-1)
+    a, b, _ = _so3_coefficients(theta2)
+    small = theta2 < _SERIES_BELOW**2
+    safe = torch.where(small, torch.ones_like(theta2), theta2)
+    coefficient = torch.where(
+        small, 1 / 12 + theta2 / 720 * (1 + theta2 / 42), (1 - a / (2 * b)) / safe
+    )
+    W = hat(w)
+    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    V_inverse = eye - 0.5 * W + coefficient[..., None, None] * (W @ W)
+    return torch.cat([(V_inverse @ T[..., :3, 3:]).squeeze(-1), w], -1)
+
+
+def pose(R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
+    """The 4x4 matrix of rotation `R` and translation `t`."""
+    top = torch.cat([R, t[..., None]], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)
+
+
+def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of a rigid motion, without a general matrix inversion."""
+    R_t = T[..., :3, :3].transpose(-1, -2)
+    return pose(R_t, -(R_t @ T[..., :3, 3:]).squeeze(-1))
+
+
+def transform(T: Float[Tensor, "*batch 4 4"], p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """`p_a` of `p_b` under `T_a_b`; batch shapes broadcast."""
+    return rotate(T, p) + T[..., :3, 3]
+
+
+def rotate(T: Float[Tensor, "*batch 4 4"], d: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Direction `d` turned by the rotation of `T`; batch shapes broadcast."""
+    return (T[..., :3, :3] * d[..., None, :]).sum(-1)

@@ -1,0 +1,70 @@
+"""Similarities Sim(3): uniform scale, rotation, translation; and their least-squares fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Maps `p_b` to `p_a = scale * R @ p_b + t`. Named `S_a_b`, as poses are."""
+
+    scale: float
+    R: Float[ndarray, "3 3"]
+    t: Float[ndarray, "3"]
+
+    @staticmethod
+    def identity() -> "Similarity":
+        """The map that changes nothing."""
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+
+    def points(self, p: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
+        """Points of frame b in frame a."""
+        return self.scale * p @ self.R.T + self.t
+
+    def poses(self, T: Float[ndarray, "*batch 4 4"]) -> Float[ndarray, "*batch 4 4"]:
+        """Rigid poses `T_b_device` as `T_a_device`: rotations are turned, positions are mapped."""
+        out = np.array(T, dtype=np.float64)
+        out[..., :3, :3] = self.R @ T[..., :3, :3]
+        out[..., :3, 3] = self.points(T[..., :3, 3])
+        return out
+
+    def inverse(self) -> "Similarity":
+        """`S_b_a`."""
+        return Similarity(1 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
+
+    def __matmul__(self, other: "Similarity") -> "Similarity":
+        """`S_a_c = S_a_b @ S_b_c`."""
+        return Similarity(self.scale * other.scale, self.R @ other.R, self.points(other.t))
+
+    def matrix(self) -> Float[ndarray, "4 4"]:
+        """The same map on homogeneous coordinates."""
+        out = np.eye(4)
+        out[:3, :3] = self.scale * self.R
+        out[:3, 3] = self.t
+        return out
+
+
+def fit_similarity(
+    source: Float[ndarray, "n 3"],
+    target: Float[ndarray, "n 3"],
+    with_scale: bool = True,
+    weights: Float[ndarray, "n"] | None = None,
+) -> Similarity:
+    """Least-squares map of `source` onto `target`, point by point (Umeyama, PAMI 1991, eq. 40 to 42).
+
+    Raises ValueError for fewer than three pairs.
+    """
+    if len(source) < 3 or source.shape != target.shape:
+        raise ValueError(f"a similarity needs at least 3 pairs of points, got {source.shape} and {target.shape}")
+    w = np.full(len(source), 1.0) if weights is None else weights
+    w = w / w.sum()
+    mean_s, mean_t = w @ source, w @ target
+    s, t = source - mean_s, target - mean_t
+    U, D, Vt = np.linalg.svd(t.T @ (w[:, None] * s))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = (U * sign) @ Vt
+    scale = float((D * sign).sum() / (w @ (s * s).sum(1))) if with_scale else 1.0
+    return Similarity(scale, R, mean_t - scale * R @ mean_s)

@@ -1,0 +1,70 @@
+"""Where a camera ray and a projector ray meet, and how well that is known."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sl_nerfstudio.geometry.devices import Intrinsics, project_jacobian
+from sl_nerfstudio.geometry.rays import pixel_rays
+from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
+
+_PARALLEL = 1e-12  # sin^2 of the angle between rays below which they have no meeting point
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points of correspondences, with what tells good ones from bad ones."""
+
+    p_world: Float[Tensor, "*batch 3"]  # midpoint of the rays' closest approach; NaN for parallel rays
+    depth_camera: Float[Tensor, "*batch"]  # distance along the unit camera ray; negative: behind the camera
+    depth_projector: Float[Tensor, "*batch"]  # the same along the projector ray
+    gap: Float[Tensor, "*batch"]  # length of the closest approach
+    sigma_depth: Float[Tensor, "*batch"]  # 1 sigma along the camera ray for 1 px of projector noise
+
+
+def closest_approach(
+    o1: Float[Tensor, "*batch 3"],
+    d1: Float[Tensor, "*batch 3"],
+    o2: Float[Tensor, "*batch 3"],
+    d2: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Distances along two lines (unit directions) of the points where they are nearest to each other.
+
+    Lines closer to parallel than 1e-6 rad give NaN.
+    """
+    between = o2 - o1
+    c = (d1 * d2).sum(-1)
+    b1, b2 = (between * d1).sum(-1), (between * d2).sum(-1)
+    denominator = 1 - c * c
+    denominator = denominator.where(denominator > _PARALLEL, denominator.new_tensor(float("nan")))
+    return (b1 - c * b2) / denominator, (c * b1 - b2) / denominator
+
+
+def triangulate(
+    camera: Intrinsics,
+    T_world_camera: Float[Tensor, "*batch 4 4"],
+    uv_camera: Float[Tensor, "*batch 2"],
+    projector: Intrinsics,
+    T_world_projector: Float[Tensor, "*batch 4 4"],
+    uv_projector: Float[Tensor, "*batch 2"],
+) -> Triangulation:
+    """Midpoints of camera rays and projector rays; differentiable in both poses.
+
+    `sigma_depth` is 1 / |d uv_projector / d depth|: how far along the camera ray the point moves
+    for one pixel of the projector; multiply by the coordinate noise in pixels.
+    """
+    o_c, d_c = pixel_rays(camera, T_world_camera, uv_camera)
+    o_p, d_p = pixel_rays(projector, T_world_projector, uv_projector)
+    s, t = closest_approach(o_c, d_c, o_p, d_p)
+    p_c, p_p = o_c + s[..., None] * d_c, o_p + t[..., None] * d_p
+    T_projector_world = inverse(T_world_projector)
+    jacobian = project_jacobian(projector, transform(T_projector_world, p_c))
+    slope = (jacobian * rotate(T_projector_world, d_c)[..., None, :]).sum(-1)
+    return Triangulation(
+        p_world=(p_c + p_p) / 2,
+        depth_camera=s,
+        depth_projector=t,
+        gap=(p_c - p_p).norm(dim=-1),
+        sigma_depth=1 / slope.norm(dim=-1).clamp_min(1e-12),
+    )
