@@ -1,0 +1,90 @@
+"""Multi-resolution feature grid: which table row belongs to which grid corner, and the module that owns the table.
+
+Points live in [-1, 1]^3. A level of resolution R has (R + 1)^3 corners. Levels whose corners fit into
+`2 ** log2_table_size` rows are indexed densely, finer ones are hashed (Müller et al., Instant Neural Graphics
+Primitives, 2022). All levels share one flat table, so that the optimiser sees a single parameter.
+
+All implementations follow the same rule at cell faces: `cell = clamp(floor(x), 0, R - 1)`.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+PRIMES = (1, 2654435761, 805459861)  # of the spatial hash; the first is 1, so neighbours along x share a cache line
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Where the levels of a feature grid lie in the table."""
+
+    resolutions: tuple[int, ...]
+    """Cells per axis of each level."""
+    offsets: tuple[int, ...]
+    """First row of each level in the table."""
+    sizes: tuple[int, ...]
+    """Rows of each level."""
+    hashed: tuple[bool, ...]
+    """Whether rows are found by hashing (size is then a power of two) instead of counting."""
+    features: int
+    """Numbers per row."""
+    smooth: bool = False
+    """Interpolate with smoothstep weights (Heo et al., ICML 2023) instead of linearly."""
+
+    @staticmethod
+    def build(
+        levels: int, min_resolution: int, max_resolution: int, features: int, log2_table_size: int, smooth: bool
+    ) -> "GridLayout":
+        """Levels growing geometrically from `min_resolution` to `max_resolution`.
+
+        Raises:
+            ValueError: there is no level, or the resolutions are not increasing.
+        """
+        if levels < 1 or features < 1 or not 1 <= min_resolution <= max_resolution:
+            raise ValueError(f"no such grid: {levels} levels, {min_resolution}..{max_resolution}, {features} features")
+        growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
+        resolutions = tuple(round(min_resolution * growth**level) for level in range(levels))
+        corners = [(r + 1) ** 3 for r in resolutions]
+        sizes = tuple(min(n, 2**log2_table_size) for n in corners)
+        offsets = tuple(sum(sizes[:level]) for level in range(levels))
+        hashed = tuple(size < n for size, n in zip(sizes, corners, strict=True))
+        return GridLayout(resolutions, offsets, sizes, hashed, features, smooth)
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return len(self.resolutions)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the whole table."""
+        return sum(self.sizes)
+
+    @property
+    def width(self) -> int:
+        """Length of an encoded point: levels times features."""
+        return self.levels * self.features
+
+
+class HashGrid(nn.Module):
+    """The table of a feature grid and the weights that fade its levels in."""
+
+    level_weights: Tensor
+
+    def __init__(self, layout: GridLayout):
+        super().__init__()
+        self.layout = layout
+        self.table = nn.Parameter(torch.empty(layout.rows, layout.features).uniform_(-1e-4, 1e-4))
+        self.register_buffer("level_weights", torch.ones(layout.levels))
+
+    def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
+        """Fade levels: 0 switches a level off, 1 is its full strength.
+
+        Raises:
+            ValueError: the number of weights is not that of the levels.
+        """
+        if weights.shape != self.level_weights.shape:
+            raise ValueError(f"{self.layout.levels} level weights wanted, got {tuple(weights.shape)}")
+        self.level_weights.copy_(weights)
