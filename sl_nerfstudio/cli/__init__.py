@@ -1,0 +1,1 @@
+"""Command lines: parsing only. Heavy imports belong inside the functions, so that `--help` is quick."""

@@ -1,0 +1,146 @@
+"""Image files of a scan: grey or RGB, 8 or 16 bit, read exactly as stored or not at all."""
+
+import struct
+import warnings
+import zlib
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
+from numpy import ndarray
+from PIL import Image
+
+from sl_nerfstudio.scan.file_error import FileError, read_bytes
+
+FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
+_LUMA = (0.299, 0.587, 0.114)  # Rec. 601
+_EXIF_ORIENTATION = 0x0112
+_DAMAGE = (
+    OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error, zlib.error
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What the head of an image file says; `mode` is "grey" or "RGB"."""
+
+    w: int
+    h: int
+    mode: str
+    bits: int
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Size and kind of an image, without decoding it. Raises FileError for kinds that a scan may not hold."""
+    return _open(path, read_bytes(path))[1]
+
+
+def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
+    """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit as stored.
+
+    Raises FileError for a file that is missing, damaged, cut short, not of a known format, turned by an EXIF tag, or has a
+    palette or transparency: nothing of that is repaired.
+    """
+    content = read_bytes(path)
+    image, header = _open(path, content)
+    try:
+        image.load()
+    except MemoryError as error:
+        raise FileError(path, "does not fit into memory", str(error) or "the image is huge", "use smaller images") from error
+    except _DAMAGE as error:
+        raise FileError(
+            path,
+            f"cannot be decoded ({error})",
+            "the file is cut short or damaged, as by a copy that was broken off or a full disk",
+            "copy or export this image again",
+        ) from error
+    if header.bits == 16 and header.mode == "RGB":
+        return _decode_deep_colour(path, content)
+    pixels = np.asarray(image)
+    return pixels.astype(np.uint16) if header.bits == 16 else pixels
+
+
+def as_grey(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Float32[ndarray, "h w"]:
+    """Intensity in [0, 1]: full scale of the integer type is 1; colours are weighted as Rec. 601 does."""
+    scaled = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    return scaled if scaled.ndim == 2 else scaled @ np.array(_LUMA, dtype=np.float32)
+
+
+def encode_png(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> bytes:
+    """A PNG file of a grey (h, w) or RGB (h, w, 3) image, 8 or 16 bit as given. Raises ValueError for other shapes."""
+    import cv2
+
+    if image.ndim != 2 and image.shape[2:] != (3,):
+        raise ValueError(f"an image must be (h, w) or (h, w, 3), got {image.shape}")
+    ordered = image if image.ndim == 2 else image[..., ::-1]
+    ok, content = cv2.imencode(".png", np.ascontiguousarray(ordered))
+    if not ok:
+        raise ValueError(f"cannot encode an image of shape {image.shape} and type {image.dtype}")
+    return content.tobytes()
+
+
+def _open(path: Path, content: bytes) -> tuple[Image.Image, ImageHeader]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(BytesIO(content), formats=FORMATS)
+            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise FileError(
+            path,
+            f"is far too large ({error})",
+            "not a capture: a damaged head, or a file made to exhaust memory",
+            "give images of less than 89 million pixels",
+        ) from error
+    except _DAMAGE as error:
+        raise FileError(
+            path,
+            "is no image that can be read",
+            f"its head is damaged, or it is not one of {', '.join(FORMATS)}",
+            "export it again, best as PNG",
+        ) from error
+    return image, ImageHeader(*image.size, *_kind(path, image, orientation))
+
+
+def _kind(path: Path, image: Image.Image, orientation: object) -> tuple[str, int]:
+    """"grey" or "RGB", and the bits a channel; FileError for every other kind of image."""
+    if orientation not in (0, 1):
+        raise FileError(
+            path,
+            f"is to be turned before it is shown (EXIF orientation {orientation})",
+            "a phone or camera wrote how it was held; some programs turn such pictures, others do not",
+            "turn the pixels and remove the tag (for example with `exiftran` or `mogrify -auto-orient`) before calibrating",
+        )
+    if getattr(image, "n_frames", 1) != 1:
+        raise FileError(
+            path, "holds several pictures", "an animation or a multi-page TIFF", "write each picture to a file of its own"
+        )
+    raw = str(image.tile[0][3]) if image.tile else ""
+    if image.mode in ("L", "RGB"):
+        return ("grey" if image.mode == "L" else "RGB"), (16 if ";16" in raw else 8)
+    if image.mode in ("I;16", "I;16B", "I;16L"):
+        return "grey", 16
+    names = {"P": "a colour palette", "RGBA": "transparency", "LA": "transparency", "PA": "transparency", "1": "one bit a pixel"}
+    raise FileError(
+        path,
+        f"is of a kind a scan may not hold ({names.get(image.mode, 'mode ' + image.mode)})",
+        "what such a pixel means as an intensity is not certain",
+        "save it as grey or RGB with 8 or 16 bits, without palette or transparency",
+    )
+
+
+def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
+    """16-bit RGB, which Pillow would cut down to 8 bit."""
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise FileError(
+            path,
+            "cannot be decoded as 16-bit RGB",
+            "an unusual variant of its format",
+            "save it as PNG, grey or RGB, with 8 or 16 bits",
+        )
+    return np.ascontiguousarray(pixels[..., ::-1])

@@ -1,0 +1,75 @@
+"""Is a matrix a pose: a rigid motion from device to world?"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, 0.01 % of scale does not go unseen
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong with a value, likely why, and what to do; the place is known to the caller."""
+
+    problem: str
+    cause: str
+    remedy: str
+
+
+def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
+    """The first reason why `T` is no rigid motion, None if it is one."""
+    if T.shape == (3, 4):
+        return Problem("is 3 x 4", "the last row was left out", "add the row 0, 0, 0, 1")
+    if T.shape != (4, 4):
+        size = " x ".join(map(str, T.shape)) or "one number"
+        return Problem(f"is {size} instead of 4 x 4", "another kind of matrix", "give the 4 x 4 matrix from device to world")
+    if not np.isfinite(T).all():
+        return Problem(
+            "holds NaN or infinity", "registration or calibration failed for this frame", "calibrate it again or leave the frame out"
+        )
+    if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
+        return _last_row_problem(T)
+    return _rotation_problem(T[:3, :3])
+
+
+def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
+    row = ", ".join(f"{x:g}" for x in T[3])
+    if np.abs(T[:, 3] - (0, 0, 0, 1)).max() < 1e-9:
+        return Problem(
+            f"has the last row {row} and the last column 0, 0, 0, 1",
+            "the matrix is transposed (stored column by column)",
+            "transpose it: the translation is the last column",
+        )
+    return Problem(
+        f"has the last row {row} instead of 0, 0, 0, 1",
+        "a projective or scaled matrix, or rows in another order",
+        "give a rigid motion from device to world",
+    )
+
+
+def _rotation_problem(R: Float64[ndarray, "3 3"]) -> Problem | None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = R.T @ R
+        determinant = float(np.linalg.det(R))
+    if np.abs(gram - np.eye(3)).max() <= TOLERANCE:
+        if determinant > 0:
+            return None
+        return Problem(
+            "mirrors (the determinant of its rotation is -1)",
+            "one axis was negated, or left-handed axes were used (as in Unity or DirectX)",
+            "convert to right-handed axes: device looks along -z, +x right, +y up",
+        )
+    scale = float(np.cbrt(abs(determinant)))
+    if scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= TOLERANCE:
+        return Problem(
+            f"is scaled: its rotation is {scale:.6g} times {'a mirroring' if determinant < 0 else 'a rotation'}",
+            "a similarity (with a scale or a change of unit in it) was stored as a pose",
+            "divide the upper left 3 x 3 block by its scale, and give positions in the scan's unit",
+        )
+    return Problem(
+        "has no rotation in its upper left 3 x 3 block: its columns are not unit vectors at right angles",
+        "rounded to few digits, sheared, or not a pose matrix",
+        "give the rotation with at least six digits",
+    )

@@ -1,0 +1,185 @@
+"""Writing a scan folder, one frame at a time."""
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan.atomic import require_empty, write_atomic
+from sl_nerfstudio.scan.coordinates import encode_coords
+from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.types import UNITS, PoseSigma, Scale
+
+FORMAT = 1
+_INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+class ScanWriter:
+    """Writes a scan folder (format 1) in a stream: frames as they come, transforms.json last.
+
+    Use it as a context manager; until its end the folder is no scan, and if an exception leaves the block, everything
+    written is removed again. Each file is written beside its place and renamed.
+
+        with ScanWriter(root, units="mm", scale=Scale(False), projector=device, pattern=pattern, camera=camera) as writer:
+            writer.add_frame("frame_00000", image=image, coords=coords, T_world_camera=..., T_world_projector=...)
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        *,
+        units: str,
+        scale: Scale,
+        projector: Device,
+        pattern: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"],
+        camera: Device | None = None,
+        extra: dict[str, Any] | None = None,
+    ) -> None:
+        """Start a folder at `root`, which must not exist or be empty (else UserError).
+
+        `camera` holds the intrinsics common to all frames; None: each frame brings its own. `pattern` has the
+        projector's size. `extra` holds further top-level keys of transforms.json.
+        """
+        require_empty(root)
+        if units not in UNITS:
+            raise ValueError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
+        if pattern.shape != (projector.h, projector.w):
+            raise ValueError(f"the pattern is {pattern.shape}, the projector {(projector.h, projector.w)}")
+        self.root = root
+        self._camera = camera
+        self._projector = projector
+        self._head: dict[str, Any] = {"sl_format": FORMAT, "units": units, **(device_fields(camera, "camera_model") if camera else {})}
+        self._head["projector"] = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
+        self._head["scale"] = {"known": scale.known, **({"source": scale.source} if scale.source else {})}
+        self._head.update(extra or {})
+        self._frames: list[dict[str, Any]] = []
+        self._truth: list[dict[str, Any]] = []
+        self._written: list[Path] = []
+        self._made: list[Path] = [p for p in (root, *root.parents) if not p.exists()]
+        self._write("pattern.png", encode_png(pattern))
+
+    def __enter__(self) -> "ScanWriter":
+        """The writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Write transforms.json, or, after an exception, remove everything again."""
+        if kind is None:
+            try:
+                self._finish()
+            except BaseException:
+                self._remove()
+                raise
+        else:
+            self._remove()
+
+    def add_frame(
+        self,
+        name: str,
+        *,
+        image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"],
+        coords: Float32[ndarray, "h w 2"] | None,
+        T_world_camera: Float[ndarray, "4 4"],
+        T_world_projector: Float[ndarray, "4 4"],
+        pattern: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"] | None = None,
+        mask: Bool[ndarray, "h w"] | None = None,
+        camera: Device | None = None,
+        pose_sigma: PoseSigma | None = None,
+        true_poses: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]] | None = None,
+        extra: dict[str, Any] | None = None,
+    ) -> None:
+        """Write one frame. `name` becomes the stem of its files; `true_poses` (camera, projector) go to ground_truth/.
+
+        `coords` is None only for captures that are still to be decoded: such a folder does not pass the check.
+        `camera` overrides the common intrinsics; `extra` holds further keys of the frame. Raises ValueError for
+        a name given twice, shapes that differ from the camera's, or a pose that is not a rigid motion.
+        """
+        device = camera or self._camera
+        if device is None:
+            raise ValueError("a frame without common intrinsics needs a camera of its own")
+        if any(f["file_path"] == f"images/{name}.png" for f in self._frames) or Path(name).name != name:
+            raise ValueError(f"frame name {name!r} was given before or is no file name")
+        for what, array in (("image", image), ("coords", coords), ("pattern", pattern), ("mask", mask)):
+            if array is not None and array.shape[:2] != (device.h, device.w):
+                raise ValueError(f"{what} of {name} is {array.shape[:2]}, the camera {(device.h, device.w)}")
+        frame: dict[str, Any] = {"file_path": self._write(f"images/{name}.png", encode_png(image))}
+        if pattern is not None:
+            frame["sl_pattern_path"] = self._write(f"patterns/{name}.png", encode_png(pattern))
+        if coords is not None:
+            frame["sl_coords_path"] = self._write(f"coords/{name}.npz", encode_coords(coords))
+        if mask is not None:
+            frame["mask_path"] = self._write(f"masks/{name}.png", encode_png(mask.astype(np.uint8) * np.uint8(255)))
+        if camera is not None:
+            frame.update(device_fields(camera, "camera_model"))
+        frame.update(pose_fields(T_world_camera, T_world_projector))
+        if pose_sigma is not None:
+            frame["sl_pose_sigma"] = sigma_fields(pose_sigma)
+        frame.update(extra or {})
+        self._frames.append(frame)
+        if true_poses is not None:
+            self._truth.append({**frame, **pose_fields(*true_poses)})
+
+    def add_file(self, path: str, content: bytes) -> None:
+        """Write another file, such as ground_truth/mesh.ply; `path` is relative to the folder."""
+        if Path(path).is_absolute() or ".." in Path(path).parts:
+            raise ValueError(f"{path!r} leaves the scan folder")
+        self._write(path, content)
+
+    def _write(self, path: str, content: bytes) -> str:
+        self._written.append(self.root / path)
+        write_atomic(self.root / path, content)
+        return path
+
+    def _finish(self) -> None:
+        if not self._frames:
+            raise UserError(f"{self.root}: no frame was written")
+        if self._truth:
+            truth = {k: v for k, v in self._head.items() if k != "sl_pose_sigma"}
+            frames = [{k: v for k, v in f.items() if k != "sl_pose_sigma"} for f in self._truth]
+            self._write("ground_truth/transforms.json", encode_json({**truth, "frames": frames}))
+        self._write("transforms.json", encode_json({**self._head, "frames": self._frames}))
+
+    def _remove(self) -> None:
+        """Remove what this writer wrote, and the folders it made, as far as the system allows."""
+        for path in self._written:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        below = {parent for path in self._written for parent in path.parents if self.root in parent.parents}
+        for folder in [*sorted(below, key=lambda p: -len(p.parts)), *self._made]:
+            with suppress(OSError):  # not empty: somebody else's files
+                folder.rmdir()
+
+
+def device_fields(device: Device, model_key: str) -> dict[str, Any]:
+    """A device as keys of transforms.json; `model_key` is "camera_model" or "model"."""
+    return {model_key: device.model, **{key: getattr(device, key) for key in _INTRINSICS}}
+
+
+def pose_fields(T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]) -> dict[str, Any]:
+    """Both poses of a frame as keys of transforms.json. Raises ValueError unless they are rigid motions."""
+    from sl_nerfstudio.scan.poses import pose_problem
+
+    fields: dict[str, Any] = {}
+    for key, T in (("transform_matrix", T_world_camera), ("projector_transform_matrix", T_world_projector)):
+        problem = pose_problem(np.asarray(T, dtype=np.float64))
+        if problem is not None:
+            raise ValueError(f"{key} {problem.problem}")
+        fields[key] = np.asarray(T, dtype=np.float64).tolist()
+    return fields
+
+
+def sigma_fields(sigma: PoseSigma) -> dict[str, float]:
+    """The value of `sl_pose_sigma`."""
+    return {key: float(getattr(sigma, key)) for key in sigma.__dataclass_fields__}
+
+
+def encode_json(document: dict[str, Any]) -> bytes:
+    """JSON text as UTF-8; raises ValueError for NaN and infinity, which JSON does not have."""
+    return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
