@@ -1,0 +1,172 @@
+"""The whole evaluation of one result: surface against truth, poses against truth, fit to the captures."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.evaluation.alignment import align_poses
+from sl_nerfstudio.evaluation.fit import Fit, FitAccumulator, FrameFit, FramePixels, fit_frames
+from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
+from sl_nerfstudio.evaluation.observed import observable
+from sl_nerfstudio.evaluation.poses import PoseErrors, compare_poses
+from sl_nerfstudio.evaluation.reference import MeshReference, Reference
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.progress import track
+from sl_nerfstudio.scan import Frame, Scan
+
+ALIGNMENTS = ("rigid", "similarity", "none")
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Camera and projector poses of all frames of a scan, device to world."""
+
+    T_world_camera: Float[ndarray, "n 4 4"]
+    T_world_projector: Float[ndarray, "n 4 4"]
+
+    def stacked(self) -> Float[ndarray, "m 4 4"]:
+        """Cameras, then projectors."""
+        return np.concatenate([self.T_world_camera, self.T_world_projector])
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything `sl-eval` finds; lengths in `units`."""
+
+    units: str
+    fit: Fit
+    reference: Reference | None
+    surface: dict[str, SurfaceScore]  # alignment -> score; empty without a reference
+    pose_errors: PoseErrors | None  # of the poses that were evaluated
+    initial_pose_errors: PoseErrors | None  # of the scan's own poses, where they are others
+
+
+def evaluate(
+    mesh: Mesh,
+    scan: Scan,
+    poses: Poses,
+    reference: Reference | None = None,
+    true_poses: Poses | None = None,
+    f_distances: Sequence[float] = (),
+    samples: int = 100_000,
+    seed: int = 0,
+    on_frame: Callable[[Frame, FrameFit, FramePixels], None] | None = None,
+) -> Evaluation:
+    """Evaluate `mesh` with `poses` on `scan`.
+
+    `on_frame` is called with each frame's pixels as they pass (for pictures). Raises UserError where the
+    mesh cannot belong to the scan.
+    """
+    surface = Surface(mesh)
+    fit = _fit(surface, scan, poses, on_frame)
+    scores: dict[str, SurfaceScore] = {}
+    if reference is not None:
+        scores = score_alignments(surface, reference, poses, true_poses, f_distances, samples, seed)
+    initial = Poses(scan.T_world_camera, scan.T_world_projector)
+    moved = not np.array_equal(initial.stacked(), poses.stacked())
+    return Evaluation(
+        units=scan.units,
+        fit=fit,
+        reference=reference,
+        surface=scores,
+        pose_errors=_pose_errors(poses, true_poses),
+        initial_pose_errors=_pose_errors(initial, true_poses) if moved else None,
+    )
+
+
+def score_alignments(
+    surface: Surface,
+    reference: Reference,
+    poses: Poses | None,
+    true_poses: Poses | None,
+    f_distances: Sequence[float] = (),
+    samples: int = 100_000,
+    seed: int = 0,
+) -> dict[str, SurfaceScore]:
+    """Scores under rigid ICP, under ICP with scale, and as is.
+
+    ICP starts from where the result lies and, with true poses, from the map that brings the estimated
+    devices onto the true ones; the better end counts.
+    """
+    points, _ = surface.sample(samples, seed)
+    distances = tuple(f_distances) or default_f_distances(reference.size)
+    scores = {}
+    for name in ALIGNMENTS:
+        S = Similarity.identity()
+        if name != "none":
+            with_scale = name == "similarity"
+            starts = [Similarity.identity()]
+            if poses is not None and true_poses is not None:
+                starts.append(align_poses(poses.stacked(), true_poses.stacked(), with_scale))
+            ends = [reference.align(surface, points, start, with_scale) for start in starts]
+            S = min(ends, key=lambda end: end.residual).S_target_source
+        scores[name] = score_surface(surface, points, reference, S, distances)
+    return scores
+
+
+def mesh_reference(mesh: Mesh, scan: Scan, poses: Poses, samples: int = 100_000, seed: int = 0) -> MeshReference:
+    """A true mesh with the part of it that `scan` could observe with `poses` (the true ones, if known)."""
+    surface = Surface(mesh)
+    points, normals = surface.sample(samples, seed + 1)
+    frames = (
+        (frame.camera, T_c, scan.projector, T_p)
+        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
+    )
+    seen = observable(points, normals, surface, frames)
+    if not seen.any():
+        raise UserError(
+            "no part of the reference mesh is both seen by a camera and lit by its projector\n"
+            f"    cause:  it is inside out, in another unit than the scan ({scan.units}), or in other axes\n"
+            "    remedy: give a mesh in the world axes and unit of transforms.json, triangles counter-clockwise "
+            "from outside"
+        )
+    return MeshReference(
+        surface,
+        points[seen],
+        f"true mesh; {seen.mean():.0%} of its area is seen by at least one camera while its projector lights it, "
+        "and only that part counts for completeness",
+    )
+
+
+def _fit(
+    surface: Surface,
+    scan: Scan,
+    poses: Poses,
+    on_frame: Callable[[Frame, FrameFit, FramePixels], None] | None,
+) -> Fit:
+    fit = FitAccumulator()
+    frames = fit_frames(surface, scan, poses.T_world_camera, poses.T_world_projector)
+    for frame, figures, pixels in track(frames, "ray casting the frames", total=len(scan.frames)):
+        fit.add(figures, pixels)
+        if on_frame is not None:
+            on_frame(frame, figures, pixels)
+    result = fit.result()
+    if not any(frame.hit_share > 0 for frame in result.frames):
+        raise UserError(_missed(surface, scan, poses))
+    return result
+
+
+def _missed(surface: Surface, scan: Scan, poses: Poses) -> str:
+    """Why no ray meets the mesh, as far as sizes and distances tell."""
+    distance = float(np.median(np.linalg.norm(poses.T_world_camera[:, :3, 3] - surface.centre, axis=1)))
+    return (
+        "no camera ray through a masked pixel meets the mesh\n"
+        f"    cause:  mesh and poses do not belong together: the mesh measures {surface.diagonal:.4g}, and the cameras "
+        f"stand {distance:.4g} from it (median; the scan's unit is {scan.units}); another unit, other axes or "
+        "another scan are likely\n"
+        "    remedy: give the mesh that was exported from this scan, in its unit and world axes"
+    )
+
+
+def _pose_errors(poses: Poses, true_poses: Poses | None) -> PoseErrors | None:
+    if true_poses is None:
+        return None
+    return compare_poses(
+        poses.T_world_camera, poses.T_world_projector, true_poses.T_world_camera, true_poses.T_world_projector
+    )

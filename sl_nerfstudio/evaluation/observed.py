@@ -1,0 +1,46 @@
+"""Which points of a true surface a scan could observe."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.se3 import inverse, transform
+
+
+def observable(
+    points: Float[ndarray, "m 3"],
+    normals: Float[ndarray, "m 3"],
+    surface: Surface,
+    frames: Iterable[tuple[Device, Float[ndarray, "4 4"], Device, Float[ndarray, "4 4"]]],
+) -> Bool[ndarray, "m"]:
+    """Whether at least one frame's camera sees a point while that frame's projector lights it.
+
+    Seen and lit mean: the surface faces the device, the point falls inside its image, and nothing of the
+    surface stands between. `frames` holds (camera, T_world_camera, projector, T_world_projector).
+    """
+    seen = np.zeros(len(points), bool)
+    for camera, T_world_camera, projector, T_world_projector in frames:
+        open_ = np.flatnonzero(~seen)
+        for device, T in ((camera, T_world_camera), (projector, T_world_projector)):
+            open_ = open_[faces_and_falls_inside(points[open_], normals[open_], device, T)]
+            open_ = open_[~surface.occluded(points[open_], T[:3, 3])]
+        seen[open_] = True
+    return seen
+
+
+def faces_and_falls_inside(
+    points: Float[ndarray, "m 3"], normals: Float[ndarray, "m 3"], device: Device, T_world_device: Float[ndarray, "4 4"]
+) -> Bool[ndarray, "m"]:
+    """Whether points with outward `normals` face the device and project into its image."""
+    T = torch.as_tensor(T_world_device, dtype=torch.float64)
+    p_device = transform(inverse(T), torch.as_tensor(points, dtype=torch.float64))
+    uv, in_front = project(Intrinsics.of(device, torch.float64), p_device)
+    x, y = uv.numpy().T
+    inside = (x >= 0) & (x < device.w) & (y >= 0) & (y < device.h)
+    facing = ((T_world_device[:3, 3] - points) * normals).sum(1) > 0
+    return in_front.numpy() & inside & facing

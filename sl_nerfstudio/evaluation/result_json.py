@@ -1,0 +1,68 @@
+"""The evaluation as JSON."""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.metrics import SurfaceScore
+from sl_nerfstudio.evaluation.poses import DeviceErrors, PoseErrors
+
+
+def to_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Plain dict for `json.dump`: figures that do not exist are null, blocks that do not exist are absent.
+
+    `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
+    errors of the evaluated poses and `initial` those of the scan's own; `fit` is always there.
+    """
+    out: dict[str, Any] = {"format": 1, "units": evaluation.units}
+    if evaluation.reference is not None:
+        out["reference"] = evaluation.reference.description
+    for name, score in evaluation.surface.items():
+        out[name] = _surface(score)
+    if evaluation.pose_errors is not None:
+        out |= _poses(evaluation.pose_errors)
+    if evaluation.initial_pose_errors is not None:
+        out["initial"] = _poses(evaluation.initial_pose_errors)
+    out["fit"] = asdict(evaluation.fit)
+    return _finite(out)
+
+
+def _surface(score: SurfaceScore) -> dict[str, Any]:
+    return {
+        "accuracy": asdict(score.accuracy),
+        "completeness": asdict(score.completeness),
+        "chamfer": score.chamfer,
+        "f_score": {f"{distance:g}": value for distance, value in score.f_score.items()},
+        "scale": score.scale,
+        "matrix": score.S_truth_result.matrix().tolist(),
+    }
+
+
+def _poses(errors: PoseErrors) -> dict[str, Any]:
+    return {
+        "camera": _device(errors.camera),
+        "projector": _device(errors.projector),
+        "relative": _device(errors.relative),
+        "scale_error": errors.scale_error,
+    }
+
+
+def _device(errors: DeviceErrors) -> dict[str, Any]:
+    return {
+        "translation_rmse": errors.translation_rmse,
+        "rotation_rmse_deg": errors.rotation_rmse_deg,
+        "translation": errors.translation.tolist(),
+        "rotation_deg": errors.rotation_deg.tolist(),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows neither NaN nor infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
