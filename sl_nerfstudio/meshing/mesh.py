@@ -1,0 +1,52 @@
+"""The mesh that every step of this folder hands to the next."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles, counter-clockwise as seen from outside."""
+
+    vertices: Float64[ndarray, "v 3"]
+    faces: Int64[ndarray, "f 3"]
+
+    def mapped(self, S_a_b: Similarity) -> "Mesh":
+        """The mesh of frame b in frame a."""
+        return Mesh(S_a_b.points(self.vertices), self.faces)
+
+    def with_vertices(self, keep: Bool[ndarray, "v"]) -> "Mesh":
+        """The triangles all of whose corners are kept, with the vertices that they use."""
+        return self.with_faces(keep[self.faces].all(1))
+
+    def with_faces(self, keep: Bool[ndarray, "f"]) -> "Mesh":
+        """The chosen triangles, with the vertices that they use."""
+        faces = self.faces[keep]
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[faces] = True
+        return Mesh(self.vertices[used], (np.cumsum(used) - 1)[faces])
+
+    def vertex_normals(self) -> Float64[ndarray, "v 3"]:
+        """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        out = np.stack(
+            [np.bincount(self.faces.ravel(), np.repeat(normal[:, k], 3), len(self.vertices)) for k in range(3)], -1
+        )
+        length = np.linalg.norm(out, axis=1, keepdims=True)
+        return out / np.where(length > 0, length, 1.0)
+
+    def face_areas(self) -> Float64[ndarray, "f"]:
+        """Area of each triangle."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+    def edge_length(self) -> float:
+        """Median length of an edge: the resolution of the mesh."""
+        a, b = self.vertices[self.faces[:, 0]], self.vertices[self.faces[:, 1]]
+        return float(np.median(np.linalg.norm(a - b, axis=1))) if len(self.faces) else 0.0

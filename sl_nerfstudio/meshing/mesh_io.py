@@ -1,0 +1,132 @@
+"""Meshes as files: PLY, OBJ, STL and GLB, chosen by the suffix."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.scan.atomic import write_atomic
+from sl_nerfstudio.scan.file_error import FileError, check_file
+
+SUFFIXES = (".ply", ".obj", ".stl", ".glb")
+MAX_TRIANGLES = 200_000_000  # about 10 GB once read
+
+
+def check_suffix(path: Path) -> str:
+    """The suffix in lower case. Raises UserError, naming the choices, if it is no known one."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(
+            f"{path}: {f'unknown kind of mesh file {path.suffix!r}' if suffix else 'the name of a mesh file needs a suffix'}\n"
+            f"    cause:  the suffix chooses the format\n    remedy: end the name in one of {', '.join(SUFFIXES)}"
+        )
+    return suffix
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh; `path` appears whole or not at all.
+
+    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. No axis is turned: GLB viewers
+    that expect y up show the world as it is. Raises UserError for an unknown suffix, a mesh without triangles, a
+    vertex that is not a number, or a place where writing is impossible.
+    """
+    suffix = check_suffix(path)
+    if len(mesh.faces) == 0:
+        raise UserError(
+            f"{path}: not written, the mesh has no triangles\n"
+            "    cause:  no surface was found, or nothing of it was observed by any frame\n"
+            "    remedy: look at the run in ns-viewer; sl-export --keep-unobserved writes the surface uncut"
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise UserError(
+            f"{path}: not written, {int((~np.isfinite(mesh.vertices)).any(1).sum())} vertices are not numbers\n"
+            "    cause:  the training diverged, or the scan's poses are broken\n"
+            "    remedy: check the scan with sl-check and train again"
+        )
+    write_atomic(path, _ply(mesh) if suffix == ".ply" else _by_trimesh(mesh, suffix))
+
+
+def _ply(mesh: Mesh) -> bytes:
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return header.encode("ascii") + mesh.vertices.astype("<f8").tobytes() + faces.tobytes()
+
+
+def _by_trimesh(mesh: Mesh, suffix: str) -> bytes:
+    import trimesh
+
+    content: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=suffix[1:])
+    return content.encode("utf-8") if isinstance(content, str) else content
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
+
+    Vertices at one place are welded only in STL, which cannot share them. Raises UserError if the file is missing, empty, broken, too
+    large, without triangles, refers to vertices that do not exist, or holds numbers that are none.
+    """
+    suffix = check_suffix(path)
+    check_file(path)
+    try:
+        vertices, faces = _load(path, suffix)
+    except MemoryError as error:
+        raise FileError(path, "does not fit into memory", "a huge or broken mesh", "decimate it, or export it again") from error
+    except Exception as error:  # every loader has its own ways to fail on a broken file
+        raise FileError(
+            path, f"cannot be read as {suffix[1:].upper()} ({_first_line(error)})", "the file is truncated, broken or of another kind",
+            "export or copy it again",
+        ) from error  # fmt: skip
+    return _checked(path, vertices, faces)
+
+
+def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
+    import trimesh
+
+    with path.open("rb") as stream:
+        loaded: Any = trimesh.load_scene(stream, file_type=suffix[1:], process=False)
+    parts = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
+    if not parts:
+        clouds = [g for g in loaded.geometry.values() if hasattr(g, "vertices")]
+        return (np.concatenate([np.asarray(c.vertices) for c in clouds]) if clouds else np.empty((0, 3))), np.empty((0, 3))
+    offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])
+    vertices = np.concatenate([np.asarray(p.vertices) for p in parts])
+    faces = np.concatenate([np.asarray(p.faces) + o for p, o in zip(parts, offsets[:-1], strict=True)])
+    if suffix == ".stl":
+        vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+        faces = index.reshape(-1)[faces]
+    return vertices, faces
+
+
+def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
+    again = "export it again from the program that made it"
+    if len(faces) == 0:
+        what = f"it holds {len(vertices)} points only" if len(vertices) else "it holds nothing"
+        raise FileError(path, f"has no triangles: {what}", "a point cloud, an empty result, or a truncated file", "give a surface mesh")
+    if len(faces) > MAX_TRIANGLES:
+        raise FileError(path, f"has {len(faces)} triangles", f"more than {MAX_TRIANGLES} are not supported", "decimate it first")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise FileError(
+            path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is broken", again
+        )
+    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+    bad = ~np.isfinite(vertices).all(1)
+    if bad.any():
+        raise FileError(
+            path, f"has {int(bad.sum())} vertices that are not numbers, the first is number {int(bad.argmax())}",
+            "it was written by a computation that failed", again,
+        )  # fmt: skip
+    if np.abs(vertices).max() > 1e12:
+        raise FileError(path, f"reaches out to {np.abs(vertices).max():.0e} units", "a broken file or a wrong unit", again)
+    return Mesh(vertices, faces)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0][:200]

@@ -1,0 +1,136 @@
+"""Cut a mesh to what the frames observed: the surface that closes unseen sides is an invention of the field."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from numpy import ndarray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.observe import Occluder, Votes, collect_votes
+from sl_nerfstudio.scan.types import Scan
+
+DENIALS_PER_CONFIRMATION = 2
+"""A vertex stays with one confirmation for every so many denials: wrong decodings are rare, and a frame with a bad pose denies much."""
+HOLE_SHARE, SPECK_SHARE = 1e-3, 1e-4
+"""Of the kept area: smaller gaps inside the observed surface stay closed, smaller pieces apart from it are dropped."""
+_SECOND_LOOK_SHARE = 1e-3  # denied vertices, of all, that are removed from the occluders before looking again
+
+
+@dataclass(frozen=True)
+class Trimmed:
+    """The observed part of a mesh, and why the rest is gone; counts of vertices."""
+
+    mesh: Mesh
+    total: int
+    unseen: int  # no frame saw them
+    denied: int  # frames saw something else there
+    closed: int  # kept although not observed: small gaps inside the observed surface
+    specks: int  # pieces (not vertices) that were too small, or that no frame confirmed
+    threshold_px: float  # median over the frames, see observe.LEAST_PX; NaN without any decoded coordinate
+
+
+def trim_to_observed(
+    mesh: Mesh,
+    scan: Scan,
+    T_world_camera: Float[ndarray, "n 4 4"] | None = None,
+    T_world_projector: Float[ndarray, "n 4 4"] | None = None,
+) -> Trimmed:
+    """Keep the triangles of a mesh in world units whose corners at least one frame observed.
+
+    A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask (within a pixel) and
+    inside the pattern, and whose predicted pattern coordinate is the decoded one, or where nothing was decoded.
+    Poses default to the scan's own; give the refined ones, in the order of the frames, if the mesh was made with them.
+    Raises UserError if nothing was observed.
+    """
+    T_camera = scan.T_world_camera if T_world_camera is None else T_world_camera
+    T_projector = scan.T_world_projector if T_world_projector is None else T_world_projector
+    votes = collect_votes(mesh, Occluder(mesh), scan, T_camera, T_projector)
+    denied = _denied(votes)
+    if denied.sum() > _SECOND_LOOK_SHARE * len(denied):
+        # What stands in front of the object without being there hid the object itself: look again without it.
+        without = mesh.with_vertices(~denied)
+        if len(without.faces):
+            votes = collect_votes(mesh, Occluder(without), scan, T_camera, T_projector)
+    observed = _observed(votes)
+    if not observed[mesh.faces].all(1).any():
+        raise UserError(_nothing_observed(votes))
+    keep = observed | _small_gaps(mesh, observed, votes)
+    kept = keep[mesh.faces].all(1)
+    specks, n_specks = _specks(mesh, kept, votes)
+    return Trimmed(
+        mesh=mesh.with_faces(kept & ~specks),
+        total=len(mesh.vertices),
+        unseen=int((votes.confirmed + votes.silent + votes.denied == 0).sum()),
+        denied=int(_denied(votes).sum()),
+        closed=int((keep & ~observed).sum()),
+        specks=n_specks,
+        threshold_px=float(np.nanmedian(votes.threshold_px)) if np.isfinite(votes.threshold_px).any() else float("nan"),
+    )
+
+
+def _observed(votes: Votes) -> Bool[ndarray, "v"]:
+    """Confirmed often enough; or seen, and denied by fewer frames than were silent."""
+    by_code = (votes.confirmed > 0) & (votes.denied <= DENIALS_PER_CONFIRMATION * votes.confirmed)
+    by_mask = (votes.confirmed == 0) & (votes.silent > votes.denied)
+    return by_code | by_mask
+
+
+def _denied(votes: Votes) -> Bool[ndarray, "v"]:
+    return ~_observed(votes) & (votes.denied > 0)
+
+
+def _edges(mesh: Mesh) -> Int64[ndarray, "e 2"]:
+    return np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+
+
+def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarray, "n"]]:
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    return int(count), label.astype(np.int64)
+
+
+def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[ndarray, "v"]:
+    """Vertices of small unobserved patches inside the observed surface, unless several frames deny them."""
+    edges = _edges(mesh)
+    gap = ~observed
+    count, label = _components(len(gap), edges[gap[edges].all(1)])
+    face_gap = gap[mesh.faces]
+    touched = face_gap.any(1)
+    face_label = np.where(face_gap, label[mesh.faces], -1).max(1)  # a triangle touches one patch: its corners are neighbours
+    areas = mesh.face_areas()
+    area = np.bincount(face_label[touched], areas[touched], count)
+    beside = np.zeros(count, dtype=bool)
+    mixed = edges[observed[edges[:, 0]] != observed[edges[:, 1]]]
+    beside[label[mixed[gap[mixed]]]] = True
+    members = np.bincount(label[gap], minlength=count)
+    several = np.bincount(label[gap], (votes.denied[gap] > 1).astype(float), count)
+    good = beside & (area < HOLE_SHARE * areas[~touched].sum()) & (several <= 0.5 * members)
+    return gap & good[label]
+
+
+def _specks(mesh: Mesh, kept: Bool[ndarray, "f"], votes: Votes) -> tuple[Bool[ndarray, "f"], int]:
+    """Kept triangles in pieces that are tiny or that no decoded coordinate confirms, and the number of such pieces."""
+    faces = mesh.faces[kept]
+    count, label = _components(len(mesh.vertices), np.concatenate([faces[:, :2], faces[:, 1:]]))
+    area = np.bincount(label[faces[:, 0]], mesh.face_areas()[kept], count)
+    confirmed = np.bincount(label, (votes.confirmed > 0).astype(float), count)
+    bad = area < SPECK_SHARE * area.sum()
+    if votes.confirmed.any():
+        bad |= confirmed == 0
+    pieces = np.unique(label[faces[:, 0]])
+    return kept & bad[label[mesh.faces[:, 0]]], int(bad[pieces].sum())
+
+
+def _nothing_observed(votes: Votes) -> str:
+    if (votes.denied > 0).any():
+        cause = "the predicted pattern coordinates are not the decoded ones: wrong poses, wrong axes, or an unfinished training"
+    else:
+        cause = "no vertex falls inside a mask while facing camera and projector: wrong poses or axes, or an unfinished training"
+    return (
+        f"no frame observed any part of the surface, so nothing is left of it\n    cause:  {cause}\n"
+        "    remedy: check the scan with sl-check, look at the run in ns-viewer; --keep-unobserved writes the surface uncut"
+    )

@@ -1,0 +1,91 @@
+"""Scans of a mesh made with nothing but the formulas of the scan format: the truth for trimming."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.scan import Frame, Scale, Scan, ScanWriter
+
+CAMERA = Device(w=96, h=96, fl_x=160.0, fl_y=160.0, cx=48.0, cy=48.0)
+PROJECTOR = Device(w=400, h=400, fl_x=800.0, fl_y=800.0, cx=200.0, cy=200.0)
+Change = Callable[[int, Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
+
+
+def look_at(eye: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)) -> Float[ndarray, "4 4"]:
+    """Pose of a device at `eye` that looks along its -z at `target`, +y as far up (world z) as it can."""
+    back = np.subtract(eye, target).astype(float)
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0] if abs(back[2]) < 0.99 else [0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
+    T[:3, 3] = eye
+    return T
+
+
+def pairs_around(count: int, elevation_deg: float, distance: float = 300.0, apart_deg: float = 20.0) -> list[tuple[ndarray, ndarray]]:
+    """Poses (camera, projector) on a circle about the z axis; both look at the origin, `apart_deg` apart."""
+    height, radius = distance * np.sin(np.radians(elevation_deg)), distance * np.cos(np.radians(elevation_deg))
+    poses = []
+    for angle in np.arange(count) * 2 * np.pi / count:
+        eyes = [(radius * np.cos(a), radius * np.sin(a), height) for a in (angle, angle + np.radians(apart_deg))]
+        poses.append((look_at(eyes[0]), look_at(eyes[1])))
+    return poses
+
+
+def scan_of(truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, change: Change | None = None) -> Scan:
+    """Write noise-free captures of `truth`, passed through `change(frame number, coords)`, and give them as a Scan."""
+    images = np.zeros((CAMERA.h, CAMERA.w), dtype=np.uint8)
+    pattern = np.zeros((PROJECTOR.h, PROJECTOR.w), dtype=np.uint8)
+    frames = []
+    with ScanWriter(
+        root, units="mm", scale=Scale(True, "test"), projector=PROJECTOR, pattern=pattern, camera=CAMERA
+    ) as writer:
+        for number, (T_camera, T_projector) in enumerate(poses):
+            coords, mask = captured(truth, T_camera, T_projector)
+            coords = coords if change is None else change(number, coords)
+            name = f"frame_{number:05d}"
+            writer.add_frame(
+                name, image=images, coords=coords, mask=mask, T_world_camera=T_camera, T_world_projector=T_projector
+            )
+            frames.append(
+                Frame(
+                    name, CAMERA, root / f"images/{name}.png", None, root / f"coords/{name}.npz",
+                    root / f"masks/{name}.png", T_camera, T_projector,
+                )  # fmt: skip
+            )
+    return Scan(root, "mm", Scale(True, "test"), PROJECTOR, root / "pattern.png", tuple(frames))
+
+
+def captured(
+    truth: Mesh, T_camera: Float[ndarray, "4 4"], T_projector: Float[ndarray, "4 4"]
+) -> tuple[Float[ndarray, "h w 2"], Bool[ndarray, "h w"]]:
+    """Pattern coordinates of each pixel, NaN where the pattern does not fall, and where it does."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(truth.vertices.astype(np.float32)), o3d.core.Tensor(truth.faces.astype(np.uint32)))
+    y, x = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
+    direction = np.stack(
+        [(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1
+    ) @ T_camera[:3, :3].T
+    origin = np.broadcast_to(T_camera[:3, 3], direction.shape)
+    depth = _cast(scene, origin, direction)
+    hit = np.isfinite(depth)
+    p_world = origin + np.where(hit, depth, 1.0)[..., None] * direction
+    p = (p_world - T_projector[:3, 3]) @ T_projector[:3, :3]
+    u = PROJECTOR.fl_x * p[..., 0] / -p[..., 2] + PROJECTOR.cx
+    v = -PROJECTOR.fl_y * p[..., 1] / -p[..., 2] + PROJECTOR.cy
+    light = T_projector[:3, 3] - p_world
+    lit = ~np.isfinite(_cast(scene, p_world + 1e-3 * light, light))
+    mask = hit & lit & (u >= 0) & (u < PROJECTOR.w) & (v >= 0) & (v < PROJECTOR.h)
+    return np.where(mask[..., None], np.stack([u, v], -1), np.nan).astype(np.float32), mask
+
+
+def _cast(scene: o3d.t.geometry.RaycastingScene, origin: ndarray, direction: ndarray) -> ndarray:
+    rays = np.concatenate([origin, direction], -1).astype(np.float32)
+    return scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()

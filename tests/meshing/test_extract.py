@@ -1,0 +1,180 @@
+"""Surfaces of analytic fields: closed, outward, on the zero level, at any resolution."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.meshing import sparse_grid
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.mesh import Mesh
+
+
+def sphere(p):
+    return p.norm(dim=-1) - 0.5
+
+
+def torus(p):
+    return torch.stack([p[:, :2].norm(dim=-1) - 0.55, p[:, 2]], -1).norm(dim=-1) - 0.2
+
+
+def box(p):
+    q = p.abs() - p.new_tensor([0.5, 0.25, 0.375])
+    return q.clamp_min(0).norm(dim=-1) + q.amax(-1).clamp_max(0)
+
+
+def solid(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+@pytest.mark.parametrize("resolution", [17, 64, 150])
+@pytest.mark.parametrize(
+    ("sdf", "euler", "volume"), [(sphere, 2, np.pi / 6), (torus, 0, 2 * np.pi**2 * 0.55 * 0.04), (box, 2, 0.375)]
+)
+def test_closed_analytic_surfaces(sdf, euler, volume, resolution):
+    mesh = extract_mesh(sdf, resolution)
+    h = 2 / resolution
+    closed = solid(mesh)
+    assert closed.is_watertight and closed.is_winding_consistent
+    assert closed.euler_number == euler
+    # Smooth: second order, beyond the 1e-3 of a cell that vertices keep from corners. A kink inside a cell: first order.
+    assert sdf(torch.from_numpy(mesh.vertices)).abs().max() < (0.3 * h if sdf is box else 0.25 * h * h + 1.1e-3 * h)
+    assert closed.volume == pytest.approx(volume, rel=2 * h if sdf is box else 12 * h * h)  # outward: positive
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+
+
+def test_error_falls_with_the_square_of_the_cell():
+    def rms(resolution: int, polish: int) -> float:
+        mesh = extract_mesh(torus, resolution, polish=polish)
+        middle = mesh.vertices[mesh.faces].mean(1)
+        return float(torus(torch.from_numpy(middle)).square().mean().sqrt())
+
+    assert 3.5 < rms(32, 1) / rms(64, 1) < 4.5
+    assert rms(64, 1) < 0.9 * rms(64, 0)
+
+
+def test_polish_puts_vertices_on_the_zero_level_of_the_field():
+    linear, polished = (
+        torus(torch.from_numpy(extract_mesh(torus, 48, polish=n).vertices)).square().mean().sqrt() for n in (0, 1)
+    )
+    assert polished < 0.1 * linear
+
+
+def test_same_vertices_as_dense_marching_cubes():
+    """Scikit-image on the full grid is an independent implementation; a smooth surface has no ambiguous cells."""
+
+    def shifted(p):
+        return torus(p - p.new_tensor([0.013, 0.007, 0.011]))
+
+    axis = torch.linspace(-1, 1, 41, dtype=torch.float64)
+    dense = shifted(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).float())
+    expected = marching_cubes(dense.reshape(41, 41, 41).numpy(), 0.0, spacing=(0.05,) * 3)[0] - 1
+    ours = extract_mesh(shifted, 40, polish=0).vertices
+    assert len(ours) == len(expected)
+    there, back = KDTree(expected).query(ours)[0], KDTree(ours).query(expected)[0]
+    assert max(there.max(), back.max()) < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_with_every_ambiguous_case_is_a_closed_surface(seed):
+    """A lattice of random signs meets all 256 cases; no edge may have other than two triangles."""
+    n = 24
+    value = torch.rand((n + 1,) * 3, generator=torch.Generator().manual_seed(seed)) - 0.5
+    for axis in range(3):
+        value.index_fill_(axis, torch.tensor([0, n]), 0.3)
+
+    def field(p):
+        grid = p.reshape(1, 1, 1, -1, 3)  # grid_sample takes (x, y, z) for the last, middle and first axis
+        return torch.nn.functional.grid_sample(value[None, None], grid, align_corners=True).reshape(-1)
+
+    mesh = extract_mesh(field, n, polish=0)
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2}
+    assert solid(mesh).is_winding_consistent and solid(mesh).volume > 0
+
+
+@pytest.mark.parametrize("factor", [0.2, 30.0])
+def test_a_field_that_is_no_distance_gives_the_same_surface(factor):
+    """Flat or steep, and steep only near the surface, where the coarse look-out cannot know it."""
+    steep = extract_mesh(lambda p: factor * torus(p), 48, polish=0)
+    late = extract_mesh(lambda p: torch.sign(torus(p)) * (torus(p).abs() * 50).clamp_max(0.5 + torus(p).abs()), 64, polish=0)
+    plain = extract_mesh(torus, 48, polish=0)
+    np.testing.assert_allclose(steep.vertices, plain.vertices, atol=1e-5)
+    assert solid(late).is_watertight and solid(late).euler_number == 0
+
+
+def test_surface_is_followed_out_of_the_blocks_that_were_found():
+    """Huge values everywhere except in one ball: only there is the surface found, the rest must be followed."""
+
+    def field(p):
+        near = (p - p.new_tensor([0.5, 0.0, 0.0])).norm(dim=-1) < 0.2
+        return torch.where(near, sphere(p), sphere(p).sign() * 10)
+
+    closed = solid(extract_mesh(field, 64, safety=0.05, polish=0))
+    assert closed.is_watertight and closed.euler_number == 2
+
+
+def test_a_box_that_is_no_cube_and_not_centred():
+    mesh = extract_mesh(lambda p: (p - p.new_tensor([3.0, 1.0, 0.2])).norm(dim=-1) - 0.15, 61, (2.0, 0.5, 0.0), (4.0, 1.5, 0.4))
+    assert solid(mesh).is_watertight and solid(mesh).euler_number == 2
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - [3.0, 1.0, 0.2], axis=1), 0.15, atol=1e-3)
+
+
+def test_a_surface_that_leaves_the_box_is_open_there_only():
+    mesh = extract_mesh(lambda p: p[:, 2] - 0.1 * torch.sin(3 * p[:, 0]), 40)
+    border = mesh.vertices[_border_vertices(mesh)]
+    assert len(border) > 100
+    np.testing.assert_allclose(np.abs(border[:, :2]).max(1), 1.0)
+
+
+def _border_vertices(mesh: Mesh) -> np.ndarray:
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    return np.unique(edges[count == 1])
+
+
+def test_only_points_near_the_surface_are_evaluated():
+    count = 0
+
+    def counted(p):
+        nonlocal count
+        count += len(p)
+        return sphere(p)
+
+    mesh = extract_mesh(counted, 256)
+    assert count < 0.06 * 256**3 and count < 12 * len(mesh.vertices)
+
+
+def test_field_gets_float32_points_inside_the_box_in_bounded_chunks():
+    def checked(p):
+        assert p.dtype == torch.float32 and p.abs().max() <= 1.0 and len(p) <= 1 << 18
+        return torus(p)[:, None]  # a column, as networks give it
+
+    extract_mesh(checked, 97)
+
+
+@pytest.mark.parametrize("sign", ["positive", "negative"])
+def test_no_surface_says_so(sign):
+    value = 0.7 if sign == "positive" else -0.7
+    with pytest.raises(UserError, match=rf"no zero level.*{sign} everywhere.*ns-viewer.*sl-check"):
+        extract_mesh(lambda p: torch.full_like(p[:, 0], value), 32)
+
+
+def test_not_a_number_says_so():
+    with pytest.raises(UserError, match=r"not a number at \d+ of \d+ points.*diverged"):
+        extract_mesh(lambda p: torch.where(p[:, 0] > 0.5, torch.nan, sphere(p)), 32)
+
+
+def test_a_field_that_is_zero_everywhere_is_refused_before_memory_runs_out(monkeypatch):
+    monkeypatch.setattr(sparse_grid, "MAX_LEAVES", 100_000)
+    with pytest.raises(UserError, match=r"is no surface yet.*--resolution"):
+        extract_mesh(lambda p: 1e-3 * torch.sin(500 * p).prod(-1), 256)
+
+
+@pytest.mark.parametrize("resolution", [-3, 0, 1])
+def test_resolution_must_be_at_least_two(resolution):
+    with pytest.raises(UserError, match=f"--resolution {resolution}: a mesh needs at least 2 cells"):
+        extract_mesh(sphere, resolution)
