@@ -43,4 +43,3 @@ def require_empty(root: Path) -> None:
     raise UserError(
         f"{root}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it yourself first"
     )
-

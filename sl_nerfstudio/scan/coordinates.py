@@ -5,9 +5,8 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BytesIO
+from io import BufferedIOBase, BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Float32
@@ -20,8 +19,16 @@ KEY = "coords"
 _MAX_MEMBERS = 64
 _EXPORT_AGAIN = "write it with numpy.savez_compressed(file, coords=array) from a float32 array of shape (H, W, 2)"
 _DAMAGE = (
-    OSError, ValueError, EOFError, RuntimeError, NotImplementedError, KeyError, SyntaxError, zipfile.BadZipFile, zlib.error
-)  # fmt: skip
+    OSError,
+    ValueError,
+    EOFError,
+    RuntimeError,
+    NotImplementedError,
+    KeyError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def read_coords_size(path: Path) -> tuple[int, int]:
@@ -51,7 +58,7 @@ def encode_coords(coords: Float32[ndarray, "h w 2"]) -> bytes:
 
 
 @contextmanager
-def _open_member(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
     """The .npy stream in `path` and its length in bytes; every damage becomes a FileError."""
     size = check_file(path)
     try:
@@ -92,7 +99,7 @@ def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
     return found[0]
 
 
-def _read_head(path: Path, stream: BinaryIO, size: int) -> tuple[int, int]:
+def _read_head(path: Path, stream: BufferedIOBase, size: int) -> tuple[int, int]:
     """Check the head of a .npy stream of `size` bytes in all; return (w, h)."""
     version = npy.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
@@ -107,7 +114,9 @@ def _read_head(path: Path, stream: BinaryIO, size: int) -> tuple[int, int]:
             _EXPORT_AGAIN,
         )
     if dtype.kind != "f" or dtype.itemsize != 4:
-        raise FileError(path, f"holds {dtype} instead of float32", "it was saved from an array of another type", _EXPORT_AGAIN)
+        raise FileError(
+            path, f"holds {dtype} instead of float32", "it was saved from an array of another type", _EXPORT_AGAIN
+        )
     if len(shape) != 3 or shape[2] != 2 or 0 in shape:
         cause = "the channels stand first" if len(shape) == 3 and shape[0] == 2 else "another kind of array"
         raise FileError(path, f"has the shape {shape} instead of (H, W, 2)", cause, _EXPORT_AGAIN)

@@ -37,7 +37,10 @@ def check_file(path: Path) -> int:
         )
     if status.st_size > MAX_FILE_BYTES:
         raise FileError(
-            path, f"is {status.st_size >> 30} GiB large", "not a file of a scan", "correct the path or write the file again"
+            path,
+            f"is {status.st_size >> 30} GiB large",
+            "not a file of a scan",
+            "correct the path or write the file again",
         )
     return status.st_size
 
@@ -48,6 +51,14 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise FileError(
-            path, f"cannot be read ({error.strerror})", "missing rights or a failing disk", "give yourself the right to read it"
-        ) from error
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: Path, error: OSError) -> FileError:
+    """The FileError of a file that exists but that the system does not let us read."""
+    return FileError(
+        path,
+        f"cannot be read ({error.strerror})",
+        "missing rights or a failing disk",
+        "give yourself the right to read it",
+    )

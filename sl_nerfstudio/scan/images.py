@@ -4,22 +4,41 @@ import struct
 import warnings
 import zlib
 from dataclasses import dataclass
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
+from PIL.ImageFile import ImageFile
+from PIL.PngImagePlugin import PngImageFile
 
-from sl_nerfstudio.scan.file_error import FileError, read_bytes
+from sl_nerfstudio.scan.file_error import FileError, check_file, read_bytes, unreadable
 
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
 _EXIF_ORIENTATION = 0x0112
+MAX_PIXELS = 89_000_000  # Pillow warns of decompression bombs a little above
+_OTHER_KINDS = {
+    "P": "a colour palette",
+    "RGBA": "transparency",
+    "LA": "transparency",
+    "PA": "transparency",
+    "1": "one bit a pixel",
+}
 _DAMAGE = (
-    OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error, zlib.error
-)  # fmt: skip
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    TypeError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True)
@@ -34,21 +53,27 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """Size and kind of an image, without decoding it. Raises FileError for kinds that a scan may not hold."""
-    return _open(path, read_bytes(path))[1]
+    check_file(path)
+    try:
+        with path.open("rb") as stream:
+            return _header(path, _open(path, stream))
+    except OSError as error:
+        raise unreadable(path, error) from error
 
 
 def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
     """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit as stored.
 
-    Raises FileError for a file that is missing, damaged, cut short, not of a known format, turned by an EXIF tag, or has a
-    palette or transparency: nothing of that is repaired.
+    Raises FileError for a file that is missing, damaged, cut short, not of a known format, turned by an EXIF tag, or
+    has a palette or transparency: nothing of that is repaired.
     """
     content = read_bytes(path)
-    image, header = _open(path, content)
+    image = _open(path, BytesIO(content))
+    header = _header(path, image)
     try:
         image.load()
     except MemoryError as error:
-        raise FileError(path, "does not fit into memory", str(error) or "the image is huge", "use smaller images") from error
+        raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
     except _DAMAGE as error:
         raise FileError(
             path,
@@ -56,9 +81,10 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
             "the file is cut short or damaged, as by a copy that was broken off or a full disk",
             "copy or export this image again",
         ) from error
+    _refuse_orientation(path, image)  # again: a PNG may carry the tag behind its pixels
     if header.bits == 16 and header.mode == "RGB":
         return _decode_deep_colour(path, content)
-    pixels = np.asarray(image)
+    pixels = np.array(image)
     return pixels.astype(np.uint16) if header.bits == 16 else pixels
 
 
@@ -81,18 +107,18 @@ def encode_png(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> b
     return content.tobytes()
 
 
-def _open(path: Path, content: bytes) -> tuple[Image.Image, ImageHeader]:
+def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
+    """The image with its head read, its pixels not yet."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(BytesIO(content), formats=FORMATS)
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+            return Image.open(stream, formats=FORMATS)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise FileError(
             path,
-            f"is far too large ({error})",
+            f"is far too large ({str(error).split(',')[0]})",
             "not a capture: a damaged head, or a file made to exhaust memory",
-            "give images of less than 89 million pixels",
+            f"give images of at most {MAX_PIXELS // 10**6} million pixels",
         ) from error
     except _DAMAGE as error:
         raise FileError(
@@ -101,34 +127,50 @@ def _open(path: Path, content: bytes) -> tuple[Image.Image, ImageHeader]:
             f"its head is damaged, or it is not one of {', '.join(FORMATS)}",
             "export it again, best as PNG",
         ) from error
-    return image, ImageHeader(*image.size, *_kind(path, image, orientation))
 
 
-def _kind(path: Path, image: Image.Image, orientation: object) -> tuple[str, int]:
-    """"grey" or "RGB", and the bits a channel; FileError for every other kind of image."""
+def _header(path: Path, image: ImageFile) -> ImageHeader:
+    """Size and kind; FileError for every kind that a scan may not hold."""
+    _refuse_orientation(path, image)
+    if getattr(image, "n_frames", 1) != 1:
+        raise FileError(
+            path,
+            "holds several pictures",
+            "an animation or a multi-page TIFF",
+            "write each picture to a file of its own",
+        )
+    raw = str(image.tile[0][3]) if image.tile else ""
+    transparent = "transparency" in image.info
+    if image.mode in ("L", "RGB") and not transparent:
+        return ImageHeader(*image.size, "grey" if image.mode == "L" else "RGB", 16 if ";16" in raw else 8)
+    if image.mode in ("I;16", "I;16B", "I;16L") and not transparent:
+        return ImageHeader(*image.size, "grey", 16)
+    what = _OTHER_KINDS.get(image.mode, "transparency" if transparent else f"mode {image.mode}")
+    raise FileError(
+        path,
+        f"is of a kind that a scan may not hold ({what})",
+        "what such a pixel means as an intensity is not certain",
+        "save it as grey or RGB with 8 or 16 bits, without palette or transparency",
+    )
+
+
+def _refuse_orientation(path: Path, image: ImageFile) -> None:
+    # PngImageFile.getexif() would decode the pixels to look for the tag behind them.
+    orientation: object = 1
+    if not isinstance(image, PngImageFile) or "exif" in image.info:
+        try:
+            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+        except _DAMAGE as error:
+            raise FileError(
+                path, f"has a damaged EXIF head ({error})", "a faulty program wrote it", "remove it"
+            ) from error
     if orientation not in (0, 1):
         raise FileError(
             path,
             f"is to be turned before it is shown (EXIF orientation {orientation})",
-            "a phone or camera wrote how it was held; some programs turn such pictures, others do not",
-            "turn the pixels and remove the tag (for example with `exiftran` or `mogrify -auto-orient`) before calibrating",
+            "a phone or camera noted how it was held; some programs turn such pictures, others do not",
+            "turn the pixels themselves and remove the tag, before calibrating",
         )
-    if getattr(image, "n_frames", 1) != 1:
-        raise FileError(
-            path, "holds several pictures", "an animation or a multi-page TIFF", "write each picture to a file of its own"
-        )
-    raw = str(image.tile[0][3]) if image.tile else ""
-    if image.mode in ("L", "RGB"):
-        return ("grey" if image.mode == "L" else "RGB"), (16 if ";16" in raw else 8)
-    if image.mode in ("I;16", "I;16B", "I;16L"):
-        return "grey", 16
-    names = {"P": "a colour palette", "RGBA": "transparency", "LA": "transparency", "PA": "transparency", "1": "one bit a pixel"}
-    raise FileError(
-        path,
-        f"is of a kind a scan may not hold ({names.get(image.mode, 'mode ' + image.mode)})",
-        "what such a pixel means as an intensity is not certain",
-        "save it as grey or RGB with 8 or 16 bits, without palette or transparency",
-    )
 
 
 def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:

@@ -1,21 +1,12 @@
 """Is a matrix a pose: a rigid motion from device to world?"""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.scan.problem import Problem
+
 TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, 0.01 % of scale does not go unseen
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What is wrong with a value, likely why, and what to do; the place is known to the caller."""
-
-    problem: str
-    cause: str
-    remedy: str
 
 
 def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
@@ -24,10 +15,14 @@ def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
         return Problem("is 3 x 4", "the last row was left out", "add the row 0, 0, 0, 1")
     if T.shape != (4, 4):
         size = " x ".join(map(str, T.shape)) or "one number"
-        return Problem(f"is {size} instead of 4 x 4", "another kind of matrix", "give the 4 x 4 matrix from device to world")
+        return Problem(
+            f"is {size} instead of 4 x 4", "another kind of matrix", "give the 4 x 4 matrix from device to world"
+        )
     if not np.isfinite(T).all():
         return Problem(
-            "holds NaN or infinity", "registration or calibration failed for this frame", "calibrate it again or leave the frame out"
+            "holds NaN or infinity",
+            "registration or calibration failed for this frame",
+            "calibrate it again or leave the frame out",
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         return _last_row_problem(T)

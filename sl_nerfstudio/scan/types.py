@@ -11,6 +11,8 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.images import as_grey, read_image
 
+FORMAT = 1  # of the scan folder
+
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "arbitrary": None}
 """Units of length a scan may be given in, and their length in metres (None: not known)."""
 

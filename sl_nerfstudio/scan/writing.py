@@ -15,9 +15,8 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
 from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.types import UNITS, PoseSigma, Scale
+from sl_nerfstudio.scan.types import FORMAT, UNITS, PoseSigma, Scale
 
-FORMAT = 1
 _INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -27,8 +26,8 @@ class ScanWriter:
     Use it as a context manager; until its end the folder is no scan, and if an exception leaves the block, everything
     written is removed again. Each file is written beside its place and renamed.
 
-        with ScanWriter(root, units="mm", scale=Scale(False), projector=device, pattern=pattern, camera=camera) as writer:
-            writer.add_frame("frame_00000", image=image, coords=coords, T_world_camera=..., T_world_projector=...)
+        with ScanWriter(root, units="mm", scale=Scale(False), projector=.., pattern=.., camera=..) as writer:
+            writer.add_frame("frame_00000", image=.., coords=.., T_world_camera=.., T_world_projector=..)
     """
 
     def __init__(
@@ -55,7 +54,11 @@ class ScanWriter:
         self.root = root
         self._camera = camera
         self._projector = projector
-        self._head: dict[str, Any] = {"sl_format": FORMAT, "units": units, **(device_fields(camera, "camera_model") if camera else {})}
+        self._head: dict[str, Any] = {
+            "sl_format": FORMAT,
+            "units": units,
+            **(device_fields(camera, "camera_model") if camera else {}),
+        }
         self._head["projector"] = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
         self._head["scale"] = {"known": scale.known, **({"source": scale.source} if scale.source else {})}
         self._head.update(extra or {})
@@ -69,7 +72,9 @@ class ScanWriter:
         """The writer itself."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Write transforms.json, or, after an exception, remove everything again."""
         if kind is None:
             try:

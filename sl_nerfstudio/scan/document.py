@@ -1,0 +1,144 @@
+"""transforms.json as text: strict JSON, UTF-8, every key once, every number finite."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sl_nerfstudio.scan.file_error import FileError, read_bytes
+from sl_nerfstudio.scan.problem import Faults, Problem
+
+MAX_BYTES = 256 << 20
+_TOO_DEEP = Problem("is nested too deeply", "not a description of a scan", "write the file again")
+_BOM = b"\xef\xbb\xbf"
+
+
+class Record(dict[str, Any]):
+    """A JSON object that remembers which of its keys stood there more than once."""
+
+    duplicates: tuple[str, ...] = ()
+
+
+def read_document(path: Path) -> Record:
+    """The object in a JSON file. Raises FileError if the file is missing or is not one JSON object.
+
+    Numbers may come back as NaN or infinity and keys may have stood there twice: `document_faults` lists those.
+    """
+    content = read_bytes(path)
+    if len(content) > MAX_BYTES:
+        raise FileError(path, f"is {len(content) >> 20} MiB large", "not a description of a scan", "correct the path")
+    if content.startswith(_BOM):
+        raise FileError(
+            path,
+            "starts with a byte-order mark",
+            "an editor saved it as 'UTF-8 with BOM'",
+            "save it as UTF-8 without BOM",
+        )
+    try:
+        document = json.loads(content.decode("utf-8"), object_pairs_hook=_record)
+    except UnicodeDecodeError as error:
+        raise FileError(
+            path,
+            f"is not UTF-8 (byte {error.start})",
+            "it was saved in another encoding, such as Latin-1 or UTF-16",
+            "save it as UTF-8",
+        ) from error
+    except RecursionError as error:
+        raise FileError(path, _TOO_DEEP.problem, _TOO_DEEP.cause, _TOO_DEEP.remedy) from error
+    except json.JSONDecodeError as error:
+        raise _syntax_error(path, content, error) from error
+    except ValueError as error:  # a number with thousands of digits
+        raise FileError(path, f"is no valid JSON ({error})", "a damaged number", "write the file again") from error
+    if not isinstance(document, Record):
+        raise FileError(
+            path,
+            f"holds {_name(document)} instead of an object",
+            "another kind of JSON file",
+            "a scan's transforms.json starts with { and has the keys of docs/scan-format.md",
+        )
+    return document
+
+
+def document_faults(document: Record, file: str, faults: Faults) -> None:
+    """Add every key given twice and every number that is not finite, wherever they stand."""
+    try:
+        for frame, key, problem in _walk(document, None, ""):
+            faults.add(problem, file, frame, key or None)
+    except RecursionError:
+        faults.add(_TOO_DEEP, file)
+
+
+def frame_label(record: Any, index: int) -> str:
+    """How a frame is named in messages: the stem of its image, else its number counted from 0."""
+    path = record.get("file_path") if isinstance(record, dict) else None
+    stem = Path(path).stem if isinstance(path, str) else ""
+    return stem or f"#{index}"
+
+
+def _record(pairs: list[tuple[str, Any]]) -> Record:
+    record = Record(pairs)
+    if len(record) != len(pairs):
+        keys = [key for key, _ in pairs]
+        record.duplicates = tuple(key for key in record if keys.count(key) > 1)
+    return record
+
+
+def _syntax_error(path: Path, content: bytes, error: json.JSONDecodeError) -> FileError:
+    problem = f"is no valid JSON ({error.msg} in line {error.lineno}, column {error.colno})"
+    rest = content.decode("utf-8")[error.pos :].strip()
+    if not content.strip():
+        return FileError(path, "is empty (white space only)", "writing it was broken off", "write it again")
+    if not rest or error.msg.startswith("Unterminated string"):
+        return FileError(
+            path, problem, "the file is cut short: writing or copying it was broken off", "write or copy it again"
+        )
+    return FileError(
+        path, problem, "a slip while editing: a missing or trailing comma, quote or bracket", "correct that line"
+    )
+
+
+def _walk(value: Any, frame: str | None, key: str) -> Iterator[tuple[str | None, str, Problem]]:
+    if isinstance(value, Record):
+        for twice in value.duplicates:
+            yield (
+                frame,
+                f"{key}.{twice}".lstrip("."),
+                Problem("stands there more than once", "a slip while editing or merging files", "keep the right one"),
+            )
+        for name, item in value.items():
+            if not key and frame is None and name == "frames" and isinstance(item, list):
+                for index, record in enumerate(item):
+                    yield from _walk(record, frame_label(record, index), "")
+            else:
+                yield from _walk(item, frame, f"{key}.{name}".lstrip("."))
+    elif isinstance(value, list):
+        bad = [number for number in _numbers(value) if not math.isfinite(number)]
+        if bad:
+            yield frame, key, _not_finite(bad[0])
+        elif any(isinstance(item, dict) for item in value):
+            for index, item in enumerate(value):
+                yield from _walk(item, frame, f"{key}[{index}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield frame, key, _not_finite(value)
+
+
+def _numbers(value: list[Any]) -> Iterator[float]:
+    for item in value:
+        if isinstance(item, list):
+            yield from _numbers(item)
+        elif isinstance(item, float):
+            yield item
+
+
+def _not_finite(number: float) -> Problem:
+    return Problem(
+        f"holds {number}, which is no number",
+        "registration or calibration failed here and its result was written all the same",
+        "calibrate again, or leave the frame out",
+    )
+
+
+def _name(value: Any) -> str:
+    kinds = {list: "a list", str: "a text", bool: "true or false", type(None): "null"}
+    return kinds.get(type(value), "a number")

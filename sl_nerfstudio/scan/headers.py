@@ -1,0 +1,92 @@
+"""Heads of the files of a scan: do they exist, are they of the right kind and size? Decodes nothing."""
+
+from pathlib import Path
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan.coordinates import read_coords_size
+from sl_nerfstudio.scan.draft import Draft, FrameDraft
+from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.images import read_header
+from sl_nerfstudio.scan.problem import Faults, Problem
+
+
+def check_headers(draft: Draft, faults: Faults) -> set[Path]:
+    """Add what the heads of all files tell; return the files that are worth decoding."""
+    good: set[Path] = set()
+    if draft.pattern_path is not None:
+        size = None if draft.projector is None else (draft.projector.w, draft.projector.h)
+        _check_image(draft.pattern_path, draft.root, None, size, True, "the projector", good, faults)
+    for frame in draft.frames:
+        _check_frame(frame, draft.root, good, faults)
+    return good
+
+
+def relative(path: Path, root: Path) -> str:
+    """How a file is named in messages: its path below the folder, with slashes."""
+    return path.relative_to(root).as_posix()
+
+
+def _check_frame(frame: FrameDraft, root: Path, good: set[Path], faults: Faults) -> None:
+    size = _size(frame.camera)
+    for key in ("file_path", "sl_pattern_path", "mask_path"):
+        if key in frame.paths:
+            _check_image(frame.paths[key], root, frame.name, size, key != "file_path", "the camera", good, faults)
+    path = frame.paths.get("sl_coords_path")
+    if path is None:
+        return
+    try:
+        found = read_coords_size(path)
+    except FileError as error:
+        faults.add(error, relative(path, root), frame.name)
+        return
+    if size is not None and found != size:
+        faults.add(_wrong_size(found, size, "the camera"), relative(path, root), frame.name)
+    else:
+        good.add(path)
+
+
+def _check_image(
+    path: Path,
+    root: Path,
+    frame: str | None,
+    size: tuple[int, int] | None,
+    grey_only: bool,
+    device: str,
+    good: set[Path],
+    faults: Faults,
+) -> None:
+    try:
+        header = read_header(path)
+    except FileError as error:
+        faults.add(error, relative(path, root), frame)
+        return
+    found = (header.w, header.h)
+    before = len(faults.found)
+    if size is not None and found != size:
+        faults.add(_wrong_size(found, size, device), relative(path, root), frame)
+    if grey_only and header.mode != "grey":
+        faults.add(
+            Problem("is in colour", "saved by a program that knows only RGB", "save it as grey, 8 or 16 bit"),
+            relative(path, root),
+            frame,
+        )
+    if len(faults.found) == before:
+        good.add(path)
+
+
+def _size(device: Device | None) -> tuple[int, int] | None:
+    return None if device is None else (device.w, device.h)
+
+
+def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:
+    if found == wanted[::-1]:
+        cause = "width and height are exchanged: it was turned, or w and h were"
+    elif found[0] * wanted[1] == found[1] * wanted[0]:
+        cause = "it was resized, or the intrinsics are those of another resolution"
+    else:
+        cause = "it was cropped, or belongs to another camera or scan"
+    return Problem(
+        f"is {found[0]} x {found[1]} pixels, but {device} has {wanted[0]} x {wanted[1]}",
+        cause,
+        "give the original file, or the intrinsics (w, h, fl_x, fl_y, cx, cy) that belong to this one",
+    )

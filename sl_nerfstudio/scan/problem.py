@@ -1,0 +1,28 @@
+"""What is wrong with a value, and the collection of everything that is wrong with a folder."""
+
+from dataclasses import dataclass, field
+
+from sl_nerfstudio.errors import Fault
+from sl_nerfstudio.scan.file_error import FileError
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong, likely why, and what to do; the place is known to the caller."""
+
+    problem: str
+    cause: str
+    remedy: str
+
+
+@dataclass
+class Faults:
+    """Collects the faults of one folder; each method adds one."""
+
+    found: list[Fault] = field(default_factory=list)
+
+    def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
+        """Add a problem at its place. `file` is relative to the folder; `key` is a field in it."""
+        fault = Fault(file, frame, key, problem.problem, problem.cause, problem.remedy)
+        if fault not in self.found:
+            self.found.append(fault)

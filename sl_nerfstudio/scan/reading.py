@@ -1,0 +1,23 @@
+"""Reading a scan folder."""
+
+from pathlib import Path
+
+from sl_nerfstudio.errors import ScanError
+from sl_nerfstudio.scan.draft import read_draft
+from sl_nerfstudio.scan.headers import check_headers
+from sl_nerfstudio.scan.problem import Faults
+from sl_nerfstudio.scan.types import Scan
+
+
+def read_scan(root: Path, need_coords: bool = True) -> Scan:
+    """The scan in a folder, after cheap checks: transforms.json, paths, poses, heads of all files; no pixel is decoded.
+
+    `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all faults found.
+    """
+    root = Path(root).absolute()
+    faults = Faults()
+    draft = read_draft(root, faults, need_coords)
+    check_headers(draft, faults)
+    if faults.found:
+        raise ScanError(faults.found, str(root))
+    return draft.complete()
