@@ -1,0 +1,1 @@
+"""The scan folder as nerfstudio sees it: cameras, normalised scene, pixels to train on."""

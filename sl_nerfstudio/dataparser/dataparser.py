@@ -1,0 +1,121 @@
+"""`sl-data`: a scan folder as nerfstudio's dataparser. Must not import datamanagers, trainer or methods."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from sl_nerfstudio.dataparser.normalise import normalisation
+from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import Scan, read_scan
+
+
+@dataclass
+class SLDataParserConfig(DataParserConfig):
+    """A scan folder: frames of a camera, each with a pattern projector (docs/scan-format.md)."""
+
+    _target: type = field(default_factory=lambda: SLDataParser)
+    data: Path = Path()
+    """The scan folder, or its transforms.json."""
+    downscale_factor: float | None = None
+    """Shrink whole images by this factor in evaluation, rendering and the viewer. Training sees every pixel."""
+
+
+@dataclass(frozen=True)
+class LoadedScan:
+    """A scan with what is computed from all of its pixels."""
+
+    scan: Scan
+    samples: PixelSamples
+    S_scene_world: Similarity
+
+
+@dataclass
+class SLDataParser(DataParser):
+    """Cameras in the normalised scene. All splits hold all frames: poses are refined, so every frame is needed.
+
+    What training never sees are small blocks of pixels in every frame (`held_out`).
+    """
+
+    config: SLDataParserConfig
+
+    def __init__(self, config: SLDataParserConfig) -> None:
+        super().__init__(config=config)
+        # An attribute, because nerfstudio overwrites it where it wants no images resized.
+        self.downscale_factor: float | None = config.downscale_factor
+
+    @property
+    def loaded(self) -> LoadedScan:
+        """The scan, its pixels and its normalisation. Raises UserError for a folder that cannot be used."""
+        return load_scan(self.config.data)
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: dict | None) -> DataparserOutputs:
+        scan, S = self.loaded.scan, self.loaded.S_scene_world
+        return DataparserOutputs(
+            image_filenames=[frame.image_path for frame in scan.frames],
+            cameras=scene_cameras(scan, S, self.downscale_factor),
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])),
+            metadata={"sl_scan": scan, "sl_S_scene_world": S},
+            dataparser_transform=torch.from_numpy(S.matrix()[:3] / S.scale).float(),
+            dataparser_scale=S.scale,
+        )
+
+
+def scene_cameras(scan: Scan, S_scene_world: Similarity, downscale_factor: float | None = None) -> Cameras:
+    """The scan's cameras in the normalised scene; `metadata["sl_view"]` is the number of the frame."""
+    poses = torch.from_numpy(S_scene_world.poses(scan.T_world_camera)[:, :3]).float()
+    devices = [frame.camera for frame in scan.frames]
+    distortion = _column(devices, "k1", "k2", "zero", "zero", "p1", "p2")
+    cameras = Cameras(
+        camera_to_worlds=poses,
+        fx=_column(devices, "fl_x"),
+        fy=_column(devices, "fl_y"),
+        cx=_column(devices, "cx"),
+        cy=_column(devices, "cy"),
+        width=_column(devices, "w").long(),
+        height=_column(devices, "h").long(),
+        distortion_params=distortion if bool((distortion != 0).any()) else None,
+        camera_type=CameraType.PERSPECTIVE,
+        metadata={"sl_view": torch.arange(len(devices))[:, None]},
+    )
+    if downscale_factor is not None and downscale_factor != 1:
+        cameras.rescale_output_resolution(1 / downscale_factor)
+    return cameras
+
+
+def _column(devices: list[Device], *names: str) -> torch.Tensor:
+    """The named intrinsics of every device, [n, names]."""
+    return torch.tensor([[float(getattr(device, name, 0.0)) for name in names] for device in devices])
+
+
+def scan_root(data: Path) -> Path:
+    """The scan folder, absolute, of what was given to `--data`: the folder or its transforms.json."""
+    data = Path(data).expanduser().absolute()
+    return data.parent if data.name == "transforms.json" else data
+
+
+_remembered: dict[tuple[Path, int], LoadedScan] = {}
+
+
+def load_scan(data: Path) -> LoadedScan:
+    """Read a scan with all of its pixels. The last one is remembered while its transforms.json is unchanged.
+
+    nerfstudio makes several dataparsers in one command; the pixels are read once.
+    """
+    root = scan_root(data)
+    scan = read_scan(root)
+    key = (root, (root / "transforms.json").stat().st_mtime_ns)
+    if key not in _remembered:
+        _remembered.clear()
+        samples = build_samples(scan)
+        _remembered[key] = LoadedScan(scan, samples, normalisation(scan, samples))
+    return _remembered[key]
+
+
+sl_data = DataParserSpecification(config=SLDataParserConfig(), description="A scan with a moving pattern projector")

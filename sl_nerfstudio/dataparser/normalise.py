@@ -1,0 +1,95 @@
+"""From the scan's world to the scene in which the field lives: object at 0, inside the unit sphere.
+
+The map is made from the triangulated points and from the first frame's orientation alone. Turn, shift or scale
+the world of a scan, and the normalised scene stays the same but for rounding.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from sl_nerfstudio.dataparser.samples import PixelSamples
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.scan import Scan
+
+OBJECT_RADIUS = 0.8  # of the scene's unit sphere; the rest is room for poses that are still wrong
+_POINTS_PER_FRAME = 1000
+_FEWEST_POINTS = 16
+_NEIGHBOURS = 8
+_LONELY = 4.0  # times the usual distance to the neighbours: a wrong decoding
+_INSIDE = 0.99  # share of the points that the object's sphere holds
+
+
+def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
+    """`S_scene_world`, with scene axes: x to the right of the first frame's camera, z up in its image, y into it.
+
+    Raises UserError where hardly any pixel triangulates.
+    """
+    points, tried = triangulated_points(scan, samples)
+    if len(points) < _FEWEST_POINTS:
+        raise UserError(
+            f"{scan.root / 'transforms.json'}: only {len(points)} of {tried} pixels have a camera ray and a projector "
+            "ray that meet in front of both devices. The poses are probably world-to-device instead of "
+            "device-to-world, or in OpenCV axes (turn them by diag(1, -1, -1, 1) on the right), or coords/ has x and y "
+            "swapped. Run sl-check on the folder."
+        )
+    centre, radius = enclosing_sphere(without_lonely(points))
+    scale = OBJECT_RADIUS / radius
+    R = _AXES @ scan.frames[0].T_world_camera[:3, :3].T
+    return Similarity(scale, R, -scale * R @ centre)
+
+
+_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # camera (right, up, back) to scene (x, y, z)
+
+
+def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarray, "n 3"], int]:
+    """World points of up to 1000 decoded pixels of each frame, and how many pixels were tried."""
+    points, tried = [], 0
+    for number, frame in enumerate(scan.frames):
+        pixels = samples.at(_evenly(samples, number))
+        decoded = pixels.decoded
+        count = int(decoded.sum())
+        tried += count
+        found = triangulate(
+            Intrinsics.of(frame.camera, torch.float64),
+            torch.from_numpy(frame.T_world_camera).expand(count, 4, 4),
+            pixels.uv[decoded].double(),
+            Intrinsics.of(scan.projector, torch.float64),
+            torch.from_numpy(frame.T_world_projector).expand(count, 4, 4),
+            pixels.coords[decoded].double(),
+        )
+        good = found.p_world.isfinite().all(-1) & (found.depth_camera > 0) & (found.depth_projector > 0)
+        points.append(found.p_world[good].numpy())
+    return np.concatenate(points), tried
+
+
+def _evenly(samples: PixelSamples, frame: int) -> Int[torch.Tensor, "n"]:
+    first, last = int(samples.first[frame]), int(samples.first[frame + 1])
+    return torch.linspace(first, last - 1, min(_POINTS_PER_FRAME, last - first), dtype=torch.float64).round().long()
+
+
+def without_lonely(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """Points whose neighbours are about as near as everybody's: wrong decodings scatter along their rays."""
+    distance, _ = KDTree(points).query(points, k=_NEIGHBOURS + 1)
+    distance = distance[:, -1]
+    return points[distance <= _LONELY * np.median(distance)]
+
+
+def enclosing_sphere(points: Float[ndarray, "n 3"], rounds: int = 300) -> tuple[Float[ndarray, "3"], float]:
+    """Centre and radius of a nearly smallest sphere around 99 % of the points.
+
+    Badoiu and Clarkson's iteration (SODA 2003) with the farthest point replaced by the one at the 99 % quantile.
+    Nothing in it depends on the axes.
+    """
+    centre = points.mean(0)
+    last = int(_INSIDE * (len(points) - 1))
+    for i in range(rounds):
+        distance = np.linalg.norm(points - centre, axis=1)
+        far = np.argpartition(distance, last)[last]
+        centre = centre + (points[far] - centre) / (i + 2)
+    return centre, float(np.quantile(np.linalg.norm(points - centre, axis=1), _INSIDE))

@@ -1,0 +1,36 @@
+"""Random pixels for a step of training or evaluation."""
+
+import torch
+
+from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
+
+_STRIDE = 1_000_003  # a prime, so that seeds of neighbouring runs do not share the batches of neighbouring steps
+
+
+class SLPixelSampler:
+    """Draws `num_rays_per_batch` pixels; nerfstudio's exporters set that number from outside.
+
+    The batch of a step depends on the seed and the step alone, so that a resumed run goes on as an uninterrupted one.
+    Asked twice for one step (as `ns-export pointcloud` does), it goes on drawing.
+    """
+
+    def __init__(self, samples: PixelSamples, num_rays_per_batch: int, held_out: bool) -> None:
+        """The seed is torch's, which nerfstudio sets from `--machine.seed` and the rank of the process."""
+        self.samples = samples
+        self.num_rays_per_batch = num_rays_per_batch
+        self.held_out = held_out
+        self._generator = torch.Generator(samples.device)
+        self._seed = torch.initial_seed() + int(held_out)
+        self._step: int | None = None
+
+    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
+        """Change the number of pixels of a batch."""
+        self.num_rays_per_batch = num_rays_per_batch
+
+    def sample(self, step: int) -> PixelBatch:
+        """Pixels for a step."""
+        if step != self._step:
+            self._step = step
+            self._generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+        index = self.samples.draw(self.num_rays_per_batch, self._generator, self.held_out)
+        return self.samples.at(index)

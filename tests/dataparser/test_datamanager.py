@@ -1,0 +1,243 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from tiny_scan import CAMERA, TinyScan
+
+from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
+from sl_nerfstudio.errors import ScanError, UserError
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.se3 import inverse, transform
+
+# nerfstudio's Cameras index in a way that torch has deprecated
+pytestmark = pytest.mark.filterwarnings("ignore:Using a non-tuple sequence for multidimensional indexing:UserWarning")
+
+SKEWED = Device(w=48, h=40, fl_x=90.0, fl_y=92.0, cx=23.0, cy=21.0, k1=-0.2, k2=0.05, p1=0.003, p2=-0.002)
+
+
+def manager(root: Path, **settings: Any) -> SLDataManager:
+    torch.manual_seed(42)
+    return SLDataManagerConfig(data=root, **settings).setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+
+
+@pytest.fixture(scope="module")
+def datamanager(tiny_root: Path) -> SLDataManager:
+    return manager(tiny_root, train_num_rays_per_batch=200)
+
+
+def test_batch_belongs_to_its_rays(datamanager: SLDataManager) -> None:
+    """Independent of the samples: the sphere is hit where the coordinates say, read from the files."""
+    rays, batch = datamanager.next_train(0)
+    loaded = datamanager.dataparser.loaded
+    assert {k: tuple(v.shape) for k, v in batch.items()} == {
+        "indices": (200, 3),
+        "coords": (200, 2),
+        "decoded": (200, 1),
+        "pattern": (200, 1),
+        "image": (200, 3),
+        "mask": (200, 1),
+    }
+    for i in range(0, 200, 7):
+        number, row, column = batch["indices"][i].tolist()
+        frame = loaded.scan.frames[number]
+        np.testing.assert_array_equal(batch["coords"][i].numpy(), frame.read_coords()[row, column])
+        assert batch["decoded"][i, 0] == np.isfinite(frame.read_coords()[row, column]).all()
+        assert batch["pattern"][i, 0].item() == pytest.approx(frame.read_pattern()[row, column], rel=1e-3)
+        assert rays.metadata["sl_view"][i].tolist() == [number]
+        assert rays.metadata["sl_uv"][i].tolist() == [column + 0.5, row + 0.5]
+        # the ray, taken back to the world and into the camera, ends at the pixel's centre
+        p_world = loaded.S_scene_world.inverse().points((rays.origins[i] + 0.7 * rays.directions[i]).double().numpy())
+        p_camera = transform(inverse(torch.from_numpy(frame.T_world_camera)), torch.from_numpy(p_world))
+        uv, in_front = project(Intrinsics.of(frame.camera, torch.float64), p_camera)
+        assert in_front
+        np.testing.assert_allclose(uv.numpy(), [column + 0.5, row + 0.5], atol=1e-3)
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(200))
+
+
+@pytest.mark.parametrize("camera", [CAMERA, SKEWED])
+def test_rays_are_nerfstudios_rays(tmp_path: Path, camera: Device) -> None:
+    """The training rays equal those of nerfstudio's Cameras, which evaluation, rendering and exports use."""
+    m = manager(TinyScan(camera=camera).write(tmp_path / "scan"))
+    rays, batch = m.next_train(0)
+    frame, row, column = batch["indices"].unbind(-1)
+    stock = m.train_dataset.cameras.generate_rays(frame[:, None], torch.stack([row, column], -1) + 0.5)
+    torch.testing.assert_close(rays.origins, stock.origins, rtol=0, atol=1e-6)
+    torch.testing.assert_close(rays.directions, stock.directions, rtol=0, atol=2e-6)
+    torch.testing.assert_close(rays.metadata["sl_view"], stock.metadata["sl_view"])
+    # the solid angle of a pixel, to the order of magnitude that the lens distorts it
+    torch.testing.assert_close(rays.pixel_area, stock.pixel_area, rtol=0.3, atol=0)
+
+
+def test_training_and_evaluation_pixels_are_disjoint(datamanager: SLDataManager) -> None:
+    trained = {tuple(p) for step in range(60) for p in datamanager.next_train(step)[1]["indices"].tolist()}
+    held = {tuple(p) for step in range(5) for p in datamanager.next_eval(step)[1]["indices"].tolist()}
+    of_frames = {tuple(p) for f in range(3) for p in datamanager.held_out_batch(f, 10**6)[1]["indices"].tolist()}
+    assert held and held <= of_frames and not (trained & of_frames)
+    items = [datamanager.eval_dataset[i]["held_out"] for i in range(3)]
+    assert of_frames == {(i, *p) for i, item in enumerate(items) for p in item[..., 0].nonzero().tolist()}
+
+
+def test_held_out_batch_is_thinned_evenly(datamanager: SLDataManager) -> None:
+    for frame in range(3):
+        everything = datamanager.held_out_batch(frame, 10**6)[1]["indices"]
+        few = datamanager.held_out_batch(frame, 5)[1]["indices"]
+        assert len(few) == min(5, len(everything))
+        if len(everything) > 5:
+            assert few[0].tolist() == everything[0].tolist() and few[-1].tolist() == everything[-1].tolist()
+
+
+def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
+    one, other = manager(tiny_root), manager(tiny_root)
+    for step in range(3):
+        one.next_train(step)
+    assert torch.equal(one.next_train(7)[1]["indices"], other.next_train(7)[1]["indices"])
+    # asked again for the same step, as ns-export pointcloud does, there are new pixels
+    assert not torch.equal(other.next_train(7)[1]["indices"], one.next_train(8)[1]["indices"])
+    first = one.next_train(9)[1]["indices"]
+    assert not torch.equal(first, one.next_train(9)[1]["indices"])
+
+
+def test_exporters_set_the_number_of_rays_from_outside(tiny_root: Path) -> None:
+    m = manager(tiny_root)
+    m.train_pixel_sampler.num_rays_per_batch = 5000  # more than there are pixels in a frame
+    assert m.get_train_rays_per_batch() == 5000
+    assert len(m.next_train(0)[0]) == 5000
+
+
+def test_every_split_holds_all_frames_with_their_numbers(datamanager: SLDataManager) -> None:
+    for dataset in (datamanager.train_dataset, datamanager.eval_dataset):
+        assert dataset.cameras.metadata is not None
+        assert dataset.cameras.metadata["sl_view"].tolist() == [[0], [1], [2]]
+        assert len(dataset) == 3
+    for i, (camera, batch) in enumerate(datamanager.fixed_indices_eval_dataloader):
+        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
+        assert (rays.metadata["sl_view"] == i).all() and rays.metadata["sl_view"].shape == (40, 48, 1)
+        assert batch["image_idx"] == i
+
+
+def test_whole_frames(datamanager: SLDataManager) -> None:
+    frame = datamanager.dataparser.loaded.scan.frames[1]
+    item = datamanager.eval_dataset[1]
+    shapes = {k: tuple(v.shape) for k, v in item.items() if k != "image_idx"}
+    channels = {"image": 3, "coords": 2, "pattern": 1, "mask": 1, "decoded": 1, "held_out": 1}
+    assert shapes == {k: (40, 48, c) for k, c in channels.items()}
+    np.testing.assert_array_equal(item["coords"].numpy(), frame.read_coords())
+    np.testing.assert_array_equal(item["mask"][..., 0].numpy(), frame.read_mask())
+    np.testing.assert_array_equal(item["pattern"][..., 0].numpy(), frame.read_pattern())
+    np.testing.assert_allclose(item["image"][..., 1].numpy() * 255, frame.read_image(), atol=1e-4)
+
+
+@pytest.mark.parametrize("bits, channels", [(8, 1), (8, 3), (16, 1)])
+def test_images_of_any_depth_and_colour(tmp_path: Path, bits: int, channels: int) -> None:
+    root = TinyScan().write(tmp_path / "scan")
+    rng = np.random.default_rng(0)
+    top = 2**bits - 1
+    stored = rng.integers(0, top + 1, (40, 48, channels) if channels == 3 else (40, 48)).astype(f"uint{bits}")
+    stored.flat[:2] = 0, top
+    Image.fromarray(stored).save(root / "images/frame_00002.png")
+    item = manager(root).train_dataset.get_data(2)["image"]
+    expected = np.broadcast_to(stored.reshape(40, 48, -1) / top, (40, 48, 3))
+    np.testing.assert_allclose(item.numpy(), expected, atol=1e-6)
+    as_bytes = manager(root).train_dataset.get_numpy_image(2)
+    np.testing.assert_array_equal(as_bytes, np.round(expected * 255).astype(np.uint8))
+
+
+def test_downscaled_frames_keep_their_pixels_coordinates(tiny_root: Path) -> None:
+    config = SLDataManagerConfig(data=tiny_root)
+    assert isinstance(config.dataparser, SLDataParserConfig)
+    config.dataparser.downscale_factor = 2.0
+    m = config.setup(device="cpu", test_mode="test", world_size=1, local_rank=0)
+    item, cameras = m.eval_dataset[0], m.eval_dataset.cameras
+    assert item["image"].shape == (20, 24, 3) and item["coords"].shape == (20, 24, 2)
+    assert (int(cameras.height[0]), int(cameras.width[0]), float(cameras.fx[0])) == (20, 24, 45.0)
+    # nearest pixel: at most half a pixel of the full image away
+    full = m.dataparser.loaded.scan.frames[0].read_coords()
+    np.testing.assert_array_equal(item["coords"].numpy(), full[1::2, 1::2])
+    # training still sees the full resolution
+    assert int(m.next_train(0)[1]["indices"][:, 2].max()) > 24
+
+
+def test_world_coordinates_come_back_through_nerfstudios_transform(datamanager: SLDataManager) -> None:
+    loaded = datamanager.dataparser.loaded
+    poses = datamanager.train_dataparser_outputs.transform_poses_to_original_space(
+        datamanager.train_dataset.cameras.camera_to_worlds, camera_convention="opengl"
+    )
+    np.testing.assert_allclose(poses.numpy(), loaded.scan.T_world_camera[:, :3], atol=1e-3)
+
+
+def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
+    m = manager(tiny_root)
+    before, _ = m.next_train(0)
+    assert "sl_refined" not in before.metadata
+    T = torch.eye(4).repeat(3, 1, 1)
+    T[:, :3] = m.train_dataset.cameras.camera_to_worlds
+    T[:, 0, 3] += 0.125
+    m.stand_at(T)
+    rays, batch = m.next_train(0)
+    frame = batch["indices"][:, 0]
+    assert rays.metadata["sl_refined"].all()
+    torch.testing.assert_close(rays.origins, T[frame, :3, 3])
+    holders = (
+        m.train_dataset,
+        m.eval_dataset,
+        m.train_dataparser_outputs,
+        m.eval_dataset._dataparser_outputs,
+        m.fixed_indices_eval_dataloader,
+        m.eval_dataloader,
+    )
+    for holder in holders:
+        torch.testing.assert_close(holder.cameras.camera_to_worlds, T[:, :3])
+        assert holder.cameras.generate_rays(0).metadata["sl_refined"].all()
+    camera, _ = next(iter(m.fixed_indices_eval_dataloader))
+    assert camera.metadata is not None and camera.metadata["sl_refined"].tolist() == [[True]]
+
+
+def test_own_intrinsics_of_a_frame(tmp_path: Path) -> None:
+    root = TinyScan().write(tmp_path / "scan")
+    content = json.loads((root / "transforms.json").read_text())
+    own = {key: [content[key]] * 3 for key in ("fl_x", "cx")}
+    own["fl_x"][1], own["cx"][1] = 80.0, 20.0
+    for key, values in own.items():
+        del content[key]
+        for frame, value in zip(content["frames"], values, strict=True):
+            frame[key] = value
+    (root / "transforms.json").write_text(json.dumps(content))
+    m = manager(root)
+    assert m.train_dataset.cameras.fx[:, 0].tolist() == [90.0, 80.0, 90.0]
+    rays, batch = m.next_train(0)
+    own = batch["indices"][:, 0] == 1
+    T = m.train_dataset.cameras.camera_to_worlds[1, :, :3]
+    expected = unproject(Intrinsics.of(m.dataparser.loaded.scan.frames[1].camera), rays.metadata["sl_uv"][own]) @ T.T
+    torch.testing.assert_close(rays.directions[own], expected, rtol=0, atol=1e-6)
+
+
+def test_scan_is_read_once_and_again_when_it_changes(tmp_path: Path) -> None:
+    root = TinyScan().write(tmp_path / "scan")
+    first = manager(root).samples
+    assert manager(root).samples is first
+    content = json.loads((root / "transforms.json").read_text())
+    content["frames"].pop()
+    (root / "transforms.json").write_text(json.dumps(content))
+    assert len(manager(root).train_dataset) == 2
+
+
+def test_transforms_json_itself_may_be_named(tiny_root: Path) -> None:
+    assert sl_data.config.__class__ is SLDataParserConfig
+    assert len(manager(tiny_root / "transforms.json").train_dataset) == 3
+
+
+def test_other_dataparsers_are_refused(tiny_root: Path) -> None:
+    config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
+    with pytest.raises(UserError, match="does not describe a projector"):
+        config.setup(device="cpu")
+
+
+def test_a_folder_that_is_no_scan(tmp_path: Path) -> None:
+    with pytest.raises(ScanError, match=r"transforms\.json"):
+        manager(tmp_path)
