@@ -1,0 +1,33 @@
+"""A few hundred correspondences of each frame, kept while the frames stream past."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device
+
+SAMPLES = 400  # a frame; enough for a median, little enough to try dozens of readings of the poses
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Camera pixels and pattern coordinates of one frame, with all that is needed to triangulate them."""
+
+    name: str
+    camera: Device
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    uv_camera: Float64[ndarray, "n 2"]
+    uv_projector: Float64[ndarray, "n 2"]
+
+
+def sample_pixels(
+    coords: Float32[ndarray, "h w 2"], where: Bool[ndarray, "h w"]
+) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
+    """Pixel centres and coordinates at SAMPLES pixels spread evenly over `where` (some twice if it has fewer)."""
+    flat = np.flatnonzero(where)
+    chosen = flat[np.linspace(0, len(flat) - 1, SAMPLES).round().astype(np.int64)]
+    rows, columns = np.divmod(chosen, where.shape[1])
+    return np.stack([columns, rows], -1) + 0.5, coords.reshape(-1, 2)[chosen].astype(np.float64)
