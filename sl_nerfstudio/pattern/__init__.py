@@ -1,0 +1,1 @@
+"""Projected patterns: the coded grid, any image, and local intensity normalisation."""

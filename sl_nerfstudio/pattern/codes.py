@@ -1,0 +1,84 @@
+"""Code arrays: a grid of symbols in which every small window tells where it is.
+
+Symbols (numbers 0 to 4; the method's text counts them from 1):
+
+    0  no gap
+    1  gap in the horizontal line, left side higher       2  ... right side higher
+    3  gap in the vertical line, upper side further right 4  ... upper side further left
+
+Turning the pattern by 90 degrees exchanges 1 with 3 and 2 with 4; turning it by 180 degrees
+changes no symbol. Both facts let windows be compared under every roll of the camera.
+"""
+
+import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
+
+from sl_nerfstudio.pattern.code_search import resolve_conflicts
+
+SYMBOLS = 5
+WINDOW = 3
+SYMBOL_NAMES = (
+    "no gap",
+    "horizontal line: left side higher",
+    "horizontal line: right side higher",
+    "vertical line: upper side further right",
+    "vertical line: upper side further left",
+)
+_QUARTER_TURN = np.array([0, 3, 4, 1, 2], dtype=np.int8)
+
+
+def rotate_codes(codes: Int[ndarray, "*batch rows columns"], quarter_turns: int) -> Int[ndarray, "*batch r c"]:
+    """The code array as seen when the pattern is turned clockwise by `quarter_turns` times 90 degrees."""
+    turned = np.rot90(codes, -quarter_turns, axes=(-2, -1))
+    return _QUARTER_TURN[turned] if quarter_turns % 2 else np.ascontiguousarray(turned)
+
+
+def windows(codes: Int[ndarray, "rows columns"], size: int = WINDOW) -> Int[ndarray, "n cells"]:
+    """All `size` x `size` windows, row by row, each flattened row by row."""
+    view = np.lib.stride_tricks.sliding_window_view(codes, (size, size))
+    return view.reshape(-1, size * size)
+
+
+def hamming_margin(codes: Int[ndarray, "rows columns"], rotations: bool = True, size: int = WINDOW) -> int:
+    """Smallest number of cells in which two different windows differ.
+
+    With `rotations`, windows are also compared with all windows (their own included) of the pattern
+    turned by 90, 180 and 270 degrees, as a camera that rolls freely sees them.
+    """
+    plain = windows(codes, size)
+    least = size * size
+    for turns in range(4 if rotations else 1):
+        turned = windows_turned(plain, turns, size)
+        for index, window in enumerate(plain):
+            distance = (turned != window).sum(1)
+            if turns == 0:
+                distance[index] = size * size
+            least = min(least, int(distance.min()))
+    return least
+
+
+def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int = WINDOW) -> Int[ndarray, "n cells"]:
+    """Flattened windows turned clockwise, each in its place."""
+    return rotate_codes(plain.reshape(-1, size, size), quarter_turns).reshape(len(plain), size * size)
+
+
+def code_array(
+    rows: int, columns: int, seed: int = 0, margin: int = 3, turned_margin: int = 2
+) -> Int[ndarray, "rows columns"]:
+    """Random symbols whose 3x3 windows differ pairwise in `margin` cells, and in `turned_margin` cells when
+    one of the two is turned by a quarter turn or more.
+
+    Starts from a random fill and re-samples cells of windows that are too similar to others. If the
+    margins cannot be had for so large an array, lower ones are tried: `hamming_margin` tells what was
+    reached (3 and 2 for 40 x 40 cells: upright, one misread cell of nine can be put right).
+    """
+    while True:
+        rng = np.random.default_rng([seed, margin, turned_margin])
+        codes = rng.integers(0, SYMBOLS, (rows, columns)).astype(np.int8)
+        hopeless = margin <= 1 and turned_margin <= 0
+        if min(rows, columns) < WINDOW or hopeless:
+            return codes
+        if resolve_conflicts(codes, margin, turned_margin, int(rng.integers(2**31))):
+            return codes
+        turned_margin, margin = (turned_margin - 1, margin) if turned_margin > 0 else (turned_margin, margin - 1)

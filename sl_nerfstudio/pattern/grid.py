@@ -1,0 +1,135 @@
+"""The coded grid: vertical and horizontal line segments with small gaps at the crossings.
+
+Node (i, j) of the grid (row, column) lies at pattern pixel (x0 + j * period, y0 + i * period).
+Between two nodes a segment runs straight from the offset that the first node gives it to the offset
+of the second, so that lines bend a little and nodes stay where the regular grid has them.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int8
+from numpy import ndarray
+
+from sl_nerfstudio.pattern.codes import code_array
+
+# offset, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right)
+_OFFSETS = np.array(
+    [[0, 0, 0, 0], [-1, 1, 0, 0], [1, -1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]],
+    dtype=np.float64,
+)
+
+
+@dataclass(frozen=True)
+class GridPattern:
+    """Description of a coded grid; lengths in pattern pixels."""
+
+    w: int = 800
+    h: int = 800
+    period: float = 20.0
+    line_width: float = 4.0
+    gap: float = 6.0
+    dark: float = 0.0  # intensity between the lines; the lines have 1
+    seed: int = 0
+    codes: Int8[ndarray, "rows columns"] | None = None  # None: made from the seed
+
+    def __post_init__(self) -> None:
+        """Check the lengths and fill in the codes. Raises ValueError for a grid that cannot be drawn."""
+        if not 0 < self.line_width < self.period or not 0 <= self.gap < self.period - self.line_width:
+            raise ValueError(
+                f"a grid needs 0 < line_width < period and 0 <= gap < period - line_width, got "
+                f"line_width {self.line_width:g}, gap {self.gap:g}, period {self.period:g}"
+            )
+        rows, columns = int(self.h // self.period), int(self.w // self.period)
+        if min(rows, columns) < 3:
+            raise ValueError(f"a {self.w} x {self.h} pattern of period {self.period:g} has fewer than 3 x 3 nodes")
+        codes = code_array(rows, columns, self.seed) if self.codes is None else np.asarray(self.codes, dtype=np.int8)
+        if codes.shape != (rows, columns):
+            raise ValueError(f"the code array must be {rows} x {columns}, got {codes.shape[0]} x {codes.shape[1]}")
+        object.__setattr__(self, "codes", codes)
+
+    @property
+    def rows(self) -> int:
+        """Number of nodes from top to bottom."""
+        return int(self.h // self.period)
+
+    @property
+    def columns(self) -> int:
+        """Number of nodes from left to right."""
+        return int(self.w // self.period)
+
+    @property
+    def x0(self) -> float:
+        """x of the leftmost nodes; the grid lies centred in the pattern."""
+        return (self.w - (self.columns - 1) * self.period) / 2
+
+    @property
+    def y0(self) -> float:
+        """y of the uppermost nodes."""
+        return (self.h - (self.rows - 1) * self.period) / 2
+
+    def nodes(self) -> Float[ndarray, "rows columns 2"]:
+        """Pattern pixel (x, y) of every node."""
+        x = self.x0 + self.period * np.arange(self.columns)
+        y = self.y0 + self.period * np.arange(self.rows)
+        return np.stack(np.meshgrid(x, y), -1)
+
+    def node_index(self, uv: Float[ndarray, "*n 2"]) -> Int[ndarray, "*n 2"]:
+        """Nearest node (i, j) of pattern pixels (x, y), inside the array."""
+        j = np.rint((uv[..., 0] - self.x0) / self.period)
+        i = np.rint((uv[..., 1] - self.y0) / self.period)
+        return np.stack([np.clip(i, 0, self.rows - 1), np.clip(j, 0, self.columns - 1)], -1).astype(np.int64)
+
+    def intensity(self, uv: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n"]:
+        """Brightness at pattern pixels (x, y): 1 on a line, `dark` between, with edges one pixel soft."""
+        x = (uv[..., 0] - self.x0) / self.period
+        y = (uv[..., 1] - self.y0) / self.period
+        offset_y, offset_x = self._line_offsets
+        across_h = (y - np.rint(y)) * self.period - _along(offset_y, y, x)
+        across_v = (x - np.rint(x)) * self.period - _along(offset_x.transpose(1, 0, 2), x, y)
+        distance = np.minimum(np.abs(across_h), np.abs(across_v))
+        light = np.clip(self.line_width / 2 + 0.5 - distance, 0.0, 1.0)
+        return self.dark + (1 - self.dark) * light
+
+    def render(self, supersampling: int = 4) -> Float32[ndarray, "h w"]:
+        """The pattern as an image in [0, 1], each pixel the mean of `supersampling`^2 places."""
+        step = (np.arange(supersampling) + 0.5) / supersampling
+        image = np.zeros((self.h, self.w))
+        for dy in step:
+            for dx in step:
+                uv = np.stack(np.meshgrid(np.arange(self.w) + dx, np.arange(self.h) + dy), -1)
+                image += self.intensity(uv)
+        return (image / supersampling**2).astype(np.float32)
+
+    @cached_property
+    def _line_offsets(self) -> tuple[Float[ndarray, "rows segments 2"], Float[ndarray, "segments columns 2"]]:
+        """Offsets at both ends of each segment: segment k of a line runs from node k - 1 to node k.
+
+        At the rim, where one of the nodes is missing, a segment keeps the offset of the other.
+        """
+        left, right, above, below = np.moveaxis(_OFFSETS[self.codes] * self.gap / 2, -1, 0)
+        start = np.concatenate([left[:, :1], right], 1)
+        end = np.concatenate([left, right[:, -1:]], 1)
+        top = np.concatenate([above[:1], below], 0)
+        bottom = np.concatenate([above, below[-1:]], 0)
+        return np.stack([start, end], -1), np.stack([top, bottom], -1)
+
+    def without_codes(self) -> dict[str, float]:
+        """The numbers that describe the grid, as plain JSON values."""
+        return asdict(replace(self, codes=np.zeros((self.rows, self.columns), np.int8)), dict_factory=_numbers)
+
+
+def _numbers(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    return {key: value for key, value in pairs if key != "codes"}
+
+
+def _along(
+    offsets: Float[ndarray, "lines segments 2"], across: Float[ndarray, "*n"], along: Float[ndarray, "*n"]
+) -> Float[ndarray, "*n"]:
+    """Offset of the nearest line at a place; both places counted in periods from the first node."""
+    line = np.clip(np.rint(across), 0, offsets.shape[0] - 1).astype(np.int64)
+    segment = np.clip(np.floor(along) + 1, 0, offsets.shape[1] - 1).astype(np.int64)
+    t = np.clip(along - (segment - 1), 0.0, 1.0)
+    ends = offsets[line, segment]
+    return (1 - t) * ends[..., 0] + t * ends[..., 1]

@@ -1,0 +1,1 @@
+"""Synthetic scans: scenes with truth, rendered captures, and noise as a separate step."""

@@ -1,0 +1,88 @@
+"""What a synthetic scan is made of; the docstrings of the fields are the help text of `sl-synth`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sl_nerfstudio.errors import UserError
+
+Units = Literal["m", "cm", "mm", "um", "arbitrary"]
+MILLIMETRES = {"m": 1e-3, "cm": 0.1, "mm": 1.0, "um": 1e3, "arbitrary": 1.0}
+"""A millimetre in each unit; a unit that is not known counts as a millimetre."""
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """A synthetic scan. Lengths in flags are millimetres, fractions lie between 0 and 1."""
+
+    scene: str = "cone-and-cylinder"
+    """cone-and-cylinder, head, frog, or a mesh file (.ply .obj .stl .glb) whose lengths are in --units"""
+    frames: int = 22
+    """number of captures"""
+    resolution: int = 400
+    """width and height of the camera's image, pixels"""
+    pattern: Path | None = None
+    """what the projector throws: a pattern.json or any image; default: an 800 x 800 coded grid"""
+    seed: int = 0
+    """everything random follows from it: same flags, same bytes"""
+
+    path: Literal["hand-held", "rigid-rig", "static-projector"] = "hand-held"
+    """hand-held: camera and projector move on their own; rigid-rig: together; static-projector: camera alone"""
+    projector_model: Literal["OPENCV", "DOE"] = "OPENCV"
+    """pinhole, or a diffractive element whose pattern is even in direction cosines"""
+    camera_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1 k2 p1 p2 of the camera, as OpenCV has them"""
+    projector_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1 k2 p1 p2 of the projector"""
+    supersampling: int = 2
+    """rays a pixel and direction in captured images; correspondences are exact at pixel centres anyway"""
+
+    noise: float = 0.3
+    """standard deviation of decoded coordinates, pattern pixels"""
+    missing: float = 0.15
+    """fraction of pattern cells that were not decoded"""
+    wrong: float = 0.02
+    """fraction of pattern cells that were decoded as another one, 1 to 5 periods off"""
+    sensor_noise: float = 0.012
+    """noise of captured images at full scale, as a fraction of full scale"""
+    pose_error: tuple[float, float] = (1.0, 3.0)
+    """registration: RMS rotation (degrees) and translation (mm) of a frame as a whole, turning about the object"""
+    autocalibration_error: tuple[float, float, float] = (0.22, 0.37, 0.02)
+    """auto-calibration: RMS rotation (degrees) of projector against camera, baseline direction (degrees) and length
+    (fraction)"""
+    clean: bool = False
+    """no noise of any kind and exact poses, whatever the flags above say"""
+
+    units: Units = "mm"
+    """unit of the lengths that are written"""
+    scale_known: bool = True
+    """the length of frame 0's baseline is exact and said to be known; with --no-scale-known no length is"""
+    pose_sigma: bool = True
+    """state the uncertainty of the starting poses (sl_pose_sigma)"""
+    world_turn: int | None = None
+    """turn and shift the world at random, by this seed"""
+    images_only: bool = False
+    """write only what a camera would bring home: images, pattern and intrinsics; the truth goes to ground_truth/"""
+
+    def check(self) -> None:
+        """Raise UserError naming the flag if a value makes no sense."""
+        rules = (
+            (self.frames >= 2, "--frames", self.frames, "a scan needs at least 2 frames"),
+            (self.resolution >= 16, "--resolution", self.resolution, "give at least 16 pixels"),
+            (1 <= self.supersampling <= 8, "--supersampling", self.supersampling, "give 1 to 8"),
+            (self.noise >= 0, "--noise", self.noise, "a standard deviation in pattern pixels is at least 0"),
+            (self.sensor_noise >= 0, "--sensor-noise", self.sensor_noise, "it is at least 0"),
+            (0 <= self.missing < 1, "--missing", self.missing, "it is a fraction: 15 % is 0.15"),
+            (0 <= self.wrong < 1, "--wrong", self.wrong, "it is a fraction: 2 % is 0.02"),
+            (self.missing + self.wrong <= 1, "--missing and --wrong", self.missing + self.wrong, "their sum is over 1"),
+            (min(self.pose_error) >= 0, "--pose-error", self.pose_error, "errors are at least 0"),
+            (min(self.autocalibration_error) >= 0, "--autocalibration-error", self.autocalibration_error,
+             "errors are at least 0"),
+            (self.autocalibration_error[2] < 0.5, "--autocalibration-error", self.autocalibration_error,
+             "the third is a fraction of the baseline: 2 % is 0.02"),
+            (self.seed >= 0, "--seed", self.seed, "seeds are at least 0"),
+            ((self.world_turn or 0) >= 0, "--world-turn", self.world_turn, "seeds are at least 0"),
+        )  # fmt: skip
+        for holds, flag, value, why in rules:
+            if not holds:
+                raise UserError(f"{flag} {value}: {why}")

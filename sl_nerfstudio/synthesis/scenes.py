@@ -1,0 +1,43 @@
+"""Scenes by name, and from mesh files."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.scene import Scene
+
+MESH_FORMATS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
+BUILT_IN = {"cone-and-cylinder": cone_and_cylinder}
+
+
+def make_scene(name: str, file_unit: float = 1.0) -> Scene:
+    """A built-in scene, or the mesh in a file whose unit is `file_unit` millimetres.
+
+    Raises UserError for a name that is neither.
+    """
+    if name in BUILT_IN:
+        return BUILT_IN[name]()
+    path = Path(name)
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise UserError(
+            f"--scene {name}: neither a built-in scene ({', '.join(BUILT_IN)}) nor a mesh file ({' '.join(MESH_FORMATS)})"
+        )
+    return _read_mesh(path, file_unit)
+
+
+def _read_mesh(path: Path, file_unit: float) -> Scene:
+    import trimesh
+
+    if not path.is_file():
+        raise UserError(f"--scene {path}: there is no such file")
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64) * file_unit
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+    except Exception as error:  # trimesh's loaders raise whatever their parsers do
+        raise UserError(f"--scene {path}: cannot be read as a mesh ({error}); export it again as PLY") from error
+    if len(faces) == 0 or not np.isfinite(vertices).all() or np.ptp(vertices, axis=0).max() <= 0:
+        raise UserError(f"--scene {path}: holds no surface (no faces, or all in one place); a point cloud will not do")
+    return Scene(path.stem, vertices, faces)
