@@ -1,0 +1,63 @@
+"""`sl-check DIR`: every fault of a scan folder at once."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sl_nerfstudio.cli.run import run
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.scan.examining import Examination
+
+
+def main() -> None:
+    """Entry point of `sl-check`."""
+    run(lambda: tyro.cli(check, prog="sl-check"))
+
+
+def check(folder: Annotated[Path, tyro.conf.Positional]) -> None:
+    """List every fault of a scan folder at once: file, frame, field, likely cause, what to do.
+
+    Reads transforms.json and decodes every file; training makes the same check before it starts. Prints a short
+    summary and exits with status 0 if the scan is good, prints all faults and exits with status 1 otherwise.
+
+    Args:
+        folder: The scan folder, which holds transforms.json.
+    """
+    from sl_nerfstudio.errors import ScanError
+    from sl_nerfstudio.scan.examining import examine
+
+    result = examine(folder)
+    if result.faults:
+        raise ScanError(result.faults, str(folder))
+    sys.stdout.write(summary(result))
+
+
+def summary(result: "Examination") -> str:
+    """What a person wants to know of a good scan, in a few lines."""
+    scan, fit = result.scan, result.fit
+    if scan is None or fit is None:
+        raise ValueError("a scan with faults has no summary")
+    sizes = sorted({(frame.camera.w, frame.camera.h) for frame in scan.frames})
+    decoded = [content.decoded for content in result.contents]
+    lines = [
+        f"{scan.root}: no faults",
+        f"  frames              {len(scan.frames)}, {', '.join(f'{w} x {h}' for w, h in sizes)} pixels",
+        f"  projector           {scan.projector.model}, {scan.projector.w} x {scan.projector.h} pixels",
+        f"  units               {scan.units}, scale {'known' if scan.scale.known else 'not known'}"
+        + (f" ({scan.scale.source})" if scan.scale.source else ""),
+        f"  working distance    {fit.depth:.4g} {scan.units} (median)",
+        f"  decoded             {100 * min(decoded):.0f} to {100 * max(decoded):.0f} % of the masked pixels",
+        f"  starting poses      epipolar residual {fit.typical_px:.2g} px; frames {fit.typical_spread * fit.depth:.2g} "
+        f"{scan.units} apart (medians)",
+    ]
+    whole = [content.name for content in result.contents if content.masked == 1]
+    if whole:
+        lines.append(f"  note                the mask covers the whole image in {', '.join(whole)}")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
