@@ -1,6 +1,7 @@
 """What the frames say about every vertex of a mesh: seen and confirmed, seen only, seen and denied, or not seen."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -9,15 +10,16 @@ from numpy import ndarray
 from scipy.ndimage import binary_dilation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.rays import pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, transform
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
 
 MASK_MARGIN = 1  # pixels around the mask that still count: a border pixel is only partly covered
-LEAST_PX, MOST_PX, MEDIANS = 4.0, 32.0, 6.0
+LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
-LEAST_PX (decoding noise and half a camera pixel of slope stay below it) and MOST_PX (beyond, poses prove nothing)."""
+LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +27,9 @@ class Votes:
     """Number of frames that saw each vertex, by what they decoded there."""
 
     confirmed: Int64[ndarray, "v"]  # the decoded coordinate is the one that the vertex predicts
-    silent: Int64[ndarray, "v"]  # the pattern falls there, but nothing was decoded nearby
+    silent: Int64[ndarray, "v"]  # the pattern falls there, but what was decoded nearby, if anything, proves nothing
     denied: Int64[ndarray, "v"]  # another coordinate was decoded: the camera saw something else there
-    threshold_px: Float[ndarray, "n"]  # of each frame, see LEAST_PX; NaN where nothing was decoded on the mesh
+    residual_px: Float[ndarray, "n"]  # median of each frame; NaN where nothing was decoded on the mesh
 
 
 class Occluder:
@@ -69,22 +71,17 @@ def collect_votes(
     """Ask every frame about every vertex; one frame's mask and coordinates are in memory at a time."""
     confirmed, silent, denied = (np.zeros(len(mesh.vertices), dtype=np.int64) for _ in range(3))
     normals = mesh.vertex_normals()
-    thresholds = []
+    medians: list[float] = []
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
-        vertex, residual = frame_residuals(mesh.vertices, normals, occluder, frame, scan.projector, T_camera, T_projector)
-        threshold = agreement_threshold(residual)
-        confirmed[vertex] += residual <= threshold
-        denied[vertex] += residual > threshold
-        silent[vertex] += np.isnan(residual)
-        thresholds.append(threshold)
-    return Votes(confirmed, silent, denied, np.array(thresholds))
-
-
-def agreement_threshold(residual: Float[ndarray, "n"]) -> float:
-    """Pattern pixels within which a frame's predictions agree with what it decoded; NaN if it decoded nothing there."""
-    known = residual[np.isfinite(residual)]
-    return float(np.clip(MEDIANS * np.median(known), LEAST_PX, MOST_PX)) if len(known) else float("nan")
+        vertex, least, most = frame_residuals(mesh.vertices, normals, occluder, frame, scan.projector, T_camera, T_projector)
+        known = most[np.isfinite(most)]
+        medians.append(float(np.median(known)) if len(known) else float("nan"))
+        threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
+        confirmed[vertex] += most <= threshold
+        denied[vertex] += least > threshold
+        silent[vertex] += ~(most <= threshold) & ~(least > threshold)
+    return Votes(confirmed, silent, denied, np.array(medians))
 
 
 def frame_residuals(
@@ -95,11 +92,11 @@ def frame_residuals(
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> tuple[Int64[ndarray, "m"], Float[ndarray, "m"]]:
-    """Vertices that the frame saw, and how far their predicted pattern coordinate is from the decoded one.
+) -> tuple[Int64[ndarray, "m"], Float[ndarray, "m"], Float[ndarray, "m"]]:
+    """Vertices that the frame saw, and how far, at least and at most, their predicted pattern coordinate is from the decoded one.
 
     Seen means: they face camera and projector, fall inside the mask and inside the pattern, and the mesh hides them from neither.
-    The residual, in pattern pixels, is the smallest over the pixel and its eight neighbours; NaN if none of these was decoded.
+    The distances are in pattern pixels; NaN if neither the pixel nor any of its eight neighbours was decoded.
     """
     vertex = np.arange(len(vertices), dtype=np.int64)
     vertex = vertex[_faces(vertices, normals, T_world_camera)]
@@ -107,15 +104,15 @@ def frame_residuals(
     uv_camera, inside = _pixels(vertices[vertex], frame.camera, T_world_camera)
     vertex, uv_camera = vertex[inside], uv_camera[inside]
     column, row = np.floor(uv_camera).astype(np.int64).T
-    mask = binary_dilation(frame.read_mask(), np.ones((3, 3), dtype=bool), iterations=MASK_MARGIN)
-    masked = mask[row, column]
-    vertex, row, column = vertex[masked], row[masked], column[masked]
+    masked = binary_dilation(frame.read_mask(), np.ones((3, 3), dtype=bool), iterations=MASK_MARGIN)[row, column]
+    vertex, uv_camera = vertex[masked], uv_camera[masked]
     uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
-    vertex, row, column, uv_projector = vertex[inside], row[inside], column[inside], uv_projector[inside]
+    vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
-        vertex, row, column, uv_projector = vertex[free], row[free], column[free], uv_projector[free]
-    return vertex, _nearest_decoded(frame.read_coords(), row, column, uv_projector)
+        vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
+    slope = _slope(vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector)
+    return vertex, *_offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, slope)
 
 
 def _faces(points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"]) -> Bool[ndarray, "n"]:
@@ -132,13 +129,55 @@ def _pixels(
     return uv, in_front.numpy() & (uv >= 0).all(1) & (uv < (device.w, device.h)).all(1)
 
 
-def _nearest_decoded(
-    coords: Float[ndarray, "h w 2"], row: Int64[ndarray, "n"], column: Int64[ndarray, "n"], uv: Float[ndarray, "n 2"]
+def _slope(
+    points: Float[ndarray, "n 3"],
+    normals: Float[ndarray, "n 3"],
+    uv_camera: Float[ndarray, "n 2"],
+    camera: Device,
+    T_world_camera: Float[ndarray, "4 4"],
+    projector: Device,
+    T_world_projector: Float[ndarray, "4 4"],
 ) -> Float[ndarray, "n"]:
+    """Pattern pixels by which the prediction moves for one camera pixel on the tangent plane, at most MOST_PX."""
+    here, _ = _pixels(points, projector, T_world_projector)
+    square = np.zeros(len(points))
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        uv = torch.from_numpy(uv_camera + step)
+        origin, direction = pixel_rays(Intrinsics.of(camera, torch.float64), torch.from_numpy(T_world_camera), uv)
+        o, d = origin.numpy(), direction.numpy()
+        towards = (d * normals).sum(1)
+        distance = ((points - o) * normals).sum(1) / np.where(towards < 0, towards, -1e-12)
+        there, valid = _pixels(o + distance[:, None] * d, projector, T_world_projector)
+        square += np.where(valid, ((there - here) ** 2).sum(1), MOST_PX**2)
+    return np.sqrt(square).clip(max=MOST_PX)
+
+
+def _offset_from_decoded(
+    coords: Float[ndarray, "h w 2"],
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    slope: Float[ndarray, "n"],
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
+    """Least and greatest distance of predicted from decoded coordinates, NaN if nothing was decoded within a pixel.
+
+    Where four decoded neighbours vary as `slope` lets expect, their bilinear value is compared. Else (an edge, or undecoded
+    neighbours) it is the nearest of nine pixels: the least distance leaves out what `slope` explains by a pixel being off the vertex.
+    """
     height, width = coords.shape[:2]
-    best = np.full(len(row), np.inf)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            decoded = coords[np.clip(row + dy, 0, height - 1), np.clip(column + dx, 0, width - 1)]
-            best = np.fmin(best, np.linalg.norm(decoded - uv, axis=1))
-    return np.where(np.isinf(best), np.nan, best)
+
+    def offset(row: Int64[ndarray, "n"], column: Int64[ndarray, "n"]) -> Float[ndarray, "n 2"]:
+        return coords[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] - uv_projector
+
+    column, row = np.floor(uv_camera).astype(np.int64).T
+    least, most = np.full(len(row), np.nan), np.full(len(row), np.nan)
+    for dy, dx in product((-1, 0, 1), repeat=2):
+        away = np.linalg.norm(np.stack([column + dx, row + dy], 1) + 0.5 - uv_camera, axis=1)
+        distance = np.linalg.norm(offset(row + dy, column + dx), axis=1)
+        least, most = np.fmin(least, (distance - slope * away).clip(min=0)), np.fmin(most, distance)
+    column, row = np.floor(uv_camera - 0.5).astype(np.int64).T
+    corners = [offset(row + dy, column + dx) for dy, dx in product((0, 1), repeat=2)]
+    spread = np.linalg.norm(np.max(corners, axis=0) - np.min(corners, axis=0), axis=1)
+    x, y = (uv_camera - 0.5 - np.stack([column, row], 1))[:, :, None].transpose(1, 0, 2)
+    bilinear = (1 - y) * ((1 - x) * corners[0] + x * corners[1]) + y * ((1 - x) * corners[2] + x * corners[3])
+    smooth, distance = spread <= 2 * slope + 1, np.linalg.norm(bilinear, axis=1)
+    return np.where(smooth, distance, least), np.where(smooth, distance, most)

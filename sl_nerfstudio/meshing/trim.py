@@ -13,10 +13,9 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.observe import Occluder, Votes, collect_votes
 from sl_nerfstudio.scan.types import Scan
 
-DENIALS_PER_CONFIRMATION = 2
-"""A vertex stays with one confirmation for every so many denials: wrong decodings are rare, and a frame with a bad pose denies much."""
-HOLE_SHARE, SPECK_SHARE = 1e-3, 1e-4
+HOLE_SHARE, SPECK_SHARE = 2e-3, 1e-4
 """Of the kept area: smaller gaps inside the observed surface stay closed, smaller pieces apart from it are dropped."""
+_LEAST_SHARE = 0.1  # observed vertices, of those seen: with fewer, the agreement is chance
 _SECOND_LOOK_SHARE = 1e-3  # denied vertices, of all, that are removed from the occluders before looking again
 
 
@@ -30,7 +29,7 @@ class Trimmed:
     denied: int  # frames saw something else there
     closed: int  # kept although not observed: small gaps inside the observed surface
     specks: int  # pieces (not vertices) that were too small, or that no frame confirmed
-    threshold_px: float  # median over the frames, see observe.LEAST_PX; NaN without any decoded coordinate
+    residual_px: float  # between predicted and decoded coordinates, median over frames; NaN if nothing was decoded
 
 
 def trim_to_observed(
@@ -52,11 +51,12 @@ def trim_to_observed(
     denied = _denied(votes)
     if denied.sum() > _SECOND_LOOK_SHARE * len(denied):
         # What stands in front of the object without being there hid the object itself: look again without it.
-        without = mesh.with_vertices(~denied)
+        without = _without(mesh, denied, _observed(votes))
         if len(without.faces):
             votes = collect_votes(mesh, Occluder(without), scan, T_camera, T_projector)
     observed = _observed(votes)
-    if not observed[mesh.faces].all(1).any():
+    seen = votes.confirmed + votes.silent + votes.denied > 0
+    if observed.sum() < _LEAST_SHARE * seen.sum() or not observed[mesh.faces].all(1).any():
         raise UserError(_nothing_observed(votes))
     keep = observed | _small_gaps(mesh, observed, votes)
     kept = keep[mesh.faces].all(1)
@@ -64,23 +64,31 @@ def trim_to_observed(
     return Trimmed(
         mesh=mesh.with_faces(kept & ~specks),
         total=len(mesh.vertices),
-        unseen=int((votes.confirmed + votes.silent + votes.denied == 0).sum()),
+        unseen=int((~seen).sum()),
         denied=int(_denied(votes).sum()),
         closed=int((keep & ~observed).sum()),
         specks=n_specks,
-        threshold_px=float(np.nanmedian(votes.threshold_px)) if np.isfinite(votes.threshold_px).any() else float("nan"),
+        residual_px=float(np.nanmedian(votes.residual_px)) if np.isfinite(votes.residual_px).any() else float("nan"),
     )
 
 
 def _observed(votes: Votes) -> Bool[ndarray, "v"]:
-    """Confirmed often enough; or seen, and denied by fewer frames than were silent."""
-    by_code = (votes.confirmed > 0) & (votes.denied <= DENIALS_PER_CONFIRMATION * votes.confirmed)
+    """Confirmed at least as often as denied; or never confirmed, but silently seen more often than denied."""
+    by_code = (votes.confirmed > 0) & (votes.confirmed >= votes.denied)
     by_mask = (votes.confirmed == 0) & (votes.silent > votes.denied)
     return by_code | by_mask
 
 
 def _denied(votes: Votes) -> Bool[ndarray, "v"]:
     return ~_observed(votes) & (votes.denied > 0)
+
+
+def _without(mesh: Mesh, denied: Bool[ndarray, "v"], observed: Bool[ndarray, "v"]) -> Mesh:
+    """The mesh without denied vertices, and without the pieces that remain of a phantom once its visible side is gone."""
+    edges = _edges(mesh)
+    count, label = _components(len(denied), edges[~denied[edges].any(1)])
+    real = np.bincount(label, observed, count) > 0
+    return mesh.with_vertices(~denied & real[label])
 
 
 def _edges(mesh: Mesh) -> Int64[ndarray, "e 2"]:
@@ -127,10 +135,11 @@ def _specks(mesh: Mesh, kept: Bool[ndarray, "f"], votes: Votes) -> tuple[Bool[nd
 
 def _nothing_observed(votes: Votes) -> str:
     if (votes.denied > 0).any():
-        cause = "the predicted pattern coordinates are not the decoded ones: wrong poses, wrong axes, or an unfinished training"
+        off = f"off by {np.nanmedian(votes.residual_px):.0f} px (median)"
+        cause = f"the predicted pattern coordinates are not the decoded ones, {off}: wrong poses or axes, or an unfinished training"
     else:
         cause = "no vertex falls inside a mask while facing camera and projector: wrong poses or axes, or an unfinished training"
     return (
-        f"no frame observed any part of the surface, so nothing is left of it\n    cause:  {cause}\n"
+        f"the frames observed no part of the surface, so nothing is left of it\n    cause:  {cause}\n"
         "    remedy: check the scan with sl-check, look at the run in ns-viewer; --keep-unobserved writes the surface uncut"
     )

@@ -39,16 +39,18 @@ def pairs_around(count: int, elevation_deg: float, distance: float = 300.0, apar
     return poses
 
 
-def scan_of(truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, change: Change | None = None) -> Scan:
+def scan_of(
+    truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, change: Change | None = None, camera: Device = CAMERA
+) -> Scan:
     """Write noise-free captures of `truth`, passed through `change(frame number, coords)`, and give them as a Scan."""
-    images = np.zeros((CAMERA.h, CAMERA.w), dtype=np.uint8)
+    images = np.zeros((camera.h, camera.w), dtype=np.uint8)
     pattern = np.zeros((PROJECTOR.h, PROJECTOR.w), dtype=np.uint8)
     frames = []
     with ScanWriter(
-        root, units="mm", scale=Scale(True, "test"), projector=PROJECTOR, pattern=pattern, camera=CAMERA
+        root, units="mm", scale=Scale(True, "test"), projector=PROJECTOR, pattern=pattern, camera=camera
     ) as writer:
         for number, (T_camera, T_projector) in enumerate(poses):
-            coords, mask = captured(truth, T_camera, T_projector)
+            coords, mask = captured(truth, camera, T_camera, T_projector)
             coords = coords if change is None else change(number, coords)
             name = f"frame_{number:05d}"
             writer.add_frame(
@@ -56,7 +58,7 @@ def scan_of(truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, chang
             )
             frames.append(
                 Frame(
-                    name, CAMERA, root / f"images/{name}.png", None, root / f"coords/{name}.npz",
+                    name, camera, root / f"images/{name}.png", None, root / f"coords/{name}.npz",
                     root / f"masks/{name}.png", T_camera, T_projector,
                 )  # fmt: skip
             )
@@ -64,14 +66,14 @@ def scan_of(truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, chang
 
 
 def captured(
-    truth: Mesh, T_camera: Float[ndarray, "4 4"], T_projector: Float[ndarray, "4 4"]
+    truth: Mesh, camera: Device, T_camera: Float[ndarray, "4 4"], T_projector: Float[ndarray, "4 4"]
 ) -> tuple[Float[ndarray, "h w 2"], Bool[ndarray, "h w"]]:
     """Pattern coordinates of each pixel, NaN where the pattern does not fall, and where it does."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(truth.vertices.astype(np.float32)), o3d.core.Tensor(truth.faces.astype(np.uint32)))
-    y, x = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
+    y, x = np.mgrid[: camera.h, : camera.w] + 0.5
     direction = np.stack(
-        [(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1
+        [(x - camera.cx) / camera.fl_x, -(y - camera.cy) / camera.fl_y, -np.ones_like(x)], -1
     ) @ T_camera[:3, :3].T
     origin = np.broadcast_to(T_camera[:3, 3], direction.shape)
     depth = _cast(scene, origin, direction)

@@ -1,0 +1,207 @@
+"""What is cut and what stays, against visibility computed by formula for balls and planes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.se3 import exp_se3
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.trim import trim_to_observed
+
+from .ray_cast_scan import CAMERA, look_at, pairs_around, scan_of
+
+RADIUS = 40.0
+POSES = pairs_around(6, elevation_deg=40)
+
+
+def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -> Mesh:
+    low, high = (tuple(c + s * (radius + 2 * cell) for c in centre) for s in (-1, 1))
+    return extract_mesh(
+        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius, round(2 * (radius / cell + 2)), low, high
+    )
+
+
+def together(*parts: Mesh) -> Mesh:
+    offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])[:-1]
+    return Mesh(
+        np.concatenate([p.vertices for p in parts]), np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
+    )
+
+
+def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Which points are vertices of the mesh."""
+    known = {tuple(v) for v in mesh.vertices.round(9)}
+    return np.array([tuple(p) in known for p in points.round(9)])
+
+
+def angle_beyond_horizon_deg(points: np.ndarray) -> np.ndarray:
+    """For points of the ball at the origin: by how much the best frame sees and lights them (negative: not at all)."""
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    height = [
+        np.min([np.arcsin(((T[:3, 3] - points) * normals).sum(1) / np.linalg.norm(T[:3, 3] - points, axis=1)) for T in pair], 0)
+        for pair in POSES
+    ]
+    return np.degrees(np.max(height, 0))
+
+
+def euler(mesh: Mesh) -> int:
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    return len(mesh.vertices) - len(np.unique(edges, axis=0)) + len(mesh.faces)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Mesh:
+    return ball((0.0, 0.0, 0.0), RADIUS)
+
+
+@pytest.fixture(scope="module")
+def scan(truth, tmp_path_factory):
+    return scan_of(truth, POSES, tmp_path_factory.mktemp("trim") / "scan")
+
+
+def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, scan):
+    result = trim_to_observed(truth, scan)
+    kept = contains(result.mesh, truth.vertices)
+    margin = angle_beyond_horizon_deg(truth.vertices)
+    assert kept[margin > 5].all()  # a triangle and a pixel of the mask are 4 degrees of the ball
+    assert not kept[margin < -3].any()
+    assert euler(result.mesh) == 1  # one disk: no hole, no speck
+    assert result.total == len(truth.vertices) and result.unseen == pytest.approx((margin < 0).sum(), rel=0.05)
+    assert (result.denied, result.closed, result.specks) == (0, 0, 0)
+
+
+TOWARDS_FIRST_CAMERA = np.array([np.cos(np.radians(40)), 0.0, np.sin(np.radians(40))])
+
+
+def test_a_phantom_in_front_goes_and_what_it_hid_stays(truth, tmp_path):
+    """One frame alone sees the phantom, and the surface behind it."""
+    scan = scan_of(truth, POSES[:1], tmp_path / "scan")
+    plain = trim_to_observed(truth, scan).mesh
+    phantom = ball(tuple(62 * TOWARDS_FIRST_CAMERA), 9.0)
+    result = trim_to_observed(together(truth, phantom), scan)
+    assert not contains(result.mesh, phantom.vertices).any()
+    assert np.array_equal(contains(result.mesh, truth.vertices), contains(plain, truth.vertices))
+    assert result.denied > 0.3 * len(phantom.vertices)
+
+
+def test_a_bulge_on_the_surface_goes(truth, scan):
+    """Surface that is 8 mm too far out over a patch: every frame decodes something else there."""
+    towards = np.array([0.5, 0.0, np.sqrt(0.75)])
+    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
+    bulged = Mesh(truth.vertices * (1 + 8 / RADIUS * np.clip((14 - angle) / 2, 0, 1))[:, None], truth.faces)
+    result = trim_to_observed(bulged, scan)
+    kept = contains(result.mesh, bulged.vertices)
+    assert not kept[angle < 10].any()
+    assert kept[(angle > 20) & (angle_beyond_horizon_deg(truth.vertices) > 5)].all()
+
+
+def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndarray:
+    """A share of the cells of size x size camera pixels, another one in each frame."""
+    chosen = np.random.default_rng(number).random((across, across)) < share
+    return np.kron(chosen, np.ones((size, size), dtype=bool))
+
+
+@pytest.mark.parametrize("share", [0.15, 0.5])
+def test_undecoded_cells_inside_the_mask_make_no_hole(truth, scan, tmp_path, share):
+    holey = scan_of(truth, POSES, tmp_path / "scan", lambda i, c: np.where(cells(i, share)[..., None], np.float32(np.nan), c))
+    assert euler(trim_to_observed(truth, holey).mesh) == 1
+    assert len(trim_to_observed(truth, holey).mesh.faces) == pytest.approx(len(trim_to_observed(truth, scan).mesh.faces), rel=0.02)
+
+
+@pytest.mark.parametrize("frames", [1, 6])
+def test_wrongly_decoded_cells_make_no_hole(truth, tmp_path, frames):
+    """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
+    camera, poses = CAMERA.scaled(2.0), POSES[:frames]
+    wrong = scan_of(truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera)
+    result = trim_to_observed(truth, wrong)
+    assert euler(result.mesh) == 1
+    assert len(result.mesh.faces) == pytest.approx(len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b")).mesh.faces), rel=0.02)
+    assert frames > 1 or result.closed > 0
+
+
+def test_noise_of_coordinates_and_poses_cuts_nothing(truth, scan, tmp_path):
+    rng = np.random.default_rng(0)
+    noisy = scan_of(truth, POSES, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
+    tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
+    moved = np.stack([T @ tilt for T in noisy.T_world_camera])
+    faces = len(trim_to_observed(truth, noisy, moved, noisy.T_world_projector).mesh.faces)
+    assert faces == pytest.approx(len(trim_to_observed(truth, scan).mesh.faces), rel=0.02)
+
+
+def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
+    """One frame, a ball above a plane: the plane stays where the ball blocks neither camera nor projector."""
+    sphere, plane = ball((0.0, 0.0, 25.0), 12.0), plate(60.0, 1.0)
+    both = together(sphere, plane)
+    T_camera, T_projector = look_at((150.0, 0.0, 300.0)), look_at((-150.0, 60.0, 300.0))
+    result = trim_to_observed(both, scan_of(both, [(T_camera, T_projector)], tmp_path / "scan"))
+    kept = contains(result.mesh, plane.vertices)
+    clear = np.min([clearance(plane.vertices, T[:3, 3], np.array([0.0, 0.0, 25.0])) for T in (T_camera, T_projector)], 0)
+    central = np.abs(plane.vertices).max(1) < 55
+    assert kept[central & (clear > 12 + 4)].all()  # a camera pixel is 2 mm here
+    assert not kept[clear < 12 - 4].any()
+
+
+def plate(half: float, cell: float) -> Mesh:
+    """The plane z = 0, seen from above."""
+    n = int(2 * half / cell) + 1
+    x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n))
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
+    faces = np.concatenate([i + [0, 1, n], i + [1, n + 1, n]])
+    return Mesh(np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], 1), faces)
+
+
+def clearance(points: np.ndarray, eye: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Distance of the ball's centre from the way of each point to the eye."""
+    way = eye - points
+    t = ((centre - points) * way).sum(1) / (way * way).sum(1)
+    return np.linalg.norm(points + t.clip(0, 1)[:, None] * way - centre, axis=1)
+
+
+def test_a_floating_piece_that_no_frame_confirms_goes(truth, tmp_path):
+    """In front of it nothing was decoded at all, so nothing denies it: but nothing confirms it either."""
+    phantom = ball(tuple(58 * TOWARDS_FIRST_CAMERA), 6.0)
+    both = together(truth, phantom)
+    blind = [covered_pixels(T_camera, phantom.vertices) for T_camera, _ in POSES]
+    scan = scan_of(truth, POSES, tmp_path / "scan", lambda i, c: np.where(blind[i][..., None], np.float32(np.nan), c))
+    result = trim_to_observed(both, scan)
+    assert result.specks > 0
+    assert not contains(result.mesh, phantom.vertices).any()
+
+
+def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels within two of a projection of the points."""
+    p = (points - T_camera[:3, 3]) @ T_camera[:3, :3]
+    u, v = 160 * p[:, 0] / -p[:, 2] + 48, -160 * p[:, 1] / -p[:, 2] + 48
+    out = np.zeros((96, 96), dtype=bool)
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            out[(v + dy).astype(int).clip(0, 95), (u + dx).astype(int).clip(0, 95)] = True
+    return out
+
+
+def test_given_poses_replace_those_of_the_scan(truth, scan):
+    S = Similarity(1.0, exp_se3(torch.tensor([0, 0, 0, 0.3, -0.2, 0.9], dtype=torch.float64)).numpy()[:3, :3], np.array([500.0, -20, 7]))
+    moved = trim_to_observed(truth.mapped(S), scan, S.poses(scan.T_world_camera), S.poses(scan.T_world_projector)).mesh
+    assert len(moved.faces) == pytest.approx(len(trim_to_observed(truth, scan).mesh.faces), rel=2e-3)
+
+
+def test_wrong_poses_say_so(truth, scan):
+    upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
+    with pytest.raises(UserError, match=r"the frames observed no part(.|\n)*no vertex falls inside a mask(.|\n)*sl-check(.|\n)*--keep-unobserved"):
+        trim_to_observed(truth, scan, scan.T_world_camera @ upside_down, scan.T_world_projector @ upside_down)
+
+
+def test_another_surface_says_so(scan):
+    with pytest.raises(UserError, match=r"predicted pattern coordinates are not the decoded ones, off by \d+ px"):
+        trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), scan)
+
+
+def test_missing_mask_files_mean_decoded_pixels(truth, scan, tmp_path: Path):
+    without = replace(scan, frames=tuple(replace(f, mask_path=None) for f in scan.frames))
+    assert len(trim_to_observed(truth, without).mesh.faces) == len(trim_to_observed(truth, scan).mesh.faces)
