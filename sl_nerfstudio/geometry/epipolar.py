@@ -16,12 +16,12 @@ def essential_matrix(T_projector_camera: Float[Tensor, "*batch 4 4"]) -> Float[T
 
 def epipolar_residual(
     camera: Intrinsics,
-    T_world_camera: Float[Tensor, "*batch 4 4"],
-    uv_camera: Float[Tensor, "*batch 2"],
+    T_world_camera: Float[Tensor, "*#batch 4 4"],
+    uv_camera: Float[Tensor, "*#batch 2"],
     projector: Intrinsics,
-    T_world_projector: Float[Tensor, "*batch 4 4"],
-    uv_projector: Float[Tensor, "*batch 2"],
-) -> Float[Tensor, "*batch"]:
+    T_world_projector: Float[Tensor, "*#batch 4 4"],
+    uv_projector: Float[Tensor, "*#batch 2"],
+) -> Float[Tensor, "*#batch"]:
     """Signed distance, in projector pixels, of `uv_projector` from the epipolar curve of `uv_camera`.
 
     The curve is the image of the camera ray in the projector. It is linearised where the two rays

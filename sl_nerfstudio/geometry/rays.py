@@ -17,8 +17,8 @@ def pixel_centres(device: Device, dtype: torch.dtype = torch.float32) -> Float[T
 
 
 def pixel_rays(
-    intrinsics: Intrinsics, T_world_device: Float[Tensor, "*batch 4 4"], uv: Float[Tensor, "*batch 2"]
-) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
+    intrinsics: Intrinsics, T_world_device: Float[Tensor, "*#batch 4 4"], uv: Float[Tensor, "*#batch 2"]
+) -> tuple[Float[Tensor, "*#batch 3"], Float[Tensor, "*#batch 3"]]:
     """Origin and unit direction, in the world, of the rays through pixels `uv`."""
     d_world = rotate(T_world_device, unproject(intrinsics, uv))
     return T_world_device[..., :3, 3].expand_as(d_world), d_world

@@ -43,11 +43,11 @@ def closest_approach(
 
 def triangulate(
     camera: Intrinsics,
-    T_world_camera: Float[Tensor, "*batch 4 4"],
-    uv_camera: Float[Tensor, "*batch 2"],
+    T_world_camera: Float[Tensor, "*#batch 4 4"],
+    uv_camera: Float[Tensor, "*#batch 2"],
     projector: Intrinsics,
-    T_world_projector: Float[Tensor, "*batch 4 4"],
-    uv_projector: Float[Tensor, "*batch 2"],
+    T_world_projector: Float[Tensor, "*#batch 4 4"],
+    uv_projector: Float[Tensor, "*#batch 2"],
 ) -> Triangulation:
     """Midpoints of camera rays and projector rays; differentiable in both poses.
 
