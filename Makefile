@@ -1,0 +1,97 @@
+# One machine, one virtual environment: `make install` makes .venv from pinned versions, and every target
+# below uses it. Nothing is installed twice: the stamp is renewed only when a pinned version changes.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-builtin-rules
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --constraint constraints.txt
+DEMO := outputs/demo
+DEMO_RUN := $(DEMO)/run/cone-and-cylinder/sl-neus/demo
+
+# The first of these that runs, is of a version in range and can make virtual environments.
+# `make install PYTHON=/path/to/python3.12` chooses another.
+PYTHONS := python3.11 python3.12 python3.10 python3 python
+SUITABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
+
+.PHONY: help install demo test bench lint format clean
+
+help:
+	@echo "make install   .venv with pinned dependencies and this package"
+	@echo "make demo      synthesise, train, export, evaluate: outputs/demo/report.html (minutes)"
+	@echo "make test      the test suite"
+	@echo "make bench     the benchmarks that need minutes; results in benchmarks/results/"
+	@echo "make lint      ruff and pyright"
+	@echo "make format    let ruff format the code and sort the imports"
+	@echo "make clean     remove .venv, the demo's output and caches; your own outputs stay"
+
+install: $(STAMP)
+
+$(BIN)/python:
+	@python="$(PYTHON)"; \
+	for candidate in $(PYTHONS); do \
+	  if [ -z "$$python" ] && "$$candidate" -c '$(SUITABLE)' >/dev/null 2>&1; then python="$$candidate"; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	  echo "error: no suitable Python found (tried: $(PYTHONS))." >&2; \
+	  echo "       Needed: Python 3.10, 3.11 or 3.12 with its venv and ensurepip modules, for example" >&2; \
+	  echo "       'apt-get install python3.11 python3.11-venv' on Debian 12; or name one: make install PYTHON=/path/to/python3" >&2; \
+	  exit 1; \
+	fi; \
+	echo "creating $(VENV) with $$python ($$("$$python" --version))"; \
+	"$$python" -m venv --clear $(VENV)
+
+$(STAMP): $(BIN)/python pyproject.toml constraints.txt
+	@# All of it comes as wheels but pyliblzfse (viser's, for iPhone recordings, unused here): without a C compiler it is left out.
+	@if $(PIP) --quiet pyliblzfse >/dev/null 2>&1; then \
+	  $(PIP) --editable '.[dev]'; \
+	else \
+	  echo "no C compiler: installing the pinned list without pyliblzfse"; \
+	  grep -v '^pyliblzfse==' constraints.txt >$(VENV)/wheels.txt; \
+	  $(PIP) --no-deps --requirement $(VENV)/wheels.txt; \
+	  $(PIP) --no-deps --editable .; \
+	fi
+	@$(BIN)/python -c 'import cv2, open3d, torch, torchvision' || { \
+	  echo "error: the packages are installed, but not all of them can be loaded (see above)." >&2; \
+	  echo "       Where a shared library is missing (libGL.so.1, libgomp.so.1): 'apt-get install libgl1 libgomp1'." >&2; \
+	  exit 1; \
+	}
+	@touch $@
+
+demo: install
+	rm -rf $(DEMO)
+	$(BIN)/sl-synth --output $(DEMO)/scan
+	$(BIN)/ns-train sl-neus --data $(DEMO)/scan --output-dir $(DEMO)/run \
+	  --experiment-name cone-and-cylinder --timestamp demo --vis tensorboard
+	$(BIN)/sl-export --load-config $(DEMO_RUN)/config.yml --output $(DEMO)/mesh.ply --poses $(DEMO)/refined
+	$(BIN)/sl-eval --mesh $(DEMO)/mesh.ply --data $(DEMO)/scan --poses $(DEMO)/refined/transforms.json \
+	  --json $(DEMO)/evaluation.json --report $(DEMO)/report.html
+	@echo
+	@echo "surface  $(DEMO)/mesh.ply"
+	@echo "poses    $(DEMO)/refined/transforms.json"
+	@echo "figures  $(DEMO)/evaluation.json"
+	@echo "report   $(CURDIR)/$(DEMO)/report.html (open it in a browser)"
+
+test: install
+	$(BIN)/python -m pytest
+
+bench: install
+	$(BIN)/python -m benchmarks
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: install
+	$(BIN)/ruff check --fix --select I .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
