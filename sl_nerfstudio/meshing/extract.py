@@ -1,6 +1,5 @@
 """The zero level of a signed distance field as a mesh, at a cost that grows with its area, not with the volume."""
 
-
 import math
 
 import torch
@@ -26,14 +25,15 @@ def extract_mesh(
 ) -> Mesh:
     """Mesh of the zero level of `sdf` in the box, with `resolution` cells along its longest side.
 
-    `sdf` takes float32 points on `device`, at most 2^18 at a time, and gives the distance in the same units, negative inside;
-    it need only be nearly a distance (`safety`: the larger, the farther off a surface is looked for). The mesh is in the box's frame,
-    closed except where the surface leaves the box, and its normals point to positive values. `polish` regula falsi steps move each
-    vertex along its grid edge to the field's own zero, beyond linear interpolation: one more evaluation per vertex and step.
+    `sdf` takes float32 points on `device`, at most 2^18 at a time, and gives the distance in the same units, negative
+    inside; it need only be nearly a distance (`safety`: the larger, the farther off a surface is looked for). The mesh
+    is in the box's frame, closed except where the surface leaves the box, and its normals point to positive values.
+    `polish` regula falsi steps move each vertex along its grid edge to the field's own zero, beyond linear
+    interpolation, for one more evaluation per vertex and step.
     Raises UserError if there is no surface in the box, or the field is not a number.
     """
     if resolution < 2:
-        raise UserError(f"--resolution {resolution}: a mesh needs at least 2 cells along an axis; 256 or 512 are usual.")
+        raise UserError(f"--resolution {resolution}: a mesh needs at least 2 cells along an axis; 256 or 512 is usual")
     grid = _grid(sdf, resolution, lower, upper, torch.device(device))
     leaves = evaluate_leaves(grid, find_leaves(grid, safety))
     corner, case = _surface_cells(leaves)

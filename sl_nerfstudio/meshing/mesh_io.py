@@ -1,5 +1,6 @@
 """Meshes as files: PLY, OBJ, STL and GLB, chosen by the suffix."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ def check_suffix(path: Path) -> str:
     """The suffix in lower case. Raises UserError, naming the choices, if it is no known one."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
+        problem = f"unknown kind of mesh file {path.suffix!r}" if suffix else "the name of a mesh file needs a suffix"
         raise UserError(
-            f"{path}: {f'unknown kind of mesh file {path.suffix!r}' if suffix else 'the name of a mesh file needs a suffix'}\n"
+            f"{path}: {problem}\n"
             f"    cause:  the suffix chooses the format\n    remedy: end the name in one of {', '.join(SUFFIXES)}"
         )
     return suffix
@@ -29,9 +31,9 @@ def check_suffix(path: Path) -> str:
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Write a mesh; `path` appears whole or not at all.
 
-    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. No axis is turned: GLB viewers
-    that expect y up show the world as it is. Raises UserError for an unknown suffix, a mesh without triangles, a
-    vertex that is not a number, or a place where writing is impossible.
+    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. No axis is turned:
+    GLB viewers that expect y up show the world as it is. Raises UserError for an unknown suffix, a mesh without
+    triangles, a vertex that is not a number, or a place where writing is impossible.
     """
     suffix = check_suffix(path)
     if len(mesh.faces) == 0:
@@ -70,21 +72,37 @@ def _by_trimesh(mesh: Mesh, suffix: str) -> bytes:
 def read_mesh(path: Path) -> Mesh:
     """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
 
-    Vertices at one place are welded only in STL, which cannot share them. Raises UserError if the file is missing, empty, broken, too
-    large, without triangles, refers to vertices that do not exist, or holds numbers that are none.
+    Vertices at one place are welded only in STL, which cannot share them. Raises UserError if the file is missing,
+    empty, broken, too large, without triangles, refers to vertices that do not exist, or holds numbers that are none.
     """
     suffix = check_suffix(path)
     check_file(path)
     try:
         vertices, faces = _load(path, suffix)
     except MemoryError as error:
-        raise FileError(path, "does not fit into memory", "a huge or broken mesh", "decimate it, or export it again") from error
-    except Exception as error:  # every loader has its own ways to fail on a broken file
         raise FileError(
-            path, f"cannot be read as {suffix[1:].upper()} ({_first_line(error)})", "the file is truncated, broken or of another kind",
-            "export or copy it again",
-        ) from error  # fmt: skip
+            path, "does not fit into memory", "a huge or broken mesh", "decimate or export it again"
+        ) from error
+    except Exception as error:  # every loader has its own ways to fail on a broken file
+        problem = f"cannot be read as {suffix[1:].upper()} ({_first_line(error)})"
+        cause = "the file is truncated, broken or of another kind"
+        raise FileError(path, problem, cause, "export or copy it again") from error
+    if suffix == ".ply":
+        _check_ply_counts(path, len(vertices), len(faces))
     return _checked(path, vertices, faces)
+
+
+def _check_ply_counts(path: Path, vertices: int, faces: int) -> None:
+    """The loader takes what there is of a truncated text file; the header says how much there should be."""
+    with path.open("rb") as stream:
+        header = stream.read(65536).split(b"end_header")[0].decode("ascii", "replace")
+    stated = {kind: int(count) for kind, count in re.findall(r"element (vertex|face) (\d+)", header)}
+    stated = {"vertex": 0, "face": 0, **stated}
+    if vertices < stated["vertex"] or faces < stated["face"]:
+        problem = (
+            f"should hold {stated['vertex']} vertices and {stated['face']} faces, but {vertices} and {faces} were read"
+        )
+        raise FileError(path, problem, "the file is truncated or broken", "export or copy it again")
 
 
 def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
@@ -94,8 +112,8 @@ def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
         loaded: Any = trimesh.load_scene(stream, file_type=suffix[1:], process=False)
     parts = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
     if not parts:
-        clouds = [g for g in loaded.geometry.values() if hasattr(g, "vertices")]
-        return (np.concatenate([np.asarray(c.vertices) for c in clouds]) if clouds else np.empty((0, 3))), np.empty((0, 3))
+        clouds = [np.asarray(g.vertices) for g in loaded.geometry.values() if hasattr(g, "vertices")]
+        return np.concatenate([np.empty((0, 3)), *clouds]), np.empty((0, 3))
     offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])
     vertices = np.concatenate([np.asarray(p.vertices) for p in parts])
     faces = np.concatenate([np.asarray(p.faces) + o for p, o in zip(parts, offsets[:-1], strict=True)])
@@ -108,10 +126,10 @@ def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
 def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
     again = "export it again from the program that made it"
     if len(faces) == 0:
-        what = f"it holds {len(vertices)} points only" if len(vertices) else "it holds nothing"
-        raise FileError(path, f"has no triangles: {what}", "a point cloud, an empty result, or a truncated file", "give a surface mesh")
+        problem = f"has no triangles: it holds {f'{len(vertices)} points only' if len(vertices) else 'nothing'}"
+        raise FileError(path, problem, "a point cloud, an empty result, or a truncated file", "give a surface mesh")
     if len(faces) > MAX_TRIANGLES:
-        raise FileError(path, f"has {len(faces)} triangles", f"more than {MAX_TRIANGLES} are not supported", "decimate it first")
+        raise FileError(path, f"has {len(faces)} triangles", f"{MAX_TRIANGLES} are supported", "decimate it first")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise FileError(
             path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is broken", again
@@ -119,12 +137,10 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     bad = ~np.isfinite(vertices).all(1)
     if bad.any():
-        raise FileError(
-            path, f"has {int(bad.sum())} vertices that are not numbers, the first is number {int(bad.argmax())}",
-            "it was written by a computation that failed", again,
-        )  # fmt: skip
-    if np.abs(vertices).max() > 1e12:
-        raise FileError(path, f"reaches out to {np.abs(vertices).max():.0e} units", "a broken file or a wrong unit", again)
+        problem = f"has {int(bad.sum())} vertices that are not numbers, the first is number {int(bad.argmax())}"
+        raise FileError(path, problem, "it was written by a computation that failed", again)
+    if (reach := np.abs(vertices).max()) > 1e12:
+        raise FileError(path, f"reaches out to {reach:.0e} units", "a broken file or a wrong unit", again)
     return Mesh(vertices, faces)
 
 

@@ -52,7 +52,7 @@ class Occluder:
     ) -> Bool[ndarray, "n"]:
         """Whether the mesh stands between points on it, facing `eye`, and `eye`.
 
-        Rays start two edge lengths off the surface, along the normal and towards the eye, so that no surface hides itself.
+        Rays start two edge lengths off the surface, along the normal and towards the eye, so that none hits its own.
         """
         way = eye - points
         distance = np.linalg.norm(way, axis=1, keepdims=True)
@@ -74,7 +74,9 @@ def collect_votes(
     medians: list[float] = []
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
-        vertex, least, most = frame_residuals(mesh.vertices, normals, occluder, frame, scan.projector, T_camera, T_projector)
+        vertex, least, most = frame_residuals(
+            mesh.vertices, normals, occluder, frame, scan.projector, T_camera, T_projector
+        )
         known = most[np.isfinite(most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
@@ -93,29 +95,34 @@ def frame_residuals(
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
 ) -> tuple[Int64[ndarray, "m"], Float[ndarray, "m"], Float[ndarray, "m"]]:
-    """Vertices that the frame saw, and how far, at least and at most, their predicted pattern coordinate is from the decoded one.
+    """Vertices that the frame saw, and how far the decoded coordinate is, at least and at most, from the predicted one.
 
-    Seen means: they face camera and projector, fall inside the mask and inside the pattern, and the mesh hides them from neither.
-    The distances are in pattern pixels; NaN if neither the pixel nor any of its eight neighbours was decoded.
+    Seen means: they face camera and projector, fall inside the mask and inside the pattern, and the mesh hides them
+    from neither. The distances are in pattern pixels; NaN if neither the pixel nor any of its neighbours was decoded.
     """
     vertex = np.arange(len(vertices), dtype=np.int64)
-    vertex = vertex[_faces(vertices, normals, T_world_camera)]
-    vertex = vertex[_faces(vertices[vertex], normals[vertex], T_world_projector)]
+    for T in (T_world_camera, T_world_projector):
+        vertex = vertex[_faces(vertices[vertex], normals[vertex], T)]
     uv_camera, inside = _pixels(vertices[vertex], frame.camera, T_world_camera)
     vertex, uv_camera = vertex[inside], uv_camera[inside]
-    column, row = np.floor(uv_camera).astype(np.int64).T
-    masked = binary_dilation(frame.read_mask(), np.ones((3, 3), dtype=bool), iterations=MASK_MARGIN)[row, column]
+    pixel = np.floor(uv_camera).astype(np.int64)
+    mask: ndarray = binary_dilation(frame.read_mask(), np.ones((3, 3), dtype=bool), iterations=MASK_MARGIN)
+    masked: ndarray = mask[pixel[:, 1], pixel[:, 0]]
     vertex, uv_camera = vertex[masked], uv_camera[masked]
     uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
     vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
         vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
-    slope = _slope(vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector)
+    slope = _slope(
+        vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector
+    )
     return vertex, *_offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, slope)
 
 
-def _faces(points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"]) -> Bool[ndarray, "n"]:
+def _faces(
+    points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"]
+) -> Bool[ndarray, "n"]:
     return ((T[:3, 3] - points) * normals).sum(1) > 0
 
 
@@ -160,8 +167,9 @@ def _offset_from_decoded(
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
     """Least and greatest distance of predicted from decoded coordinates, NaN if nothing was decoded within a pixel.
 
-    Where four decoded neighbours vary as `slope` lets expect, their bilinear value is compared. Else (an edge, or undecoded
-    neighbours) it is the nearest of nine pixels: the least distance leaves out what `slope` explains by a pixel being off the vertex.
+    Where four decoded neighbours vary as `slope` lets expect, their bilinear value is compared. Else (an edge, or
+    undecoded neighbours) it is the nearest of nine pixels, and the least distance leaves out what `slope` explains by a
+    pixel being off the vertex.
     """
     height, width = coords.shape[:2]
 

@@ -126,8 +126,8 @@ def find_leaves(grid: Grid, safety: float) -> Int[Tensor, "n 3"]:
 def evaluate_leaves(grid: Grid, lower: Int[Tensor, "n 3"]) -> Leaves:
     """The field at the corners of leaf blocks, and of those that the surface enters from them.
 
-    Where the field is not a distance the search may have missed a block; the surface then leaves the known ones through a
-    face. Such neighbours are added until none is missing, so a component is found whole if any part of it was.
+    Where the field is not a distance the search may have missed a block; the surface then leaves the known ones
+    through a face. Such neighbours are added until none is missing: a component is found whole if any part of it was.
     """
     offsets = _offsets(LEAF + 1, grid.device)
     key = torch.empty(0, dtype=torch.long, device=grid.device)

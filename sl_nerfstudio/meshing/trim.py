@@ -40,8 +40,9 @@ def trim_to_observed(
 ) -> Trimmed:
     """Keep the triangles of a mesh in world units whose corners at least one frame observed.
 
-    A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask (within a pixel) and
-    inside the pattern, and whose predicted pattern coordinate is the decoded one, or where nothing was decoded.
+    A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask
+    (within a pixel) and inside the pattern, and whose predicted pattern coordinate is the decoded one, or where nothing
+    was decoded.
     Poses default to the scan's own; give the refined ones, in the order of the frames, if the mesh was made with them.
     Raises UserError if nothing was observed.
     """
@@ -84,7 +85,7 @@ def _denied(votes: Votes) -> Bool[ndarray, "v"]:
 
 
 def _without(mesh: Mesh, denied: Bool[ndarray, "v"], observed: Bool[ndarray, "v"]) -> Mesh:
-    """The mesh without denied vertices, and without the pieces that remain of a phantom once its visible side is gone."""
+    """The mesh without denied vertices, and without what remains of a phantom once its visible side is gone."""
     edges = _edges(mesh)
     count, label = _components(len(denied), edges[~denied[edges].any(1)])
     real = np.bincount(label, observed, count) > 0
@@ -108,7 +109,7 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[
     count, label = _components(len(gap), edges[gap[edges].all(1)])
     face_gap = gap[mesh.faces]
     touched = face_gap.any(1)
-    face_label = np.where(face_gap, label[mesh.faces], -1).max(1)  # a triangle touches one patch: its corners are neighbours
+    face_label = np.where(face_gap, label[mesh.faces], -1).max(1)  # corners are neighbours, so of one patch
     areas = mesh.face_areas()
     area = np.bincount(face_label[touched], areas[touched], count)
     beside = np.zeros(count, dtype=bool)
@@ -136,10 +137,12 @@ def _specks(mesh: Mesh, kept: Bool[ndarray, "f"], votes: Votes) -> tuple[Bool[nd
 def _nothing_observed(votes: Votes) -> str:
     if (votes.denied > 0).any():
         off = f"off by {np.nanmedian(votes.residual_px):.0f} px (median)"
-        cause = f"the predicted pattern coordinates are not the decoded ones, {off}: wrong poses or axes, or an unfinished training"
+        cause = f"the predicted pattern coordinates are not the decoded ones, {off}"
     else:
-        cause = "no vertex falls inside a mask while facing camera and projector: wrong poses or axes, or an unfinished training"
+        cause = "no vertex falls inside a mask while facing camera and projector"
     return (
-        f"the frames observed no part of the surface, so nothing is left of it\n    cause:  {cause}\n"
-        "    remedy: check the scan with sl-check, look at the run in ns-viewer; --keep-unobserved writes the surface uncut"
+        "the frames observed no part of the surface, so nothing is left of it\n"
+        f"    cause:  {cause}: wrong poses or axes, or an unfinished training\n"
+        "    remedy: check the scan with sl-check and look at the run in ns-viewer; "
+        "--keep-unobserved writes the surface uncut"
     )

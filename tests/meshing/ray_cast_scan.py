@@ -29,7 +29,9 @@ def look_at(eye: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)) -> 
     return T
 
 
-def pairs_around(count: int, elevation_deg: float, distance: float = 300.0, apart_deg: float = 20.0) -> list[tuple[ndarray, ndarray]]:
+def pairs_around(
+    count: int, elevation_deg: float, distance: float = 300.0, apart_deg: float = 20.0
+) -> list[tuple[ndarray, ndarray]]:
     """Poses (camera, projector) on a circle about the z axis; both look at the origin, `apart_deg` apart."""
     height, radius = distance * np.sin(np.radians(elevation_deg)), distance * np.cos(np.radians(elevation_deg))
     poses = []
@@ -58,9 +60,15 @@ def scan_of(
             )
             frames.append(
                 Frame(
-                    name, camera, root / f"images/{name}.png", None, root / f"coords/{name}.npz",
-                    root / f"masks/{name}.png", T_camera, T_projector,
-                )  # fmt: skip
+                    name,
+                    camera,
+                    root / f"images/{name}.png",
+                    None,
+                    root / f"coords/{name}.npz",
+                    root / f"masks/{name}.png",
+                    T_camera,
+                    T_projector,
+                )
             )
     return Scan(root, "mm", Scale(True, "test"), PROJECTOR, root / "pattern.png", tuple(frames))
 
@@ -70,16 +78,19 @@ def captured(
 ) -> tuple[Float[ndarray, "h w 2"], Bool[ndarray, "h w"]]:
     """Pattern coordinates of each pixel, NaN where the pattern does not fall, and where it does."""
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(truth.vertices.astype(np.float32)), o3d.core.Tensor(truth.faces.astype(np.uint32)))
+    scene.add_triangles(
+        o3d.core.Tensor(truth.vertices.astype(np.float32)), o3d.core.Tensor(truth.faces.astype(np.uint32))
+    )
     y, x = np.mgrid[: camera.h, : camera.w] + 0.5
-    direction = np.stack(
-        [(x - camera.cx) / camera.fl_x, -(y - camera.cy) / camera.fl_y, -np.ones_like(x)], -1
-    ) @ T_camera[:3, :3].T
+    direction = (
+        np.stack([(x - camera.cx) / camera.fl_x, -(y - camera.cy) / camera.fl_y, -np.ones_like(x)], -1)
+        @ T_camera[:3, :3].T
+    )
     origin = np.broadcast_to(T_camera[:3, 3], direction.shape)
     depth = _cast(scene, origin, direction)
     hit = np.isfinite(depth)
     p_world = origin + np.where(hit, depth, 1.0)[..., None] * direction
-    p = (p_world - T_projector[:3, 3]) @ T_projector[:3, :3]
+    p: ndarray = (p_world - T_projector[:3, 3]) @ T_projector[:3, :3]
     u = PROJECTOR.fl_x * p[..., 0] / -p[..., 2] + PROJECTOR.cx
     v = -PROJECTOR.fl_y * p[..., 1] / -p[..., 2] + PROJECTOR.cy
     light = T_projector[:3, 3] - p_world

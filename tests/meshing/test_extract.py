@@ -40,7 +40,7 @@ def test_closed_analytic_surfaces(sdf, euler, volume, resolution):
     closed = solid(mesh)
     assert closed.is_watertight and closed.is_winding_consistent
     assert closed.euler_number == euler
-    # Smooth: second order, beyond the 1e-3 of a cell that vertices keep from corners. A kink inside a cell: first order.
+    # Smooth: second order, beyond the 1e-3 of a cell that vertices keep from corners. A kink in a cell: first order.
     assert sdf(torch.from_numpy(mesh.vertices)).abs().max() < (0.3 * h if sdf is box else 0.25 * h * h + 1.1e-3 * h)
     assert closed.volume == pytest.approx(volume, rel=2 * h if sdf is box else 12 * h * h)  # outward: positive
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
@@ -100,7 +100,9 @@ def test_noise_with_every_ambiguous_case_is_a_closed_surface(seed):
 def test_a_field_that_is_no_distance_gives_the_same_surface(factor):
     """Flat or steep, and steep only near the surface, where the coarse look-out cannot know it."""
     steep = extract_mesh(lambda p: factor * torus(p), 48, polish=0)
-    late = extract_mesh(lambda p: torch.sign(torus(p)) * (torus(p).abs() * 50).clamp_max(0.5 + torus(p).abs()), 64, polish=0)
+    late = extract_mesh(
+        lambda p: torch.sign(torus(p)) * (torus(p).abs() * 50).clamp_max(0.5 + torus(p).abs()), 64, polish=0
+    )
     plain = extract_mesh(torus, 48, polish=0)
     np.testing.assert_allclose(steep.vertices, plain.vertices, atol=1e-5)
     assert solid(late).is_watertight and solid(late).euler_number == 0
@@ -118,7 +120,9 @@ def test_surface_is_followed_out_of_the_blocks_that_were_found():
 
 
 def test_a_box_that_is_no_cube_and_not_centred():
-    mesh = extract_mesh(lambda p: (p - p.new_tensor([3.0, 1.0, 0.2])).norm(dim=-1) - 0.15, 61, (2.0, 0.5, 0.0), (4.0, 1.5, 0.4))
+    mesh = extract_mesh(
+        lambda p: (p - p.new_tensor([3.0, 1.0, 0.2])).norm(dim=-1) - 0.15, 61, (2.0, 0.5, 0.0), (4.0, 1.5, 0.4)
+    )
     assert solid(mesh).is_watertight and solid(mesh).euler_number == 2
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - [3.0, 1.0, 0.2], axis=1), 0.15, atol=1e-3)
 

@@ -56,8 +56,7 @@ def test_two_cells_draw_opposite_segments_on_their_common_face():
 
 
 def test_normals_point_from_negative_to_positive():
-    """The polygon's area vector leans from the mean of the negative to that of the positive corners, for one cut-off corner
-    and every half cell."""
+    """For one cut-off corner and every half cell: the area vector leans from negative to positive corners."""
     table, count = triangle_table()
     for case in [1 << c for c in range(8)] + [255 - (1 << c) for c in range(8)] + [0x0F, 0xF0, 0x33, 0xCC, 0x55, 0xAA]:
         corners = MIDDLE[table[case, : count[case]]]

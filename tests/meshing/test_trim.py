@@ -21,16 +21,20 @@ POSES = pairs_around(6, elevation_deg=40)
 
 
 def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -> Mesh:
-    low, high = (tuple(c + s * (radius + 2 * cell) for c in centre) for s in (-1, 1))
+    (x, y, z), r = centre, radius + 2 * cell
     return extract_mesh(
-        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius, round(2 * (radius / cell + 2)), low, high
+        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius,
+        round(2 * r / cell),
+        (x - r, y - r, z - r),
+        (x + r, y + r, z + r),
     )
 
 
 def together(*parts: Mesh) -> Mesh:
     offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])[:-1]
     return Mesh(
-        np.concatenate([p.vertices for p in parts]), np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)]),
     )
 
 
@@ -44,7 +48,13 @@ def angle_beyond_horizon_deg(points: np.ndarray) -> np.ndarray:
     """For points of the ball at the origin: by how much the best frame sees and lights them (negative: not at all)."""
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     height = [
-        np.min([np.arcsin(((T[:3, 3] - points) * normals).sum(1) / np.linalg.norm(T[:3, 3] - points, axis=1)) for T in pair], 0)
+        np.min(
+            [
+                np.arcsin(((T[:3, 3] - points) * normals).sum(1) / np.linalg.norm(T[:3, 3] - points, axis=1))
+                for T in pair
+            ],
+            0,
+        )
         for pair in POSES
     ]
     return np.degrees(np.max(height, 0))
@@ -109,19 +119,27 @@ def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndar
 
 @pytest.mark.parametrize("share", [0.15, 0.5])
 def test_undecoded_cells_inside_the_mask_make_no_hole(truth, scan, tmp_path, share):
-    holey = scan_of(truth, POSES, tmp_path / "scan", lambda i, c: np.where(cells(i, share)[..., None], np.float32(np.nan), c))
+    holey = scan_of(
+        truth, POSES, tmp_path / "scan", lambda i, c: np.where(cells(i, share)[..., None], np.float32(np.nan), c)
+    )
     assert euler(trim_to_observed(truth, holey).mesh) == 1
-    assert len(trim_to_observed(truth, holey).mesh.faces) == pytest.approx(len(trim_to_observed(truth, scan).mesh.faces), rel=0.02)
+    assert len(trim_to_observed(truth, holey).mesh.faces) == pytest.approx(
+        len(trim_to_observed(truth, scan).mesh.faces), rel=0.02
+    )
 
 
 @pytest.mark.parametrize("frames", [1, 6])
 def test_wrongly_decoded_cells_make_no_hole(truth, tmp_path, frames):
     """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
     camera, poses = CAMERA.scaled(2.0), POSES[:frames]
-    wrong = scan_of(truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera)
+    wrong = scan_of(
+        truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera
+    )
     result = trim_to_observed(truth, wrong)
     assert euler(result.mesh) == 1
-    assert len(result.mesh.faces) == pytest.approx(len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b")).mesh.faces), rel=0.02)
+    assert len(result.mesh.faces) == pytest.approx(
+        len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b")).mesh.faces), rel=0.02
+    )
     assert frames > 1 or result.closed > 0
 
 
@@ -141,7 +159,9 @@ def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
     T_camera, T_projector = look_at((150.0, 0.0, 300.0)), look_at((-150.0, 60.0, 300.0))
     result = trim_to_observed(both, scan_of(both, [(T_camera, T_projector)], tmp_path / "scan"))
     kept = contains(result.mesh, plane.vertices)
-    clear = np.min([clearance(plane.vertices, T[:3, 3], np.array([0.0, 0.0, 25.0])) for T in (T_camera, T_projector)], 0)
+    clear = np.min(
+        [clearance(plane.vertices, T[:3, 3], np.array([0.0, 0.0, 25.0])) for T in (T_camera, T_projector)], 0
+    )
     central = np.abs(plane.vertices).max(1) < 55
     assert kept[central & (clear > 12 + 4)].all()  # a camera pixel is 2 mm here
     assert not kept[clear < 12 - 4].any()
@@ -152,7 +172,7 @@ def plate(half: float, cell: float) -> Mesh:
     n = int(2 * half / cell) + 1
     x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n))
     i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
-    faces = np.concatenate([i + [0, 1, n], i + [1, n + 1, n]])
+    faces = np.concatenate([i + np.array([0, 1, n]), i + np.array([1, n + 1, n])])
     return Mesh(np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], 1), faces)
 
 
@@ -186,14 +206,21 @@ def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def test_given_poses_replace_those_of_the_scan(truth, scan):
-    S = Similarity(1.0, exp_se3(torch.tensor([0, 0, 0, 0.3, -0.2, 0.9], dtype=torch.float64)).numpy()[:3, :3], np.array([500.0, -20, 7]))
+    S = Similarity(
+        1.0,
+        exp_se3(torch.tensor([0, 0, 0, 0.3, -0.2, 0.9], dtype=torch.float64)).numpy()[:3, :3],
+        np.array([500.0, -20, 7]),
+    )
     moved = trim_to_observed(truth.mapped(S), scan, S.poses(scan.T_world_camera), S.poses(scan.T_world_projector)).mesh
     assert len(moved.faces) == pytest.approx(len(trim_to_observed(truth, scan).mesh.faces), rel=2e-3)
 
 
 def test_wrong_poses_say_so(truth, scan):
     upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
-    with pytest.raises(UserError, match=r"the frames observed no part(.|\n)*no vertex falls inside a mask(.|\n)*sl-check(.|\n)*--keep-unobserved"):
+    with pytest.raises(
+        UserError,
+        match=r"the frames observed no part(.|\n)*no vertex falls inside a mask(.|\n)*sl-check(.|\n)*--keep-unobserved",
+    ):
         trim_to_observed(truth, scan, scan.T_world_camera @ upside_down, scan.T_world_projector @ upside_down)
 
 
