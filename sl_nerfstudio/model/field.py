@@ -4,17 +4,21 @@ Inside the box [-1, 1]^3 the field is `f(p) = MLP(p, features(p))`. Outside it i
 box: `f(p) = f(q) + |p - q|` with `q` the nearest point of the box.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.encoding import GridLayout, HashGrid
-from sl_nerfstudio.model.encoding_torch import encode
+from sl_nerfstudio.model.field_backend import BackendName, FieldBackend, FieldState, numba_cannot
+from sl_nerfstudio.model.field_function import value, value_and_gradient
+from sl_nerfstudio.model.field_torch import TorchField, knee
+from sl_nerfstudio.model.table_gradient import TableGradient
 
 
 @dataclass
@@ -37,12 +41,12 @@ class FieldConfig:
     """Width of the MLP's hidden layers."""
     hidden_layers: int = 2
     """Number of the MLP's hidden layers."""
-    softplus_beta: float = 100.0
-    """Sharpness of the activation `log(1 + exp(beta x)) / beta`."""
+    knee: float = 0.02
+    """Half-width of the rounded corner of the activation, a ReLU that is twice continuously differentiable."""
     sphere_radius: float = 0.5
     """Radius, in scene units, of the sphere the field starts from."""
-    backend: Literal["auto", "torch", "numba"] = "auto"
-    """Implementation of the grid: numba on the CPU and torch on GPUs, or one of them by name."""
+    backend: BackendName = "auto"
+    """numba: compiled for this CPU; torch: any device and precision; auto: numba wherever it can."""
 
 
 class SDFField(nn.Module):
@@ -62,7 +66,9 @@ class SDFField(nn.Module):
             )
         )
         widths = [3 + self.encoding.layout.width] + [config.hidden] * config.hidden_layers + [1]
-        self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+        self._torch = TorchField(self.encoding.layout, config.knee)
+        self._numba: FieldBackend | None = None
         self._start_as_sphere(config.sphere_radius)
 
     def _start_as_sphere(self, radius: float) -> None:
@@ -101,34 +107,48 @@ class SDFField(nn.Module):
 
     def _hidden(self, h: Float[Tensor, "n w"]) -> Float[Tensor, "n hidden"]:
         for layer in self.hidden:
-            h = F.softplus(layer(h), beta=self.config.softplus_beta)
+            h = knee(layer(h), self.config.knee)
         return h
 
     def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
         """Fade the grid's levels in, coarse to fine: one weight in [0, 1] a level."""
         self.encoding.set_level_weights(weights)
 
-    def _inside(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        encoding = self.encoding
-        h = torch.cat([q, encode(encoding.layout, encoding.table, encoding.level_weights, q)], -1)
-        return self.last(self._hidden(h))[:, 0]
-
     def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Signed distance; differentiable with respect to the parameters and `p`."""
-        q = p.clamp(-1, 1)
-        return self._inside(q) + _safe_norm(p - q)
+        """Signed distance; differentiable (once) with respect to the parameters and `p`."""
+        state = self._state()
+        return value(self._backend(state), self._buffer(state), state, p)
 
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
-        with torch.enable_grad():
-            p = p.detach().requires_grad_()
-            f = self.sdf(p)
-            (g,) = torch.autograd.grad(f.sum(), p, create_graph=True)
-        return f, g
+        state = self._state()
+        return value_and_gradient(self._backend(state), self._buffer(state), state, p)
+
+    def _state(self) -> FieldState:
+        mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
+        return FieldState(self.encoding.table, self.encoding.level_weights, mlp)
+
+    def _backend(self, state: FieldState) -> FieldBackend:
+        name = self.config.backend
+        obstacle = numba_cannot(self.encoding.layout, state.table)
+        if name == "torch" or (name == "auto" and obstacle is not None):
+            return self._torch
+        if obstacle is not None:
+            raise UserError(f"{obstacle}; choose the backend auto or torch")
+        if self._numba is None:
+            self._numba = _numba_field(self.encoding.layout, self.config.knee)
+        return self._numba
+
+    def _buffer(self, state: FieldState) -> TableGradient | None:
+        """The table's persistent gradient buffer, where one is used: compiled kernels, one process."""
+        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+        if distributed or self._backend(state) is self._torch:
+            return None
+        return TableGradient.of(self.encoding.table)
 
 
-def _safe_norm(v: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Euclidean length whose derivative at zero is zero."""
-    square = (v * v).sum(-1)
-    zero = square == 0
-    return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())
+def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:
+    """The compiled backend; numba is imported only when it is needed (it takes a second)."""
+    from sl_nerfstudio.model.field_numba import NumbaField
+
+    return NumbaField(layout, knee)

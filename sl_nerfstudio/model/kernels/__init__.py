@@ -1,0 +1,1 @@
+"""The field's compiled CPU kernels: numba, without BLAS, without OpenMP, without a compiler at the user's."""

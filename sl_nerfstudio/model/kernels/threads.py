@@ -1,0 +1,45 @@
+"""Run independent pieces of work in parallel, on as many threads as torch uses.
+
+The pieces are numba kernels that release the GIL. Idle threads sleep: unlike an OpenMP team they do not spin beside
+torch's own. Callers may be several threads (training, viewer) at once.
+"""
+
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+import torch
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The process's threads; a forked child makes its own."""
+    return ThreadPoolExecutor(max_workers=max((os.cpu_count() or 2) - 1, 1), thread_name_prefix="sl-field")
+
+
+def parallel(tasks: Sequence[Callable[[], object]]) -> None:
+    """Run all tasks, each once, in any order, on up to `torch.get_num_threads()` threads; raises what a task raises."""
+    queue = itertools.count()
+
+    def work() -> None:
+        while (i := next(queue)) < len(tasks):
+            tasks[i]()
+
+    others = min(torch.get_num_threads(), len(tasks)) - 1
+    futures = [_pool(os.getpid()).submit(work) for _ in range(others)]
+    try:
+        work()
+    finally:
+        errors = [future.exception() for future in futures]
+    for error in errors:
+        if error is not None:
+            raise error
+
+
+def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:
+    """One to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
+    step = max(-(-n // parts), 1)
+    step = -(-step // multiple) * multiple
+    return [(start, min(start + step, n)) for start in range(0, max(n, 1), step)]
