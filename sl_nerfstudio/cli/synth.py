@@ -1,7 +1,8 @@
 """sl-synth: make a synthetic scan."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -10,27 +11,29 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 
 
 @dataclass(frozen=True)
-class Arguments(SynthConfig):
+class Arguments:
     """Make a synthetic scan with its truth: a moving camera and a moving projector about a matte object.
 
     Lengths in flags are millimetres, fractions lie between 0 and 1.
     """
 
-    output: Path = Path("scan")
+    output: Path
     """folder to write; it must be new or empty"""
-
-
-def _synthesise() -> None:
-    arguments = tyro.cli(Arguments, prog="sl-synth")
-    from sl_nerfstudio.synthesis.synthesise import synthesise  # slow to import: torch, open3d
-
-    synthesise(arguments, arguments.output)
-    print(f"wrote {arguments.frames} frames to {arguments.output}")
+    config: Annotated[SynthConfig, tyro.conf.arg(name="")] = field(default_factory=SynthConfig)
 
 
 def main() -> None:
     """Entry point of the command."""
     run(_synthesise)
+
+
+def _synthesise() -> None:
+    arguments = tyro.cli(Arguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes))
+    arguments.config.check()
+    from sl_nerfstudio.synthesis.synthesise import synthesise  # slow to import: torch, open3d
+
+    synthesise(arguments.config, arguments.output)
+    print(f"wrote {arguments.config.frames} frames to {arguments.output}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ changes no symbol. Both facts let windows be compared under every roll of the ca
 """
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float32, Int
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.code_search import resolve_conflicts
@@ -47,15 +47,17 @@ def hamming_margin(codes: Int[ndarray, "rows columns"], rotations: bool = True, 
     turned by 90, 180 and 270 degrees, as a camera that rolls freely sees them.
     """
     plain = windows(codes, size)
-    least = size * size
+    most_alike = 0
     for turns in range(4 if rotations else 1):
-        turned = windows_turned(plain, turns, size)
-        for index, window in enumerate(plain):
-            distance = (turned != window).sum(1)
-            if turns == 0:
-                distance[index] = size * size
-            least = min(least, int(distance.min()))
-    return least
+        alike = _one_hot(plain) @ _one_hot(windows_turned(plain, turns, size)).T  # cells in which two windows agree
+        if turns == 0:
+            np.fill_diagonal(alike, 0)
+        most_alike = max(most_alike, int(alike.max()))
+    return size * size - most_alike
+
+
+def _one_hot(plain: Int[ndarray, "n cells"]) -> Float32[ndarray, "n symbols"]:
+    return (plain[..., None] == np.arange(SYMBOLS)).reshape(len(plain), -1).astype(np.float32)
 
 
 def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int = WINDOW) -> Int[ndarray, "n cells"]:

@@ -92,7 +92,7 @@ class GridPattern:
         light = np.clip(self.line_width / 2 + 0.5 - distance, 0.0, 1.0)
         return self.dark + (1 - self.dark) * light
 
-    def render(self, supersampling: int = 4) -> Float32[ndarray, "h w"]:
+    def render(self, supersampling: int = 2) -> Float32[ndarray, "h w"]:
         """The pattern as an image in [0, 1], each pixel the mean of `supersampling`^2 places."""
         step = (np.arange(supersampling) + 0.5) / supersampling
         image = np.zeros((self.h, self.w))

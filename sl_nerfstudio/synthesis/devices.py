@@ -1,6 +1,6 @@
 """Intrinsics that suit a scene: the object fills the image, the pattern covers the object."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -8,12 +8,12 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, DeviceKind, Intrinsics, project, unproject
-from sl_nerfstudio.synthesis.paths import DISTANCE
+from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 
 Distortion = tuple[float, float, float, float]
-_CAMERA_FILL = 0.84  # of the image's half width: radius of the object
-_PATTERN_FILL = 0.80
+_CAMERA_FILL = 0.92  # of the image's half width, where the object reaches farthest out in any frame
+_PATTERN_FILL = 0.88
 
 
 @dataclass(frozen=True)
@@ -24,25 +24,36 @@ class Pair:
     projector: Device
 
 
-def make_devices(
-    scene: Scene,
-    resolution: int,
-    pattern_size: tuple[int, int],
-    projector_model: DeviceKind = "OPENCV",
-    camera_distortion: Distortion = (0.0, 0.0, 0.0, 0.0),
-    projector_distortion: Distortion = (0.0, 0.0, 0.0, 0.0),
-) -> Pair:
-    """A square camera of `resolution` pixels and a projector of the pattern's (w, h)."""
-    spread = DISTANCE * scene.size / scene.radius
-    fl = _CAMERA_FILL * resolution / 2 * spread
-    w, h = pattern_size
-    fl_p = _PATTERN_FILL * min(w, h) / 2 * spread
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What may be chosen about both devices."""
+
+    resolution: int = 400
+    projector_model: DeviceKind = "OPENCV"
+    camera_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
+    projector_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
+
+
+def make_devices(scene: Scene, poses: Poses, pattern_size: tuple[int, int], options: DeviceOptions) -> Pair:
+    """A square camera and a projector of the pattern's (w, h), zoomed so that every frame holds the whole object."""
+    n, (w, h) = options.resolution, pattern_size
     # principal points a little off the middle, as real devices have them
-    camera = Device(
-        resolution, resolution, fl, fl, 0.503 * resolution, 0.496 * resolution, *camera_distortion, model="OPENCV"
+    camera = Device(n, n, 1.0, 1.0, 0.503 * n, 0.496 * n, *options.camera_distortion)
+    projector = Device(w, h, 1.0, 1.0, 0.498 * w, 0.505 * h, *options.projector_distortion, options.projector_model)
+    return Pair(
+        _zoomed(camera, scene, poses.T_world_camera, _CAMERA_FILL),
+        _zoomed(projector, scene, poses.T_world_projector, _PATTERN_FILL),
     )
-    projector = Device(w, h, fl_p, fl_p, 0.498 * w, 0.505 * h, *projector_distortion, model=projector_model)
-    return Pair(camera, projector)
+
+
+def _zoomed(device: Device, scene: Scene, T_world_device: Float[ndarray, "n 4 4"], fill: float) -> Device:
+    """The device with the focal length at which the object reaches out to `fill` of the half image."""
+    some = scene.vertices[:: max(1, len(scene.vertices) // 2000)]
+    reach = 0.0
+    for T in T_world_device:
+        out = np.abs(pixels(device, T, some)[0] - (device.cx, device.cy)) / (device.w / 2, device.h / 2)
+        reach = max(reach, float(out.max()))
+    return replace(device, fl_x=fill / reach, fl_y=fill / reach)
 
 
 def rays(

@@ -67,20 +67,37 @@ def capture(
     """Render a frame: correspondences at pixel centres, light as the mean of `supersampling`^2 rays a pixel."""
     w, h = devices.camera.w, devices.camera.h
     corner = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
-    at_centres = look(caster, devices, T_world_camera, T_world_projector, corner + 0.5)
-    coords = np.where(at_centres.lit[:, None], at_centres.uv_projector, np.nan).astype(np.float32)
-    radiance = np.zeros(h * w, dtype=np.float32)
-    near = _near_the_object(at_centres.hit.reshape(h, w)).reshape(-1)
+    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
+    mask, hit = np.zeros((2, h * w), dtype=bool)
+    box = _box_of_the_object(caster.scene, devices, T_world_camera).reshape(-1)
+    at_centres = look(caster, devices, T_world_camera, T_world_projector, corner[box] + 0.5)
+    mask[box], hit[box] = at_centres.lit, at_centres.hit
+    coords[mask] = at_centres.uv_projector[at_centres.lit]
+    radiance = np.full(h * w, appearance.background, dtype=np.float32)
+    near = _near_the_object(hit.reshape(h, w)).reshape(-1)
+    light = np.zeros(int(near.sum()), dtype=np.float32)
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
         for dx in step:
             sight = look(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
-            radiance[near] += _light(sight, caster.scene, devices, T_world_projector, pattern, appearance)
-    radiance[near] /= supersampling**2
-    radiance[~near] = appearance.background
-    return Capture(
-        coords.reshape(h, w, 2), at_centres.lit.reshape(h, w), appearance.through_lens(radiance.reshape(h, w))
-    )
+            light += _light(sight, caster.scene, devices, T_world_projector, pattern, appearance)
+    radiance[near] = light / supersampling**2
+    return Capture(coords.reshape(h, w, 2), mask.reshape(h, w), appearance.through_lens(radiance.reshape(h, w)))
+
+
+def _box_of_the_object(
+    scene: Scene, devices: Pair, T_world_camera: Float[ndarray, "4 4"]
+) -> Bool[ndarray, "h w"]:
+    """Pixels that may see the object: a rectangle around its vertices; the whole image if some lie behind."""
+    camera = devices.camera
+    uv, _ = pixels(camera, T_world_camera, scene.vertices)
+    depth = -(scene.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+    box = np.zeros((camera.h, camera.w), dtype=bool)
+    if depth.min() <= 0 or camera.k1 or camera.k2 or camera.p1 or camera.p2:
+        return ~box  # behind the camera, or bent edges
+    (x0, y0), (x1, y1) = np.clip(np.floor(uv.min(0)) - 1, 0, None).astype(int), np.ceil(uv.max(0)).astype(int) + 1
+    box[y0:y1, x0:x1] = True
+    return box
 
 
 def _near_the_object(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:

@@ -1,15 +1,18 @@
 """Scenes by name, and from mesh files."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.frog import frog
+from sl_nerfstudio.synthesis.head import head
 from sl_nerfstudio.synthesis.scene import Scene
 
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
-BUILT_IN = {"cone-and-cylinder": cone_and_cylinder}
+BUILT_IN: dict[str, Callable[[], Scene]] = {"cone-and-cylinder": cone_and_cylinder, "head": head, "frog": frog}
 
 
 def make_scene(name: str, file_unit: float = 1.0) -> Scene:

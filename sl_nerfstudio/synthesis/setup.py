@@ -1,0 +1,124 @@
+"""Everything that is settled before the first frame is rendered: scene, devices, paths and their errors."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from sl_nerfstudio.pattern.files import read_pattern
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.types import PoseSigma
+from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
+from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
+from sl_nerfstudio.synthesis.devices import DeviceOptions, Pair, make_devices
+from sl_nerfstudio.synthesis.noise import Cells
+from sl_nerfstudio.synthesis.paths import DISTANCE, Poses, make_paths
+from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, pose_sigma
+from sl_nerfstudio.synthesis.ray_casting import Caster
+from sl_nerfstudio.synthesis.render import Capture, capture, look
+from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes import make_scene
+
+_REGISTRATION_GRID = 28  # pixels a side that a frame's disturbed points are registered by
+
+
+class Stream(IntEnum):
+    """Every use of randomness has its own stream: changing one leaves the others as they were."""
+
+    PATHS = 1
+    TEXTURE = 2
+    POSES = 3
+    COORDS = 4
+    SENSOR = 5
+    WORLD = 6
+
+
+def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Generator:
+    """The generator of one use of randomness in one frame."""
+    return np.random.default_rng([seed, int(stream), frame])
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A scan before it is taken; lengths in millimetres, poses in the scene's axes."""
+
+    scene: Scene
+    caster: Caster
+    devices: Pair
+    pattern: Float32[ndarray, "h w"]
+    grid: GridPattern | None  # None: the pattern is a plain image
+    cells: Cells
+    appearance: Appearance
+    truth: Poses
+    start: Poses
+    sigma: PoseSigma | None
+
+    def render(self, frame: int, supersampling: int) -> Capture:
+        """Frame number `frame`, without noise."""
+        return capture(
+            self.caster,
+            self.devices,
+            self.truth.T_world_camera[frame],
+            self.truth.T_world_projector[frame],
+            self.pattern,
+            self.appearance,
+            supersampling,
+        )
+
+
+def make_setup(config: SynthConfig) -> Setup:
+    """Scene, devices, paths and their errors, as the configuration says. Raises UserError for bad files."""
+    scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
+    pattern, grid = _make_pattern(config)
+    truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
+    options = DeviceOptions(
+        config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
+    )
+    devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
+    caster = Caster(scene)
+    noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
+    pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
+    matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
+    start = disturb_poses(
+        truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES)
+    )
+    return Setup(
+        scene=scene,
+        caster=caster,
+        devices=devices,
+        pattern=pattern,
+        grid=grid,
+        cells=make_cells(pattern, grid),
+        appearance=make_appearance(scene, DISTANCE * scene.size, random_stream(config.seed, Stream.TEXTURE)),
+        truth=truth,
+        start=start,
+        sigma=pose_sigma(truth, start, scene.centre),
+    )
+
+
+def make_cells(pattern: Float32[ndarray, "h w"], grid: GridPattern | None) -> Cells:
+    """The grid's cells; a plain image counts as 40 cells along its longer side."""
+    h, w = pattern.shape
+    if grid is not None:
+        return Cells(grid.period, grid.x0, grid.y0, grid.rows, grid.columns, w, h)
+    period = max(w, h) / 40
+    return Cells(period, period / 2, period / 2, max(1, round(h / period)), max(1, round(w / period)), w, h)
+
+
+def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], GridPattern | None]:
+    if config.pattern is not None:
+        return read_pattern(config.pattern)
+    grid = GridPattern()
+    return grid.render(), grid
+
+
+def _matches(
+    caster: Caster, devices: Pair, T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]
+) -> Correspondences:
+    """Exact correspondences on a coarse grid of pixels."""
+    place = (np.arange(_REGISTRATION_GRID) + 0.5) / _REGISTRATION_GRID
+    uv = np.stack(np.meshgrid(place * devices.camera.w, place * devices.camera.h), -1).reshape(-1, 2)
+    sight = look(caster, devices, T_world_camera, T_world_projector, uv)
+    return Correspondences(uv[sight.lit], sight.uv_projector[sight.lit], sight.p_world[sight.lit])
