@@ -7,13 +7,11 @@ nearly all frames are beyond what any calibration error can do.
 
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.convention_words import APART, describe, hopeless, key_of, wrong_unit
 from sl_nerfstudio.scan.correspondences import Correspondences
 from sl_nerfstudio.scan.problem import Problem
-from sl_nerfstudio.scan.readings import Fit, Reading, apply_reading, fit_frames, other_readings
+from sl_nerfstudio.scan.readings import Fit, Reading, apply_reading, distance_to_others, fit_frames, other_readings
 
 # Epipolar residuals as fractions of the projector's focal length: angles in radian.
 _SUSPECT = 0.01  # 0.6 degrees: worse than auto-calibration usually is
@@ -22,6 +20,7 @@ _FITS = 0.05  # the most that a reading which "fits" may leave
 _HOPELESS = 0.35  # 19 degrees: no error of a calibration
 _MUCH_BETTER = 0.2  # factor by which the right reading must lower the residual
 _MUCH_CLOSER = 0.4  # factor by which the right reading must lower that distance
+_ONE_SURFACE = 0.1  # the most it may leave, in working distances, with frames out of place by 10 degrees
 _MOST = 0.9  # share of hopeless frames that makes a scan hopeless
 _NEAREST, _FARTHEST = 1e-3, 100.0  # metres; working distances outside are a unit's mistake
 
@@ -54,7 +53,7 @@ def convention_problems(
 
 def _better_reading(frames: Sequence[Correspondences], projector: Device, given: Fit, focal: float) -> Reading | None:
     """The mix-up that, undone, makes the whole scan fit; None if it fits as it is or nothing helps."""
-    if given.typical_px <= _SUSPECT * focal and not APART < given.typical_spread < np.inf:
+    if given.typical_px <= _SUSPECT * focal and given.typical_spread <= APART:
         return None
     found: list[tuple[float, Reading]] = []
     for reading in other_readings():
@@ -69,13 +68,15 @@ def _better_reading_of_frame(
 ) -> Reading | None:
     """The mix-up that, undone in one frame alone, makes it fit the others."""
     residual, spread = float(given.residual_px[index]), float(given.spread[index])
-    if residual <= _SUSPECT_FRAME * focal and not APART < spread < np.inf:
+    if given.depth == 0 or (residual <= _SUSPECT_FRAME * focal and spread <= APART):
         return None
     found: list[tuple[float, Reading]] = []
     for reading in other_readings():
-        changed = [apply_reading(reading, f, projector) if i == index else f for i, f in enumerate(frames)]
-        fit = fit_frames(changed, projector)
-        px, apart = float(fit.residual_px[index]), float(fit.spread[index])
+        alone = fit_frames([apply_reading(reading, frames[index], projector)], projector)
+        px, cloud = alone.typical_px, alone.clouds[0]
+        if px > _FITS * focal:
+            continue
+        apart = distance_to_others(cloud, given.clouds, index) / given.depth
         if apart < APART and _explains(residual, spread, px, apart, focal):
             found.append((_badness(px, apart, focal), reading))
     return min(found, key=lambda item: item[0])[1] if found else None
@@ -86,8 +87,10 @@ def _explains(px_before: float, spread_before: float, px: float, spread: float, 
     if px > _FITS * focal:
         return False
     if px_before > _SUSPECT * focal and px < _MUCH_BETTER * px_before:
-        return not spread > max(APART, spread_before)
-    return APART < spread_before < np.inf and spread < _MUCH_CLOSER * spread_before and px < max(2 * px_before, 2.0)
+        return px < _SUSPECT * focal or spread <= max(APART, spread_before)
+    # The rays meet as well in either reading: only the agreement of the frames tells. Views that never overlap
+    # (a room seen from its middle) may come nearer to each other in a wrong reading, but not to one surface.
+    return spread_before > APART and spread < min(_MUCH_CLOSER * spread_before, _ONE_SURFACE) and px < 2 * px_before + 1
 
 
 def _badness(px: float, spread: float, focal: float) -> float:

@@ -1,5 +1,6 @@
 """transforms.json taken apart: what could be read of each frame, and everything that could not."""
 
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,8 +93,8 @@ def read_draft(root: Path, faults: Faults, need_coords: bool = True) -> Draft:
 
 
 def _transforms_path(root: Path) -> Path:
-    if not root.is_dir():
-        what = "is a file, not a folder" if root.exists() else "does not exist"
+    if not os.path.isdir(root):
+        what = "is a file, not a folder" if os.path.lexists(root) else "does not exist"
         raise FileError(
             root, f"is missing: {root} {what}", "a slip in the path", "give the folder that holds transforms.json"
         )

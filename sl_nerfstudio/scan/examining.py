@@ -1,5 +1,6 @@
 """The full check of a scan folder: everything `read_scan` sees, every pixel, and how all of it fits together."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ class Examination:
 
 def examine(root: Path) -> Examination:
     """Check a folder wholly, with progress; never raises for a faulty scan. Holds one frame in memory at a time."""
-    root = Path(root).absolute()
+    root = Path(os.path.realpath(root))
     faults = Faults()
     draft = read_draft(root, faults)
     good = check_headers(draft, faults)

@@ -1,5 +1,6 @@
 """Reading a scan folder."""
 
+import os
 from pathlib import Path
 
 from sl_nerfstudio.errors import ScanError
@@ -14,7 +15,7 @@ def read_scan(root: Path, need_coords: bool = True) -> Scan:
 
     `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all faults found.
     """
-    root = Path(root).absolute()
+    root = Path(os.path.realpath(root))
     faults = Faults()
     draft = read_draft(root, faults, need_coords)
     check_headers(draft, faults)

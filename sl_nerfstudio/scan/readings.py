@@ -43,6 +43,7 @@ class Fit:
     residual_px: Float64[ndarray, "n"]  # median epipolar residual; inf: most points lie behind a device
     spread: Float64[ndarray, "n"]  # median distance to the points of other frames, in depths; inf: too few points
     depth: float  # median distance of all points from their cameras; 0: no points
+    clouds: tuple[Float64[ndarray, "_ 3"], ...]  # some triangulated points of each frame
 
     @property
     def typical_px(self) -> float:
@@ -96,8 +97,21 @@ def fit_frames(frames: Sequence[Correspondences], projector: Device) -> Fit:
     in_front = residual.isfinite()
     points = triangulate(*geometry)
     depth = float(points.depth_camera[in_front].median()) if in_front.any() else 0.0
-    clouds = [p[ok].numpy() for p, ok in zip(points.p_world, in_front, strict=True)]
-    return Fit(residual.median(-1).values.numpy(), _distances_between(clouds) / max(depth, 1e-300), depth)
+    clouds = tuple(_thin(p[ok].numpy()) for p, ok in zip(points.p_world, in_front, strict=True))
+    spread = [distance_to_others(cloud, clouds, index) for index, cloud in enumerate(clouds)]
+    return Fit(residual.median(-1).values.numpy(), np.array(spread) / max(depth, 1e-300), depth, clouds)
+
+
+def distance_to_others(cloud: Float64[ndarray, "n 3"], clouds: Sequence[Float64[ndarray, "_ 3"]], index: int) -> float:
+    """Median distance of a cloud's points to the nearest point of any of `clouds` but number `index`; inf if unknown."""
+    others = np.concatenate([np.empty((0, 3)), *(c for i, c in enumerate(clouds) if i != index)])
+    if len(cloud) < _FEWEST_POINTS or len(others) < _FEWEST_POINTS:
+        return np.inf
+    return float(np.median(KDTree(others).query(cloud)[0]))
+
+
+def _thin(cloud: Float64[ndarray, "n 3"]) -> Float64[ndarray, "_ 3"]:
+    return cloud[:: max(1, len(cloud) // _CLOUD_POINTS)]
 
 
 def _read_pose(T: Float64[ndarray, "4 4"], reading: PoseReading) -> Float64[ndarray, "4 4"]:
@@ -108,17 +122,6 @@ def _read_pose(T: Float64[ndarray, "4 4"], reading: PoseReading) -> Float64[ndar
 def _read_coords(uv: Float64[ndarray, "n 2"], reading: Reading, projector: Device) -> Float64[ndarray, "n 2"]:
     x, y = uv.T[::-1] if reading.exchanged else uv.T
     return np.stack([projector.w - x if reading.mirrored_x else x, projector.h - y if reading.mirrored_y else y], -1)
-
-
-def _distances_between(clouds: list[Float64[ndarray, "..."]]) -> Float64[ndarray, "n"]:
-    """For each cloud, the median distance of its points to the nearest point of any other cloud; inf if unknown."""
-    thin = [cloud[:: max(1, len(cloud) // _CLOUD_POINTS)] for cloud in clouds]
-    out = np.full(len(clouds), np.inf)
-    for index, cloud in enumerate(thin):
-        others = np.concatenate([np.empty((0, 3)), *(c for i, c in enumerate(thin) if i != index)])
-        if len(cloud) >= _FEWEST_POINTS and len(others) >= _FEWEST_POINTS:
-            out[index] = float(np.median(KDTree(others).query(cloud)[0]))
-    return out
 
 
 def _stack(arrays: Iterator[Float64[ndarray, "..."]]) -> Tensor:
