@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def _synthesise() -> None:
-    arguments = tyro.cli(Arguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes))
+    arguments = tyro.cli(Arguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
     arguments.config.check()
     from sl_nerfstudio.synthesis.synthesise import synthesise  # slow to import: torch, open3d
 

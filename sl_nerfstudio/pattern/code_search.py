@@ -17,8 +17,10 @@ _RANDOM_MOVES = 0.1
 
 
 def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_margin: int, seed: int) -> bool:
-    """Change `codes` in place until all 3x3 windows differ in at least `margin` cells (1 to 3), and in at
-    least `turned_margin` cells (0 to 3) from all windows of the turned pattern. False if it fails.
+    """Change `codes` in place until its 3x3 windows are far enough from each other; False if it fails.
+
+    Any two differ in at least `margin` cells (1 to 3), and each differs in at least `turned_margin` cells
+    (0 to 3) from all windows of the pattern turned by 90, 180 or 270 degrees.
     """
     return bool(_search(codes, margin - 1, turned_margin - 1, seed, _MOVES_PER_CELL * codes.size))
 

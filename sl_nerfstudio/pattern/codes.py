@@ -68,8 +68,7 @@ def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int
 def code_array(
     rows: int, columns: int, seed: int = 0, margin: int = 3, turned_margin: int = 2
 ) -> Int[ndarray, "rows columns"]:
-    """Random symbols whose 3x3 windows differ pairwise in `margin` cells, and in `turned_margin` cells when
-    one of the two is turned by a quarter turn or more.
+    """Random symbols whose 3x3 windows differ in `margin` cells, or `turned_margin` when one of the two is turned.
 
     Starts from a random fill and re-samples cells of windows that are too similar to others. If the
     margins cannot be had for so large an array, lower ones are tried: `hamming_margin` tells what was

@@ -24,7 +24,7 @@ def grid_document(grid: GridPattern, image: str = "pattern.png") -> dict[str, An
         "sl_pattern": FORMAT,
         "kind": "grid",
         "image": image,
-        **grid.without_codes(),
+        **{key: getattr(grid, key) for key in ("w", "h", *_LENGTHS, "seed")},
         "x0": grid.x0,
         "y0": grid.y0,
         "rows": grid.rows,

@@ -5,7 +5,7 @@ Between two nodes a segment runs straight from the offset that the first node gi
 of the second, so that lines bend a little and nodes stay where the regular grid has them.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -114,14 +114,6 @@ class GridPattern:
         top = np.concatenate([above[:1], below], 0)
         bottom = np.concatenate([above, below[-1:]], 0)
         return np.stack([start, end], -1), np.stack([top, bottom], -1)
-
-    def without_codes(self) -> dict[str, float]:
-        """The numbers that describe the grid, as plain JSON values."""
-        return asdict(replace(self, codes=np.zeros((self.rows, self.columns), np.int8)), dict_factory=_numbers)
-
-
-def _numbers(pairs: list[tuple[str, object]]) -> dict[str, object]:
-    return {key: value for key, value in pairs if key != "codes"}
 
 
 def _along(

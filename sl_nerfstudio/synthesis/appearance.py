@@ -22,9 +22,9 @@ class Appearance:
     wave_phases: Float[ndarray, "k"]
     mean_albedo: float = 0.78
     albedo_contrast: float = 0.16
-    room_light: float = 0.06
+    room_light: float = 0.08
     background: float = 0.025
-    dark_leak: float = 0.03  # light of the projector between the lines
+    dark_leak: float = 0.04  # light of the projector between the lines
     corner_loss: float = 0.35  # of the lamp, in the pattern's corners
     blur: float = 0.55  # sigma of the lens, pixels
 

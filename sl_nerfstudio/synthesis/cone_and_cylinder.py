@@ -40,9 +40,7 @@ class _Builder:
 
     def fan(self, ring: Float[ndarray, "n 3"], centre: Float[ndarray, "3"]) -> None:
         """Triangles from a ring, counter-clockwise from outside, to a point."""
-        self.triangles.append(
-            np.stack([ring, np.roll(ring, -1, axis=0), np.broadcast_to(centre, ring.shape)], 1)
-        )
+        self.triangles.append(np.stack([ring, np.roll(ring, -1, axis=0), np.broadcast_to(centre, ring.shape)], 1))
 
     def merged(self) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
         """Vertices without duplicates, and faces without degenerate ones."""

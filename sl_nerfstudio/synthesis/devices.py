@@ -56,9 +56,7 @@ def _zoomed(device: Device, scene: Scene, T_world_device: Float[ndarray, "n 4 4"
     return replace(device, fl_x=fill / reach, fl_y=fill / reach)
 
 
-def rays(
-    device: Device, T_world_device: Float[ndarray, "4 4"], uv: Float[ndarray, "n 2"]
-) -> Float64[ndarray, "n 3"]:
+def rays(device: Device, T_world_device: Float[ndarray, "4 4"], uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """Unit directions in the world of the rays through pixels."""
     directions = unproject(Intrinsics.of(device, torch.float64), torch.from_numpy(np.ascontiguousarray(uv, np.float64)))
     return directions.numpy() @ T_world_device[:3, :3].T

@@ -1,4 +1,4 @@
-"""A head with neck, about 130 x 150 x 190 mm: large smooth parts with small features in them."""
+"""A head with neck, about 147 x 195 x 201 mm: large smooth parts with small features in them."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,11 +7,9 @@ from numpy import ndarray
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.sdf import capsule, carve, ellipsoid, half_space, mesh_of, mirrored, ridges, union
 
-_CELL = 1.25
 
-
-def head() -> Scene:
-    """Looks along +y; x runs from its left to its right as it sees, z up; stands on z = 0."""
+def head(cell: float = 1.25) -> Scene:
+    """Looks along +y and stands on z = 0; a mesh of edges about `cell` long."""
     skull = union(
         26.0,
         ellipsoid((0, -10, 132), (62, 74, 60)),
@@ -47,7 +45,7 @@ def head() -> Scene:
     knot = ridges(ellipsoid((14, -86, 158), (22, 19, 21)), 0.9, lambda p: 0.75 * (p[:, 0] + 0.6 * p[:, 2]))
     whole = union(2.5, union(0.5, face, union(2.0, hair, knot)), mirrored(ear))
     solid = carve(0.0, whole, half_space((0, 0, 1), 0.0))
-    return mesh_of("head", solid, (-86, -116, -6), (86, 96, 212), _CELL, elevation_deg=(4.0, 58.0))
+    return mesh_of("head", solid, (-86, -116, -6), (86, 96, 212), cell, elevation_deg=(4.0, 58.0))
 
 
 def _strands(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:

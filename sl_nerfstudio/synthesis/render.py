@@ -85,9 +85,7 @@ def capture(
     return Capture(coords.reshape(h, w, 2), mask.reshape(h, w), appearance.through_lens(radiance.reshape(h, w)))
 
 
-def _box_of_the_object(
-    scene: Scene, devices: Pair, T_world_camera: Float[ndarray, "4 4"]
-) -> Bool[ndarray, "h w"]:
+def _box_of_the_object(scene: Scene, devices: Pair, T_world_camera: Float[ndarray, "4 4"]) -> Bool[ndarray, "h w"]:
     """Pixels that may see the object: a rectangle around its vertices; the whole image if some lie behind."""
     camera = devices.camera
     uv, _ = pixels(camera, T_world_camera, scene.vertices)
@@ -131,9 +129,7 @@ def _light(
     return out
 
 
-def _shading_normals(
-    scene: Scene, face: Int64[ndarray, "n"], p: Float64[ndarray, "n 3"]
-) -> Float64[ndarray, "n 3"]:
+def _shading_normals(scene: Scene, face: Int64[ndarray, "n"], p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
     """Normals interpolated between the vertices, where the scene has them; else those of the faces."""
     if scene.vertex_normals is None:
         return scene.face_normals[face]

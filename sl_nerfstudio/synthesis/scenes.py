@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,8 @@ def make_scene(name: str, file_unit: float = 1.0) -> Scene:
     path = Path(name)
     if path.suffix.lower() not in MESH_FORMATS:
         raise UserError(
-            f"--scene {name}: neither a built-in scene ({', '.join(BUILT_IN)}) nor a mesh file ({' '.join(MESH_FORMATS)})"
+            f"--scene {name}: neither a built-in scene ({', '.join(BUILT_IN)}) "
+            f"nor a mesh file ({' '.join(MESH_FORMATS)})"
         )
     return _read_mesh(path, file_unit)
 
@@ -36,7 +38,7 @@ def _read_mesh(path: Path, file_unit: float) -> Scene:
     if not path.is_file():
         raise UserError(f"--scene {path}: there is no such file")
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
         vertices = np.asarray(mesh.vertices, dtype=np.float64) * file_unit
         faces = np.asarray(mesh.faces, dtype=np.int64)
     except Exception as error:  # trimesh's loaders raise whatever their parsers do

@@ -90,7 +90,14 @@ def mirrored(field: Field, axis: int = 0) -> Field:
     return both
 
 
-def mesh_of(name: str, field: Field, lower: ArrayLike, upper: ArrayLike, cell: float, **scene: object) -> Scene:
+def mesh_of(
+    name: str,
+    field: Field,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    cell: float,
+    elevation_deg: tuple[float, float] = (25.0, 65.0),
+) -> Scene:
     """The zero level inside a box as a closed mesh with cells of `cell`, its vertices moved onto the level.
 
     Coarse to fine: only cells near the level are looked at closely. Raises ValueError if the surface leaves the box.
@@ -106,7 +113,7 @@ def mesh_of(name: str, field: Field, lower: ArrayLike, upper: ArrayLike, cell: f
     vertices = _onto_level(field, vertices, _gradient(field, vertices, 0.05 * cell), cell)
     normals = _gradient(field, vertices, 0.05 * cell)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Scene(name, vertices, faces.astype(np.int64), normals, **scene)
+    return Scene(name, vertices, faces.astype(np.int64), normals, elevation_deg)
 
 
 def _length(v: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:

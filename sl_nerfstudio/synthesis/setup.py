@@ -81,9 +81,7 @@ def make_setup(config: SynthConfig) -> Setup:
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
-    start = disturb_poses(
-        truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES)
-    )
+    start = disturb_poses(truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES))
     return Setup(
         scene=scene,
         caster=caster,

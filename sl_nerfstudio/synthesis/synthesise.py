@@ -97,9 +97,7 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
         yield SyntheticFrame(f"frame_{index:05d}", image, pattern, coords, rendered.mask)
 
 
-def _pattern_image(
-    image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup
-) -> UInt8[ndarray, "h w"]:
+def _pattern_image(image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
     """The captured image with albedo, shading and fall-off taken out."""
     # both devices are about equally far away, so focal lengths tell how large a period appears
     period = setup.cells.period * setup.devices.camera.fl_x / setup.devices.projector.fl_x
