@@ -122,12 +122,13 @@ class SLDataManager(VanillaDataManager[SLDataset]):
 
         nerfstudio's exporters and viewer take poses from the data sets' cameras and know no corrections.
         """
+        T_scene_camera = T_scene_camera.detach().to(self.device)
         outputs = (self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs)
         loaders = [getattr(self, name, None) for name in ("fixed_indices_eval_dataloader", "eval_dataloader")]
         for holder in (*outputs, self.train_dataset, self.eval_dataset, *filter(None, loaders)):
             _stand_at(holder.cameras, T_scene_camera)
         if hasattr(self, "scene_rays"):
-            self.scene_rays = SceneRays(self.dataparser.loaded.scan, T_scene_camera.to(self.device), refined=True)
+            self.scene_rays = SceneRays(self.dataparser.loaded.scan, T_scene_camera, refined=True)
 
     def get_datapath(self) -> Path:
         """The scan folder."""

@@ -178,7 +178,8 @@ def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
     T = torch.eye(4).repeat(3, 1, 1)
     T[:, :3] = m.train_dataset.cameras.camera_to_worlds
     T[:, 0, 3] += 0.125
-    m.stand_at(T)
+    m.stand_at(T.requires_grad_())
+    T = T.detach()
     rays, batch = m.next_train(0)
     frame = batch["indices"][:, 0]
     assert rays.metadata["sl_refined"].all()
@@ -193,6 +194,7 @@ def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
     )
     for holder in holders:
         torch.testing.assert_close(holder.cameras.camera_to_worlds, T[:, :3])
+        assert not holder.cameras.camera_to_worlds.requires_grad  # exporters call .numpy()
         assert holder.cameras.generate_rays(0).metadata["sl_refined"].all()
     camera, _ = next(iter(m.fixed_indices_eval_dataloader))
     assert camera.metadata is not None and camera.metadata["sl_refined"].tolist() == [[True]]

@@ -1,0 +1,80 @@
+"""`ns-train sl-neus` and `ns-train sl-neus-paper`."""
+
+import warnings
+from typing import Any
+
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
+from sl_nerfstudio.model.config import SLModelConfig
+from sl_nerfstudio.model.model import paper_model
+from sl_nerfstudio.model.pipeline import SLPipelineConfig
+from sl_nerfstudio.model.schedulers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
+from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
+
+# nerfstudio 1.1.5 indexes its cameras in a way that torch has deprecated: ten lines of warning before every picture
+warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimensional indexing", module="nerfstudio")
+
+
+def _trainer(
+    method_name: str, model: SLModelConfig, rays: int, iterations: int, optimizers: dict[str, Any]
+) -> SLTrainerConfig:
+    """A run that trains, saves, says where the result lies, and returns; evaluated on held-out pixels as it goes."""
+    return SLTrainerConfig(
+        method_name=method_name,
+        max_num_iterations=iterations,
+        machine=MachineConfig(device_type=default_device()),
+        logging=LoggingConfig(profiler="none"),
+        vis="tensorboard",
+        steps_per_save=1000,
+        steps_per_eval_batch=100,
+        steps_per_eval_image=0,  # whole frames take seconds to minutes without a GPU: ns-eval renders them on request
+        steps_per_eval_all_images=0,
+        pipeline=SLPipelineConfig(datamanager=SLDataManagerConfig(train_num_rays_per_batch=rays), model=model),
+        optimizers=optimizers,
+    )
+
+
+def _group(optimizer: Any, scheduler: DecaySchedulerConfig) -> dict[str, Any]:
+    return {"optimizer": optimizer, "scheduler": scheduler}
+
+
+sl_neus = MethodSpecification(
+    config=_trainer(
+        "sl-neus",
+        SLModelConfig(),
+        rays=1024,
+        iterations=1000,
+        optimizers={
+            "table": _group(RowAdamOptimizerConfig(lr=1e-2), DecaySchedulerConfig(final=0.05)),
+            "mlp": _group(FusedAdamOptimizerConfig(lr=2e-3, eps=1e-15), DecaySchedulerConfig(final=0.05)),
+            "camera_opt": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.01)),
+            "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.01)),
+        },
+    ),
+    description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU.",
+)
+
+
+def _paper_group(lr: float) -> dict[str, Any]:
+    """Down to 5e-12 at step 8,000, as the paper has it."""
+    decay = DecaySchedulerConfig(shape="exponential", final=5e-12 / lr, max_steps=8000)
+    return _group(FusedAdamOptimizerConfig(lr=lr, eps=1e-15), decay)
+
+
+sl_neus_paper = MethodSpecification(
+    config=_trainer(
+        "sl-neus-paper",
+        paper_model(),
+        rays=2024,
+        iterations=10_000,
+        optimizers={
+            "table": _paper_group(5e-4),
+            "mlp": _paper_group(5e-4),
+            "camera_opt": _paper_group(1e-3),
+            "projector_opt": _paper_group(1e-3),
+        },
+    ),
+    description="The method of Furukawa, Nishihara and Kawasaki (2025) as published, for comparison.",
+)

@@ -1,0 +1,159 @@
+"""What stands between nerfstudio's commands and the model: reproducible steps, honest evaluation, refined poses."""
+
+import math
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils import comms
+from torch import Tensor
+from torchvision.utils import save_image
+
+from sl_nerfstudio.dataparser.datamanager import SLDataManager
+from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.model.viewer import SceneView
+from sl_nerfstudio.progress import track
+
+_HELD_OUT_PIXELS = 4096  # of one frame, at most: enough for a median to two digits
+
+
+@dataclass
+class SLPipelineConfig(VanillaPipelineConfig):
+    """Pixels of a scan and the model that explains them."""
+
+    _target: type = field(default_factory=lambda: SLPipeline)
+
+
+class SLPipeline(VanillaPipeline):
+    """nerfstudio's pipeline with four differences.
+
+    - The random numbers of a training step depend on the seed and the step alone: a resumed run goes on as an
+      uninterrupted one would have.
+    - Evaluation looks at held-out pixels of every frame, not at whole images that were trained on.
+    - After a checkpoint is loaded to be looked at or exported, cameras stand where refinement has put them.
+    - The viewer shows projectors, and the end of training says what can be done next.
+    """
+
+    datamanager: SLDataManager
+
+    def __init__(self, config: SLPipelineConfig, device: str, **kwargs: Any) -> None:
+        super().__init__(config, device, **kwargs)
+        self._seed = torch.initial_seed()
+        loaded = self.datamanager.dataparser.loaded
+        self.scene_view = SceneView(loaded.scan, loaded.S_scene_world, lambda: self._sl_model.poses_scene())
+        self.show_projectors = self.scene_view.show_projectors
+        self.show_starting = self.scene_view.show_starting
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """The model's, with ours around them."""
+        before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        return [
+            TrainingCallback([before], self._seed_step),
+            *super().get_training_callbacks(training_callback_attributes),
+            TrainingCallback([after], self._update_viewer),
+            TrainingCallback(
+                [TrainingCallbackLocation.AFTER_TRAIN],
+                self._say_what_next,
+                kwargs={"trainer": training_callback_attributes.trainer},
+            ),
+        ]
+
+    @property
+    def _sl_model(self) -> SLModel:
+        return cast(SLModel, self.model)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load weights; unless training is to go on (`test_mode` "val"), put the cameras at their refined poses."""
+        super().load_pipeline(loaded_state, step)
+        if self.test_mode != "val":
+            self.datamanager.stand_at(self._sl_model.poses_scene()[0])
+
+    @torch.no_grad()
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, float]:
+        """Means over the frames of the metrics of their held-out pixels, all finite; `ns-eval` writes them.
+
+        With `output_path`, whole frames are rendered and saved there beside.
+        """
+        self.eval()
+        frames = range(len(self.datamanager.train_dataset))
+        per_frame = [self._held_out_metrics(frame) for frame in track(frames, "Evaluating")]
+        if output_path is not None:
+            self._save_images(output_path)
+        self.train()
+        return mean_over_frames(per_frame, get_std)
+
+    def _held_out_metrics(self, frame: int) -> dict[str, float]:
+        rays, batch = self.datamanager.held_out_batch(frame, _HELD_OUT_PIXELS)
+        if len(rays) == 0:
+            return {}
+        outputs = self._outputs(rays)
+        return {name: float(value) for name, value in self.model.get_metrics_dict(outputs, batch).items()}
+
+    def _outputs(self, rays: RayBundle) -> dict[str, Tensor]:
+        chunks = [self.model(chunk) for chunk in _chunks(rays, self.model.config.eval_num_rays_per_chunk)]
+        return {name: torch.cat([chunk[name] for chunk in chunks]) for name in chunks[0]}
+
+    def _save_images(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [frame.name for frame in self.datamanager.dataparser.loaded.scan.frames]
+        loader = zip(names, self.datamanager.fixed_indices_eval_dataloader, strict=True)
+        for name, (camera, batch) in track(loader, "Rendering", len(names)):
+            outputs = self.model.get_outputs_for_camera(camera)
+            for key, image in self.model.get_image_metrics_and_images(outputs, batch)[1].items():
+                save_image(image.permute(2, 0, 1).cpu(), folder / f"{name}_{key}.png")
+
+    def _seed_step(self, step: int) -> None:
+        torch.manual_seed((self._seed * 1_000_003 + step) % 2**63)
+
+    def _update_viewer(self, step: int) -> None:
+        self.scene_view.update()
+
+    def _say_what_next(self, step: int, trainer: Any) -> None:
+        if comms.is_main_process():
+            print(what_next(trainer.config.get_base_dir() / "config.yml", self.datamanager.get_datapath()), flush=True)
+
+
+def what_next(config: Path, scan: Path) -> str:
+    """Where the result lies, and the commands that go on from there."""
+    settings, data = shlex.quote(str(config)), shlex.quote(str(scan))
+    return "\n".join(
+        [
+            f"Result: {config.parent}",
+            "Look at it, and write the surface and the refined poses in the scan's units:",
+            f"  ns-viewer --load-config {settings}",
+            f"  sl-export --load-config {settings} --output mesh.ply --poses refined/",
+            f"  sl-eval   --mesh mesh.ply --data {data} --poses refined/transforms.json --report report.html",
+        ]
+    )
+
+
+def mean_over_frames(per_frame: list[dict[str, float]], with_std: bool) -> dict[str, float]:
+    """Mean, and on request `<name>_std`, of each metric over the frames that have it; nothing that is not finite.
+
+    The deviation of a single value is 0, where nerfstudio's would be NaN, which is not JSON.
+    """
+    result: dict[str, float] = {}
+    for name in dict.fromkeys(name for metrics in per_frame for name in metrics):
+        values = [metrics[name] for metrics in per_frame if math.isfinite(metrics.get(name, math.nan))]
+        if not values:
+            continue
+        mean = sum(values) / len(values)
+        result[name] = mean
+        if with_std:
+            result[f"{name}_std"] = math.sqrt(sum((v - mean) ** 2 for v in values) / max(len(values) - 1, 1))
+    return result
+
+
+def _chunks(rays: RayBundle, size: int) -> Iterator[RayBundle]:
+    for first in range(0, len(rays), size):
+        yield rays[first : first + size]

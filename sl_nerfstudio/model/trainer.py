@@ -1,0 +1,123 @@
+"""What happens before training starts: faults are found before anything is written."""
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Literal
+
+import torch
+from nerfstudio.engine.schedulers import SchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.schedulers import DecaySchedulerConfig
+from sl_nerfstudio.scan import require_valid
+
+
+@dataclass
+class SLTrainerConfig(TrainerConfig):
+    """nerfstudio's settings of a run, checked before the run begins."""
+
+    schedule_iterations: int | None = None
+    """Length over which learning rates decay and annealing proceeds: by default --max-num-iterations, and for a
+    resumed run that of the run it resumes."""
+
+    def set_timestamp(self) -> None:
+        """Nerfstudio calls this first of all, before it writes the run's folder: the place to refuse a run.
+
+        A fault of the user is printed without a traceback and ends the process with status 1.
+        """
+        try:
+            self.prepare()
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(1) from None
+        super().set_timestamp()
+
+    def prepare(self) -> None:
+        """Check scan, device and checkpoint; make paths absolute; fill in the length of the schedules.
+
+        Raises UserError.
+        """
+        root = self._scan_root()
+        if self.max_num_iterations < 1:
+            raise UserError(f"--max-num-iterations {self.max_num_iterations}: at least 1 is needed")
+        _require_device(self.machine.device_type)
+        checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
+        require_valid(root)
+        load_scan(root)  # remembered for the data manager; tells whether rays meet at all
+        self.data = root
+        self.pipeline.datamanager.data = root
+        self.output_dir = self.output_dir.expanduser().absolute()
+        if self.schedule_iterations is None:
+            self.schedule_iterations = schedule_of(checkpoint) or self.max_num_iterations
+        self.pipeline.model.schedule_iterations = self.schedule_iterations  # type: ignore[attr-defined]
+        self.optimizers = {
+            name: {**group, "scheduler": _with_length(group["scheduler"], self.schedule_iterations)}
+            for name, group in self.optimizers.items()
+        }
+
+    def _scan_root(self) -> Path:
+        dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
+        if not isinstance(dataparser, SLDataParserConfig):
+            raise UserError(
+                f"{self.method_name} trains on scan folders only, which `sl-data` reads; "
+                f"{type(dataparser).__name__.removesuffix('Config')} knows no projector. Leave the dataparser out."
+            )
+        data = self.pipeline.datamanager.data or dataparser.data
+        if data == Path():
+            raise UserError(f"no scan given. Add --data FOLDER: ns-train {self.method_name} --data FOLDER")
+        return scan_root(data)
+
+
+def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConfig | None:
+    if isinstance(scheduler, DecaySchedulerConfig) and scheduler.max_steps is None:
+        return replace(scheduler, max_steps=steps)
+    return scheduler
+
+
+def default_device() -> Literal["cpu", "cuda"]:
+    """`cuda` where torch can use a GPU, else `cpu`."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _require_device(device_type: str) -> None:
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if not available[device_type]:
+        raise UserError(
+            f"--machine.device-type {device_type}: torch {torch.__version__} finds no such device on this machine. "
+            "Leave the option out to train on what there is."
+        )
+
+
+def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
+    """The checkpoint that nerfstudio will load, None for a fresh run. Raises UserError where it is missing."""
+    if load_dir is not None:
+        pattern = "step-*.ckpt" if load_step is None else f"step-{load_step:09d}.ckpt"
+        found = sorted(load_dir.glob(pattern))
+        if not found:
+            raise UserError(
+                f"--load-dir {load_dir}: no checkpoint {pattern} there. "
+                "Give the folder nerfstudio_models/ of a run, which lies beside its config.yml."
+            )
+        return found[-1]
+    if load_checkpoint is not None and not load_checkpoint.is_file():
+        raise UserError(f"--load-checkpoint {load_checkpoint}: no such file")
+    return load_checkpoint
+
+
+def schedule_of(checkpoint: Path | None) -> int | None:
+    """Length of the schedule that a checkpoint was written under, if it tells. Raises UserError if it is unreadable."""
+    if checkpoint is None:
+        return None
+    try:
+        schedulers = torch.load(checkpoint, map_location="cpu", mmap=True).get("schedulers", {})
+    except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError) as error:
+        raise UserError(
+            f"{checkpoint}: cannot be read as a checkpoint ({type(error).__name__}). "
+            "It is probably cut off; name an older one with --load-step, or train anew."
+        ) from error
+    lengths = [rate["max_steps"] for s in schedulers.values() for rate in s.get("lr_lambdas", []) if rate]
+    return max(lengths, default=None)

@@ -1,0 +1,131 @@
+"""Cameras and projectors in nerfstudio's viewer: where they started (grey) and where they stand now (coloured)."""
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import viser
+import viser.transforms as vtf
+from jaxtyping import Float, UInt8
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl
+from numpy import ndarray
+from torch import Tensor
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import Scan
+
+GREY = (130, 130, 130)
+CAMERA_COLOUR = (90, 160, 255)
+PROJECTOR_COLOUR = (255, 140, 40)
+_PATTERN_PIXELS = 256  # longest side of the pattern drawn on a projector
+_SECONDS_BETWEEN_UPDATES = 0.5
+
+ScenePoses = tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n 4 4"]]
+
+
+class SceneView(ViewerControl):
+    """Draws the frusta once a viewer exists, and moves the coloured ones while poses are refined.
+
+    nerfstudio finds the object as an attribute of the pipeline and calls `_setup`, in training and in `ns-viewer`.
+    """
+
+    def __init__(self, scan: Scan, S_scene_world: Similarity, current_poses: Callable[[], ScenePoses]) -> None:
+        """`current_poses` gives the poses of cameras and projectors in the scene."""
+        self._scan = scan
+        self._initial = (S_scene_world.poses(scan.T_world_camera), S_scene_world.poses(scan.T_world_projector))
+        self._current_poses = current_poses
+        self._refined: tuple[list[viser.CameraFrustumHandle], list[viser.CameraFrustumHandle]] = ([], [])
+        self._starting: tuple[list[viser.CameraFrustumHandle], list[viser.CameraFrustumHandle]] = ([], [])
+        self._last_update = 0.0
+        self.show_projectors = ViewerCheckbox("Projectors", True, cb_hook=lambda _: self._set_visibility())
+        self.show_starting = ViewerCheckbox("Starting poses", True, cb_hook=lambda _: self._set_visibility())
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        scale = viewer.config.camera_frustum_scale
+        cameras = [frame.camera for frame in self._scan.frames]
+        projectors = [self._scan.projector] * len(cameras)
+        pattern = _thumbnail(self._scan.read_pattern())
+        camera_poses, projector_poses = self._numpy_poses()
+        self._starting = (
+            self._frusta("starting/camera", cameras, self._initial[0], GREY, scale * 0.8),
+            self._frusta("starting/projector", projectors, self._initial[1], GREY, scale * 0.8),
+        )
+        self._refined = (
+            self._frusta("refined/camera", cameras, camera_poses, CAMERA_COLOUR, scale),
+            self._frusta("refined/projector", projectors, projector_poses, PROJECTOR_COLOUR, scale, pattern),
+        )
+
+    def update(self, force: bool = False) -> None:
+        """Move the coloured frusta to the current poses; at most twice a second, and only while somebody looks."""
+        if not self._refined[0] or not (force or self._is_due()):
+            return
+        self._last_update = time.monotonic()
+        # nerfstudio's own frusta carry the captured images; it would leave them at the starting poses
+        stock = getattr(self.viewer, "camera_handles", {})
+        camera_poses, projector_poses = self._numpy_poses()
+        with self.viser_server.atomic():
+            for i in range(len(camera_poses)):
+                _place(self._refined[0][i], camera_poses[i])
+                _place(self._refined[1][i], projector_poses[i])
+                if i in stock:
+                    _place(stock[i], camera_poses[i])
+
+    def _is_due(self) -> bool:
+        return time.monotonic() - self._last_update > _SECONDS_BETWEEN_UPDATES and bool(self.viser_server.get_clients())
+
+    def _set_visibility(self) -> None:
+        projectors, starting = self.show_projectors.value, self.show_starting.value
+        with self.viser_server.atomic():
+            for handle in self._refined[1]:
+                handle.visible = projectors
+            for handle in self._starting[0]:
+                handle.visible = starting
+            for handle in self._starting[1]:
+                handle.visible = starting and projectors
+
+    def _numpy_poses(self) -> tuple[Float[ndarray, "n 4 4"], Float[ndarray, "n 4 4"]]:
+        camera, projector = self._current_poses()
+        return camera.detach().cpu().double().numpy(), projector.detach().cpu().double().numpy()
+
+    def _frusta(
+        self,
+        name: str,
+        devices: list[Device],
+        poses: Float[ndarray, "n 4 4"],
+        colour: tuple[int, int, int],
+        scale: float,
+        image: UInt8[ndarray, "h w 3"] | None = None,
+    ) -> list[viser.CameraFrustumHandle]:
+        handles = []
+        for frame, device, T in zip(self._scan.frames, devices, poses, strict=True):
+            handle = self.viser_server.scene.add_camera_frustum(
+                f"/{name}/{frame.name}", vertical_fov(device), device.w / device.h, scale, color=colour, image=image
+            )
+            _place(handle, T)
+            handles.append(handle)
+        return handles
+
+
+def vertical_fov(device: Device) -> float:
+    """Angle in radian between the rays through the middle of the upper and of the lower edge."""
+    uv = torch.tensor([[device.w / 2, 0.0], [device.w / 2, float(device.h)]], dtype=torch.float64)
+    up, down = unproject(Intrinsics.of(device, torch.float64), uv)
+    return math.acos(max(-1.0, min(1.0, float(up @ down))))
+
+
+def _place(handle: viser.CameraFrustumHandle, T_scene_device: Float[ndarray, "4 4"]) -> None:
+    """Viser's frusta look along +z with y down; nerfstudio draws the scene ten times as large."""
+    R = vtf.SO3.from_matrix(T_scene_device[:3, :3]) @ vtf.SO3.from_x_radians(math.pi)
+    handle.wxyz = R.wxyz
+    handle.position = T_scene_device[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+
+
+def _thumbnail(pattern: Float[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2 3"]:
+    step = max(1, math.ceil(max(pattern.shape) / _PATTERN_PIXELS))
+    grey = (pattern[::step, ::step] * 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
