@@ -6,7 +6,7 @@ from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.scan.coordinate_problems import coordinate_problems
@@ -15,7 +15,8 @@ from sl_nerfstudio.scan.correspondences import Correspondences, sample_pixels
 from sl_nerfstudio.scan.draft import Draft, FrameDraft
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.headers import relative
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.pattern_shift import pattern_shift
 from sl_nerfstudio.scan.problem import Faults, Problem
 
 
@@ -28,18 +29,29 @@ class FrameContent:
     masked: float  # share of the image under the mask
     decoded: float  # share of the masked pixels that have coordinates
     correspondences: Correspondences | None  # None if the frame cannot be triangulated
+    shift: Float64[ndarray, "2"] | None  # what to add to the coordinates for the pattern to fit; None if unclear
 
 
-def check_pattern(draft: Draft, good: set[Path], faults: Faults) -> None:
-    """Decode the projected pattern."""
+def check_pattern(draft: Draft, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
+    """The projected pattern in [0, 1]; None after adding a fault."""
     if draft.pattern_path is None or draft.pattern_path not in good:
-        return
+        return None
     pattern = _read_image(draft.pattern_path, draft, None, faults)
-    if pattern is not None and pattern.min() == pattern.max():
+    if pattern is None:
+        return None
+    if pattern.min() == pattern.max():
         faults.add(_nothing_in_it("the pattern"), relative(draft.pattern_path, draft.root))
+        return None
+    return as_grey(pattern)
 
 
-def check_content(frame: FrameDraft, draft: Draft, good: set[Path], faults: Faults) -> FrameContent:
+def check_content(
+    frame: FrameDraft,
+    draft: Draft,
+    pattern: Float32[ndarray, "rows columns"] | None,
+    good: set[Path],
+    faults: Faults,
+) -> FrameContent:
     """Decode all files of a frame that are in `good`, and add what is wrong with their pixels."""
     image_path, pattern_path, coords_path, mask_path = (
         path if (path := frame.paths.get(key)) in good else None
@@ -53,20 +65,26 @@ def check_content(frame: FrameDraft, draft: Draft, good: set[Path], faults: Faul
         for problem in _together_problems(mask, decoded):
             faults.add(problem, relative(mask_path, draft.root), frame.name)
     image = None if image_path is None else _read_image(image_path, draft, frame.name, faults)
-    pattern = None if pattern_path is None else _read_image(pattern_path, draft, frame.name, faults)
-    shown, shown_path = (image, image_path) if "sl_pattern_path" not in frame.paths else (pattern, pattern_path)
+    shown, shown_path = image, image_path
+    if "sl_pattern_path" in frame.paths:
+        shown_path = pattern_path
+        shown = None if pattern_path is None else _read_image(pattern_path, draft, frame.name, faults)
     if shown is not None and shown_path is not None and where is not None and where.shape == shown.shape[:2]:
         inside = shown[where]
         if inside.size and inside.min() == inside.max():
             faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, draft.root), frame.name)
     digest = None if image is None or coords is None else _digest(image, coords)
     both = None if decoded is None else (decoded if mask is None else decoded & mask)
+    shift = None
+    if coords is not None and both is not None and shown is not None and pattern is not None:
+        shift = pattern_shift(coords, both, as_grey(shown), pattern)
     return FrameContent(
         frame.name,
         digest,
         0.0 if where is None else float(where.mean()),
         0.0 if both is None or where is None or not where.any() else float(both.sum() / where.sum()),
         _correspondences(frame, draft, coords, both),
+        shift,
     )
 
 

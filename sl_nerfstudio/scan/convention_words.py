@@ -22,7 +22,7 @@ _REMEDIES = {
 def key_of(reading: Reading) -> str:
     """The key of transforms.json that a mix-up concerns."""
     if reading.exchanged or reading.mirrored_x or reading.mirrored_y:
-        return "coords"
+        return "sl_coords_path"
     return "projector_transform_matrix" if reading.camera == "as given" else "transform_matrix"
 
 

@@ -12,6 +12,7 @@ from sl_nerfstudio.scan.content import FrameContent, check_content, check_patter
 from sl_nerfstudio.scan.conventions import convention_problems
 from sl_nerfstudio.scan.draft import TRANSFORMS, Draft, read_draft
 from sl_nerfstudio.scan.headers import check_headers
+from sl_nerfstudio.scan.pattern_shift import shift_problems
 from sl_nerfstudio.scan.pose_files import read_ground_truth
 from sl_nerfstudio.scan.problem import Faults
 from sl_nerfstudio.scan.readings import Fit, fit_frames
@@ -34,10 +35,12 @@ def examine(root: Path) -> Examination:
     faults = Faults()
     draft = read_draft(root, faults)
     good = check_headers(draft, faults)
-    check_pattern(draft, good, faults)
-    contents = [check_content(f, draft, good, faults) for f in track(draft.frames, "Checking the scan")]
+    pattern = check_pattern(draft, good, faults)
+    contents = [check_content(f, draft, pattern, good, faults) for f in track(draft.frames, "Checking the scan")]
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
+    for problem in shift_problems([content.shift for content in contents]):
+        faults.add(problem, TRANSFORMS, None, "sl_coords_path")
     _check_conventions(draft, contents, faults)
     if faults.found:
         return Examination(tuple(faults.found), None, None, tuple(contents))

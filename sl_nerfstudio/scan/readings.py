@@ -103,7 +103,7 @@ def fit_frames(frames: Sequence[Correspondences], projector: Device) -> Fit:
 
 
 def distance_to_others(cloud: Float64[ndarray, "n 3"], clouds: Sequence[Float64[ndarray, "_ 3"]], index: int) -> float:
-    """Median distance of a cloud's points to the nearest point of any of `clouds` but number `index`; inf if unknown."""
+    """Median distance from a cloud to the nearest point of any of `clouds` but number `index`; inf if unknown."""
     others = np.concatenate([np.empty((0, 3)), *(c for i, c in enumerate(clouds) if i != index)])
     if len(cloud) < _FEWEST_POINTS or len(others) < _FEWEST_POINTS:
         return np.inf
