@@ -1,0 +1,1 @@
+"""Poses from correspondences: joint adjustment of all cameras and projectors."""

@@ -1,0 +1,44 @@
+"""What training minimises. Lengths are in scene units (the object's radius is about one), so nothing depends on the scan's unit."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def coordinate_loss(
+    rendered: Float[Tensor, "rays 2"], measured: Float[Tensor, "rays 2"], counts: Bool[Tensor, "rays"]
+) -> Float[Tensor, ""]:
+    """Mean L1 distance, in pattern pixels, over the rays that count (the paper, eq. 9: decoding errors are outliers)."""
+    difference = (rendered - measured.nan_to_num()).abs().sum(-1)
+    return (difference * counts).sum() / counts.sum().clamp_min(1)
+
+
+def pattern_loss(rendered: Float[Tensor, "rays"], measured: Float[Tensor, "rays"]) -> Float[Tensor, ""]:
+    """1 - cosine between rendered and captured intensities of a batch, which match only up to scale."""
+    return 1 - torch.nn.functional.cosine_similarity(rendered, measured, dim=0, eps=1e-6)
+
+
+def eikonal_loss(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Mean of (|gradient| - 1)^2: a signed distance has slope one."""
+    return ((gradient.norm(dim=-1) - 1) ** 2).mean()
+
+
+def surface_loss(
+    sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: float
+) -> Float[Tensor, ""]:
+    """Robust mean of |f| at points that were measured to lie on the surface.
+
+    Charbonnier, bent to `width * (1 - exp(-|f| / width))`: linear for errors well below `width`, deaf to
+    those far above, which are wrong decodings.
+    """
+    return (weight * width * (1 - torch.exp(-sdf.abs() / width))).sum() / weight.sum().clamp_min(1e-9)
+
+
+def free_space_loss(sdf: Float[Tensor, "n"], at_least: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean shortfall of the distance at points that a ray passed before it met the surface."""
+    return (at_least - sdf).clamp_min(0).mean()
+
+
+def behind_loss(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean excess over zero just behind the surface."""
+    return sdf.clamp_min(0).mean()

@@ -1,0 +1,92 @@
+"""What the model shows outside training: outputs of rays for viewer, exporters and evaluation."""
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from sl_nerfstudio.geometry.se3 import inverse
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.model.model import SLModel
+
+_OPAQUE = 0.5
+_MODULO = 128.0  # pattern pixels of one turn of the coordinate colours
+_RESIDUAL_WHITE_PX = 5.0
+
+
+@torch.no_grad()
+def outputs(model: "SLModel", bundle: RayBundle) -> dict[str, Tensor]:
+    """Float images of 1 or 3 channels: what nerfstudio's viewer, renderer and exporters rely on, and ours.
+
+    `depth` is the distance along the unit ray, in scene units, and far (1000) where there is no object.
+    """
+    o, d, views = model.corrected_rays(bundle)
+    T_projector = model.poses_scene()[1]
+    T_projector_scene = inverse(T_projector).float()[views]
+    seen = model.render_rays(o, d, T_projector_scene, jitter=False)
+    p = o + seen.depth[:, None] * d
+    normal = torch.nn.functional.normalize(model.field.sdf_and_gradient(p)[1].detach(), dim=-1)
+    opaque = seen.accumulation > _OPAQUE
+    lit = model.is_lit(p, normal, T_projector.float()[views, :3, 3]) & opaque
+    facing = (-(normal * d).sum(-1)).clamp(0, 1)
+    shade = (0.15 + 0.35 * facing + 0.5 * facing * torch.where(lit, seen.pattern, 0.0)) * opaque
+    result = {
+        "rgb": shade[:, None].expand(-1, 3).contiguous(),
+        "accumulation": seen.accumulation[:, None],
+        "depth": torch.where(opaque, seen.depth, 1e3)[:, None],
+        "normals": torch.where(opaque[:, None], 0.5 * normal + 0.5, 0.5),
+        "pattern": torch.where(lit, seen.pattern, 0.0)[:, None],
+        "coordinates": coordinate_colours(seen.coordinates, lit),
+        "coordinate_x": torch.where(opaque, seen.coordinates[:, 0], 0.0)[:, None],
+        "coordinate_y": torch.where(opaque, seen.coordinates[:, 1], 0.0)[:, None],
+    }
+    error = (seen.coordinates - model.measured_coordinates(p, views)).norm(dim=-1)
+    share = torch.where(opaque, torch.nan_to_num(error / _RESIDUAL_WHITE_PX, nan=0.0), 0.0)
+    result["residual"] = share.clamp(0, 1)[:, None]
+    return result
+
+
+def coordinate_colours(uv: Float[Tensor, "n 2"], valid: Tensor) -> Float[Tensor, "n 3"]:
+    """The usual picture of a coordinate image: x modulo 128 in red, y modulo 128 in green."""
+    turn = uv.remainder(_MODULO) / _MODULO
+    colour = torch.cat([turn, torch.full_like(turn[:, :1], 0.2)], -1)
+    return torch.where(valid[:, None], colour, 0.0)
+
+
+@torch.no_grad()
+def fit_metrics(outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Median coordinate residual (pattern pixels) and cosine of rendered and captured pattern."""
+    if "rendered" in outputs:
+        coordinates, pattern = outputs["rendered"].coordinates, outputs["rendered"].pattern
+    elif "coordinate_x" in outputs:
+        coordinates = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
+        pattern = outputs["pattern"][:, 0]
+    else:
+        return {}
+    n = len(pattern)
+    error = (coordinates - batch["coords"][:n]).norm(dim=-1)[batch["decoded"][:n, 0]]
+    result = {}
+    if len(error):
+        result["coordinate_px"] = error.median()
+    result["pattern_cosine"] = torch.nn.functional.cosine_similarity(pattern, batch["pattern"][:n, 0], dim=0)
+    return result
+
+
+@torch.no_grad()
+def image_metrics_and_images(
+    outputs: dict[str, Tensor], batch: dict[str, Tensor]
+) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """Captured beside rendered, [H, 2 W, 3], and the images of the other outputs."""
+    captured = batch["image"].to(outputs["rgb"].device)[..., :3]
+    h, w = outputs["rgb"].shape[:2]
+    captured = captured[:h, :w]
+    images = {
+        "img": torch.cat([captured, outputs["rgb"]], 1),
+        "coordinates": outputs["coordinates"],
+        "normals": outputs["normals"],
+        "pattern": outputs["pattern"].expand(-1, -1, 3),
+    }
+    return {"accumulation_mean": float(outputs["accumulation"].mean())}, images

@@ -1,0 +1,151 @@
+"""From the table of pixels to refined poses: what stands between a training run and the joint adjustment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from sl_nerfstudio.calibration.bundle_adjustment import (
+    AdjustmentSettings,
+    PosePrior,
+    RefinePoses,
+    adjust,
+)
+from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.calibration.gauge import known_baseline, restore
+from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
+from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.dataparser.samples import PixelSamples
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import Scan
+
+_HELD_OUT_PER_FRAME = 300
+_GUARD_WIDTH_PX = 4.0
+
+
+@dataclass
+class PriorConfig:
+    """How well the starting poses are known where the scan does not say (`sl_pose_sigma`); 1 sigma per axis."""
+
+    frame_rotation_deg: float = 2.0
+    """Orientation of a frame in the world, in degrees."""
+    frame_translation: float = 0.1
+    """Position of a frame's part of the surface, as a share of the object's radius."""
+    relative_rotation_deg: float = 0.3
+    """Orientation of the projector against the camera, in degrees."""
+    relative_translation: float = 0.05
+    """Position of the projector against the camera, as a share of the baseline."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Refined poses in the scene frame, or the starting ones where refinement did not help."""
+
+    T_scene_camera: Float[Tensor, "frames 4 4"]
+    T_scene_projector: Float[Tensor, "frames 4 4"]
+    sigma: Float[Tensor, "frames 12"]
+    verdict: Verdict
+    noise_px: float
+
+    def message(self) -> str:
+        """One line for the person who waits."""
+        change = f"held-out pixels agree to {self.verdict.after_px:.3g} px, before {self.verdict.before_px:.3g} px"
+        if self.verdict.better:
+            return f"Poses adjusted: {change}."
+        return f"Poses NOT changed, because adjusting them did not help: {change}. The starting poses are kept."
+
+
+def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
+    """The scan's devices at their starting poses, in the scene frame."""
+    camera = torch.from_numpy(S_scene_world.poses(scan.T_world_camera))
+    projector = torch.from_numpy(S_scene_world.poses(scan.T_world_projector))
+    return Rig(
+        camera=Intrinsics.of([frame.camera for frame in scan.frames], torch.float64),
+        projector=Intrinsics.of(scan.projector, torch.float64),
+        T_world_camera=camera,
+        T_camera_projector=inverse(camera) @ projector,
+    )
+
+
+def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
+    """Stated uncertainty of each frame's starting pose, else the defaults; in scene units and radian."""
+    baseline = np.linalg.norm(scan.T_world_camera[:, :3, 3] - scan.T_world_projector[:, :3, 3], axis=1)
+    rows = []
+    for frame, length in zip(scan.frames, baseline * S_scene_world.scale, strict=True):
+        stated = frame.pose_sigma
+        if stated is None:
+            rows.append(
+                (
+                    config.frame_translation,
+                    np.radians(config.frame_rotation_deg),
+                    config.relative_translation * length,
+                    np.radians(config.relative_rotation_deg),
+                )
+            )
+        else:
+            rows.append(
+                (
+                    stated.camera_translation * S_scene_world.scale,
+                    np.radians(stated.camera_rotation_deg),
+                    stated.relative_translation * S_scene_world.scale,
+                    np.radians(stated.relative_rotation_deg),
+                )
+            )
+    # a sigma of zero is a pose known exactly: a very small one keeps the equations solvable
+    sigma = torch.tensor(np.maximum(np.array(rows), 1e-9), dtype=torch.float64)
+    return PosePrior(*sigma.unbind(1))
+
+
+def refine(
+    scan: Scan,
+    S_scene_world: Similarity,
+    samples: PixelSamples,
+    mode: RefinePoses,
+    prior: PriorConfig,
+    settings: AdjustmentSettings,
+) -> Refinement:
+    """Adjust all poses jointly, fix the gauge, and keep the result only if held-out pixels agree better with it."""
+    start = scene_rig(scan, S_scene_world)
+    maps, held_out = _maps(scan, samples)
+    found = adjust(start, maps, pose_prior(scan, S_scene_world, prior), mode, settings)
+    known = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
+    rig = restore(start, found.rig, known)
+    verdict = compare(start, rig, held_out, maps, _GUARD_WIDTH_PX)
+    kept = rig if verdict.better else start
+    n = rig.frames
+    sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, n, 6).transpose(0, 1).reshape(n, 12)
+    return Refinement(kept.T_world_camera, kept.T_world_projector, sigma, verdict, found.noise_px)
+
+
+def _maps(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOut]:
+    """Coordinate images without the held-out pixels, and some of those."""
+    images, frames, uv_camera, uv_projector = [], [], [], []
+    for number, frame in enumerate(scan.frames):
+        rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
+        image = torch.full((frame.camera.h, frame.camera.w, 2), float("nan"))
+        row, column, held = samples.row[rows].long(), samples.column[rows].long(), samples.held_out[rows]
+        image[row[~held], column[~held]] = samples.coords[rows][~held]
+        images.append(image)
+        test = samples.at(_evenly(samples.held_out_of(number), _HELD_OUT_PER_FRAME))
+        decoded = test.decoded
+        frames.append(test.frame[decoded])
+        uv_camera.append(test.uv[decoded].double())
+        uv_projector.append(test.coords[decoded].double())
+    return CoordinateMaps.of(images), HeldOut(torch.cat(frames), torch.cat(uv_camera), torch.cat(uv_projector))
+
+
+def _evenly(index: Tensor, count: int) -> Tensor:
+    if len(index) <= count:
+        return index
+    return index[torch.linspace(0, len(index) - 1, count).round().long()]
+
+
+def sigmas_in_scan_units(sigma: Float[Tensor, "frames 12"], S_scene_world: Similarity) -> Float[ndarray, "frames 4"]:
+    """RMS per axis: frame translation (scan units), frame rotation (degree), the same for the relative pose."""
+    parts = sigma.reshape(-1, 4, 3).pow(2).mean(-1).sqrt().cpu().numpy()
+    return parts * np.array([1 / S_scene_world.scale, 180 / np.pi, 1 / S_scene_world.scale, 180 / np.pi])
