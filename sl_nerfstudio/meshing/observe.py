@@ -21,6 +21,8 @@ LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
 LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""
 
+ENOUGH = 3  # confirmations more than denials: further frames are not asked about the vertex
+
 
 @dataclass(frozen=True)
 class Votes:
@@ -68,16 +70,20 @@ def collect_votes(
     T_world_camera: Float[ndarray, "n 4 4"],
     T_world_projector: Float[ndarray, "n 4 4"],
 ) -> Votes:
-    """Ask every frame about every vertex; one frame's mask and coordinates are in memory at a time."""
+    """Ask every frame about every undecided vertex; one frame's mask and coordinates are in memory at a time."""
     confirmed, silent, denied = (np.zeros(len(mesh.vertices), dtype=np.int64) for _ in range(3))
     normals = mesh.vertex_normals()
     medians: list[float] = []
+    # A frame's median must not come from disputed vertices alone: some are asked to the end.
+    always = np.arange(len(mesh.vertices)) % 8 == 0
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
+        asked = np.flatnonzero(always | (confirmed - denied < ENOUGH))
         vertex, least, most = frame_residuals(
-            mesh.vertices, normals, occluder, frame, scan.projector, T_camera, T_projector
+            mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector
         )
-        known = most[np.isfinite(most)]
+        vertex = asked[vertex]
+        known = most[always[vertex] & np.isfinite(most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
         confirmed[vertex] += most <= threshold

@@ -1,0 +1,170 @@
+"""A finished training run, loaded for export on whatever device there is."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, Protocol
+
+import torch
+import yaml
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import Scan
+
+
+class TrainedModel(Protocol):
+    """What export asks of a model; poses are in the scan's world and unit, the field in the scene frame."""
+
+    scan: Scan
+    S_scene_world: Similarity
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field is evaluated."""
+        ...
+
+    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance in scene units."""
+        ...
+
+    def poses(self) -> tuple[Float[ndarray, "frames 4 4"], Float[ndarray, "frames 4 4"]]:
+        """Poses of cameras and projectors."""
+        ...
+
+    def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
+        """One sigma of each frame's poses, in the order of PoseSigma's fields; None where it was not estimated."""
+        ...
+
+    def history(self) -> dict[str, list[float]]:
+        """Convergence curves, with the steps under `step`."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A model with the settings it was trained under."""
+
+    model: TrainedModel
+    config: Any  # nerfstudio's TrainerConfig
+    step: int
+
+
+def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
+    """Load the last checkpoint of the run that `config_path` (config.yml) describes.
+
+    nerfstudio's own `eval_setup` ends in assertions or tracebacks where files were moved or cut off; here a run whose
+    folder was moved is found beside its config.yml, and `data` names the scan folder if that was moved.
+    Raises UserError for anything missing, broken or made by another method.
+    """
+    path = config_path / "config.yml" if config_path.is_dir() else config_path
+    config = _read_config(path)
+    checkpoint = _last_checkpoint(config, path)
+    config.pipeline.datamanager.data = _scan_folder(config, data)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    state = _read_checkpoint(checkpoint)
+    pipeline = config.pipeline.setup(device=device, test_mode="inference")
+    _require_same_keys(checkpoint, state["pipeline"], pipeline.state_dict())
+    try:
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+    except RuntimeError as error:
+        raise UserError(
+            f"{checkpoint}: does not fit the scan in {config.pipeline.datamanager.data} ({_last_line(error)})\n"
+            "    cause:  the scan has other frames than when the run was trained, or another version of this package\n"
+            "    remedy: give the scan of the training with --data FOLDER, or train again"
+        ) from error
+    pipeline.eval()
+    return TrainedRun(pipeline.model, config, int(state["step"]))
+
+
+def _read_config(path: Path) -> Any:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+    from sl_nerfstudio.model.config import SLModelConfig
+
+    if not path.is_file():
+        raise UserError(
+            f"--load-config {path}: no such file\n"
+            "    cause:  the path is mistyped, or the training never started\n"
+            "    remedy: give the config.yml that ns-train named at its end: outputs/SCAN/sl-neus/DATE/config.yml"
+        )
+    try:
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError, ImportError, AttributeError, TypeError, OSError) as error:
+        raise UserError(
+            f"{path}: cannot be read as a training configuration ({type(error).__name__}: {_last_line(error)})\n"
+            "    cause:  the file is broken, or written by a version with other settings\n"
+            "    remedy: give an untouched config.yml, and the version of this package that wrote it"
+        ) from error
+    if not isinstance(config, TrainerConfig):
+        raise UserError(f"{path}: is no training configuration\n    remedy: give the config.yml that ns-train wrote")
+    if not isinstance(config.pipeline.model, SLModelConfig):
+        raise UserError(
+            f"{path}: is a run of {config.method_name}\n"
+            "    cause:  sl-export knows the surface of sl-neus and sl-neus-paper only\n"
+            "    remedy: use ns-export for other methods"
+        )
+    return config
+
+
+def _last_checkpoint(config: Any, path: Path) -> Path:
+    """Of the folder beside config.yml; that is where the run's settings put it unless the run was moved."""
+    folders = [path.absolute().parent / config.relative_model_dir, config.get_checkpoint_dir()]
+    for folder in folders:
+        found = sorted(folder.glob("step-*.ckpt"))
+        if found:
+            return found[-1]
+    raise UserError(
+        f"{folders[0]}: no checkpoint step-*.ckpt\n"
+        "    cause:  the training was broken off before its first checkpoint, or the folder was moved from config.yml\n"
+        "    remedy: train again, or put nerfstudio_models/ back beside config.yml"
+    )
+
+
+def _scan_folder(config: Any, data: Path | None) -> Path:
+    from sl_nerfstudio.dataparser.dataparser import scan_root
+
+    stated = data or config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data
+    root = scan_root(stated)
+    if not (root / "transforms.json").is_file():
+        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted since the training"
+        raise UserError(
+            f"{root}: no transforms.json, so not the scan that the run was trained on\n"
+            f"    cause:  {cause}\n    remedy: say where it is: --data FOLDER"
+        )
+    return root
+
+
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        state = torch.load(path, map_location="cpu")
+        return {"pipeline": state["pipeline"], "step": state["step"]}
+    except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path}: cannot be read as a checkpoint ({type(error).__name__})\n"
+            "    cause:  it is cut off, as by a full disk, or another file\n"
+            "    remedy: remove it, so that the one before it is taken, or train again"
+        ) from error
+
+
+def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str]) -> None:
+    """nerfstudio leaves weights that a checkpoint lacks as they were made, without a word."""
+    missing = {_plain(key) for key in wanted} - {_plain(key) for key in stored}
+    if missing:
+        raise UserError(
+            f"{path}: lacks {len(missing)} of the model's weights, such as {min(missing)}\n"
+            "    cause:  it was written by another version of this package, or with other settings\n"
+            "    remedy: use the version that trained it, or train again"
+        )
+
+
+def _plain(key: str) -> str:
+    return key.replace("module.", "")  # put there by training on several GPUs
+
+
+def _last_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [""])[-1].strip()[:200]
