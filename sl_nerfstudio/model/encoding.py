@@ -25,7 +25,7 @@ class GridLayout:
     offsets: tuple[int, ...]
     """First row of each level in the table."""
     sizes: tuple[int, ...]
-    """Rows of each level."""
+    """Rows of each level, at least its corners unless it is hashed."""
     hashed: tuple[bool, ...]
     """Whether rows are found by hashing (size is then a power of two) instead of counting."""
     features: int
@@ -47,9 +47,9 @@ class GridLayout:
         growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
         resolutions = tuple(round(min_resolution * growth**level) for level in range(levels))
         corners = [(r + 1) ** 3 for r in resolutions]
-        sizes = tuple(min(n, 2**log2_table_size) for n in corners)
+        sizes = tuple(min(-(-n // 8) * 8, 2**log2_table_size) for n in corners)  # whole cache lines
         offsets = tuple(sum(sizes[:level]) for level in range(levels))
-        hashed = tuple(size < n for size, n in zip(sizes, corners, strict=True))
+        hashed = tuple(n > 2**log2_table_size for n in corners)
         return GridLayout(resolutions, offsets, sizes, hashed, features, smooth)
 
     @property

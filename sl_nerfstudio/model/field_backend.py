@@ -51,11 +51,11 @@ class FieldBackend(Protocol):
         points: bool,
         parameters: bool,
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
         """Gradients of `sum g f(p)` with respect to the points and to the parameters, if wanted.
 
-        That of the table is added to `table_gradient`, and the blocks of rows written to are marked in `marks`.
+        That of the table is added to `table_gradient`, and the rows written to are marked in `marks`.
         """
         ...
 
@@ -66,7 +66,7 @@ class FieldBackend(Protocol):
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> tuple[Tensor, ...]:
         """MLP gradients of `sum g f(p) + v . grad f(p)`; the table's as in `pull_back`."""
         ...

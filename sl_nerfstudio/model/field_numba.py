@@ -12,7 +12,7 @@ from torch import Tensor
 from sl_nerfstudio.model.encoding import GridLayout
 from sl_nerfstudio.model.field_backend import FieldState, Pulled
 from sl_nerfstudio.model.kernels import fused
-from sl_nerfstudio.model.kernels.grid import BLOCK, POINTS, Grid, scatter_level
+from sl_nerfstudio.model.kernels.grid import POINTS, Grid, scatter_level
 from sl_nerfstudio.model.kernels.mlp import Network, Scratch, Weights, make_scratch
 from sl_nerfstudio.model.kernels.pack import pack_grid, pack_network, unpack_gradients, zero_gradients
 from sl_nerfstudio.model.kernels.simd import FEATURES
@@ -52,7 +52,7 @@ class NumbaField:
         points: bool,
         parameters: bool,
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
         """See `FieldBackend`; points whose `g` is negligible are left out."""
         heavy = _heavy(g)
@@ -92,7 +92,7 @@ class NumbaField:
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> tuple[Tensor, ...]:
         """See `FieldBackend`."""
         grid, network, xyz = self._packed(state, p)
@@ -154,7 +154,7 @@ class NumbaField:
             if table_gradient is None:
                 continue
             gradient = table_gradient.numpy().reshape(-1)
-            touched = np.empty(-(-self.layout.rows // BLOCK), np.uint8) if marks is None else marks.numpy()
+            touched = np.empty(self.layout.rows, np.uint8) if marks is None else marks.numpy()
             parallel(
                 [
                     partial(

@@ -98,7 +98,7 @@ class TorchField:
         points: bool,
         parameters: bool,
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
         """See `FieldBackend`."""
         e, jac = self._encode(state, p, points)
@@ -122,7 +122,7 @@ class TorchField:
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
         table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "blocks"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
     ) -> tuple[Tensor, ...]:
         """See `FieldBackend`: one reverse sweep through the pair (f, derivative of f in the direction v)."""
         e, jac = self._encode(state, p, True)

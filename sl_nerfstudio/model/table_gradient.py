@@ -1,13 +1,14 @@
 """The table's gradient: one buffer for the whole run, with marks on the rows that hold something."""
 
 from enum import Enum, auto
+from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.graph import get_gradient_edge
 
-from sl_nerfstudio.model.kernels.grid import BLOCK
-from sl_nerfstudio.model.kernels.rows import clear
+from sl_nerfstudio.model.kernels.rows import LIST, clear
 from sl_nerfstudio.model.kernels.threads import parallel, split
 
 
@@ -38,20 +39,26 @@ def wanted(parameter: Tensor) -> Wanted:
 class TableGradient:
     """Gradient buffer of a table, reused from step to step (a fresh 44 MB costs 20 ms in page faults).
 
-    Rows that are not zero lie in marked blocks of BLOCK rows, so clearing and the optimiser touch little memory.
-    Kernels write past torch's version counter; if that counter moved, somebody else wrote, and the marks say nothing.
+    Rows that are not zero are marked, so that clearing and the optimiser need not read the others. Kernels write past
+    torch's version counter; if that counter moved, somebody else wrote, and every row counts as marked.
     """
 
     def __init__(self, table: Tensor):
         self.buffer = torch.zeros_like(table, memory_format=torch.contiguous_format)
-        self.marks = torch.zeros(-(-table.shape[0] // BLOCK), dtype=torch.uint8)
+        self.marks = torch.zeros(-(-len(table) // 8) * 8, dtype=torch.uint8)
         self._version = self.buffer._version
+
+    @staticmethod
+    def known(table: Tensor) -> "TableGradient | None":
+        """The buffer that belongs to a table, if there is one."""
+        known = getattr(table, "_sl_gradient", None)
+        return known if isinstance(known, TableGradient) and known.buffer.shape == table.shape else None
 
     @staticmethod
     def of(table: nn.Parameter) -> "TableGradient":
         """The buffer that belongs to a table, made at first use; the optimiser finds it here, too."""
-        known = getattr(table, "_sl_gradient", None)
-        if known is None or known.buffer.shape != table.shape:
+        known = TableGradient.known(table)
+        if known is None:
             known = table._sl_gradient = TableGradient(table)  # pyright: ignore
         return known
 
@@ -70,7 +77,7 @@ class TableGradient:
         return gradient is not None and gradient.data_ptr() == self.buffer.data_ptr()
 
     def trusted_marks(self) -> Tensor:
-        """Marks of the blocks that may hold something: all, if torch wrote to the buffer."""
+        """Marks of the rows that may hold something: all, if torch wrote to the buffer."""
         if self.buffer._version != self._version:
             self.marks.fill_(1)
             self._version = self.buffer._version
@@ -79,5 +86,8 @@ class TableGradient:
     def clear(self) -> None:
         """Make the buffer zero."""
         marks, gradient = self.trusted_marks().numpy(), self.buffer.numpy().reshape(-1)
-        ranges = split(len(marks), 8, 64)
-        parallel([lambda a=a, b=b: clear(gradient, marks, a, b) for a, b in ranges])
+
+        def work(start: int, stop: int) -> None:
+            clear(gradient, marks, start, stop, np.empty(LIST, np.int64))
+
+        parallel([partial(work, start, stop) for start, stop in split(len(self.buffer), 8, 64)])

@@ -17,8 +17,6 @@ POINTS = 128
 """Points a chunk: its activations stay in the core's own cache."""
 FIRST = 8
 """Column of the first level."""
-BLOCK = 16
-"""Table rows that share one mark telling the optimiser that they were touched."""
 _AHEAD = 8  # points: so early are rows asked for
 _Y, _Z = np.int64(PRIMES[1]), np.int64(PRIMES[2])
 _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
@@ -209,7 +207,7 @@ def corner_slopes(tx, ty, tz, vx, vy, vz):
 
 @kernel
 def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slopes, with_slopes):
-    """Add one level's gradients to the table's.
+    """Add one level's gradients to the table's, and mark the rows.
 
     Point i adds `weight * corner_weights * values[level, i]`, and, `with_slopes`, also the directional derivative of
     the corner weights along `v` [n, 3] times `slopes[level, i]`; values and slopes are [levels, n, 8].
@@ -243,4 +241,4 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
             vz = v[start + i, 2] * inside(pz) * dz * slope
             scatter(gradient, corners, corner_slopes(tx, ty, tz, vx, vy, vz), flat_slopes, FEATURES * i)
         for corner in corners:
-            marks[corner // (FEATURES * BLOCK)] = 1
+            marks[corner // FEATURES] = 1

@@ -5,8 +5,11 @@ are emitted as LLVM vector code. LLVM maps it to whatever the machine has; only 
 All arrays are flat, contiguous float32; positions in them are counted in elements.
 """
 
+import hashlib
 import inspect
 from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
@@ -14,6 +17,8 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
+
+from sl_nerfstudio.model import encoding
 
 intrinsic: Any = _intrinsic  # callers pass the arguments without the typing context; type checkers cannot know
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
@@ -25,11 +30,25 @@ WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile with numba: no GIL, cached on disk, fused multiply-add allowed.
+    """Compile with numba: no GIL, fused multiply-add allowed, kept on disk for the next start.
 
     Run-time type checkers wrap functions before this decorator sees them; numba wants the bare one.
     """
-    return njit(inspect.unwrap(function), nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+    dispatcher = njit(nogil=True, fastmath={"contract", "reassoc", "nsz"})(inspect.unwrap(function))
+    try:
+        dispatcher.enable_caching()
+    except RuntimeError:  # no folder to write to: compile at every start
+        return dispatcher
+    # Kernels use one another's code and constants, but numba looks only at the file that a kernel is in.
+    dispatcher._cache._cache_file._source_stamp = _sources()
+    return dispatcher
+
+
+@lru_cache(maxsize=1)
+def _sources() -> str:
+    """Digest of all that compiled kernels are made from."""
+    files = [*sorted(Path(__file__).parent.glob("*.py")), Path(encoding.__file__)]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, position: Any) -> Any:
@@ -155,16 +174,18 @@ def _lerp(builder: Any, a: Any, b: Any, t: Any) -> tuple[Any, Any]:
 
 
 @intrinsic
-def prefetch(typing: Any, table: Any, corners: Any):
-    """Ask for the rows at `corners`, to be read or written soon."""
-    signature = types.void(table, corners)
+def prefetch(typing: Any, table: Any, positions: Any):
+    """Ask for what lies at some positions of an array, to be read or written soon."""
+    signature = types.void(table, positions)
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        for row in _rows(context, builder, signature.args[0], *args):
-            builder.call(function, [builder.bitcast(row, byte), I32(0), I32(3), I32(1)])
+        table, positions = args
+        for position in cgutils.unpack_tuple(builder, positions, len(signature.args[1])):
+            pointer = builder.bitcast(_pointer(context, builder, signature.args[0], table, position), byte)
+            builder.call(function, [pointer, I32(0), I32(3), I32(1)])
         return context.get_dummy_value()
 
     return signature, emit
