@@ -18,7 +18,12 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
     """`settings` (nested), `versions` (of the export, by package) and `curves` (lists by name, NaN as None)."""
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
-        "versions": {**package_versions(), "python": platform.python_version(), "device": _device(run.model.device)},
+        "versions": {
+            **package_versions(),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "device": _device(run.model.device),
+        },
         "curves": {name: plain(values) for name, values in run.model.history().items()},
     }
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 import yaml
@@ -17,6 +17,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
 
+@runtime_checkable
 class TrainedModel(Protocol):
     """What export asks of a model; poses are in the scan's world and unit, the field in the scene frame."""
 
