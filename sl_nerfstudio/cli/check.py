@@ -17,7 +17,7 @@ def main() -> None:
     run(lambda: tyro.cli(check, prog="sl-check"))
 
 
-def check(folder: Annotated[Path, tyro.conf.Positional]) -> None:
+def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]) -> None:
     """List every fault of a scan folder at once: file, frame, field, likely cause, what to do.
 
     Reads transforms.json and decodes every file; training makes the same check before it starts. Prints a short
@@ -41,6 +41,7 @@ def summary(result: "Examination") -> str:
     if scan is None or fit is None:
         raise ValueError("a scan with faults has no summary")
     sizes = sorted({(frame.camera.w, frame.camera.h) for frame in scan.frames})
+    unit = "units" if scan.units == "arbitrary" else scan.units
     decoded = [content.decoded for content in result.contents]
     lines = [
         f"{scan.root}: no faults",
@@ -48,10 +49,9 @@ def summary(result: "Examination") -> str:
         f"  projector           {scan.projector.model}, {scan.projector.w} x {scan.projector.h} pixels",
         f"  units               {scan.units}, scale {'known' if scan.scale.known else 'not known'}"
         + (f" ({scan.scale.source})" if scan.scale.source else ""),
-        f"  working distance    {fit.depth:.4g} {scan.units} (median)",
+        f"  working distance    {fit.depth:.4g} {unit} (median)",
         f"  decoded             {100 * min(decoded):.0f} to {100 * max(decoded):.0f} % of the masked pixels",
-        f"  starting poses      epipolar residual {fit.typical_px:.2g} px; frames {fit.typical_spread * fit.depth:.2g} "
-        f"{scan.units} apart (medians)",
+        f"  starting poses      epipolar residual {fit.typical_px:.2g} px (median)",
     ]
     whole = [content.name for content in result.contents if content.masked == 1]
     if whole:

@@ -1,0 +1,119 @@
+"""A sphere under a moving camera and projector, by formula: a valid scan folder of a few frames in milliseconds."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.errors import Fault
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan import Scale, ScanWriter, check_scan
+
+RADIUS = 40.0
+CAMERA = Device(w=72, h=60, fl_x=150.0, fl_y=152.0, cx=35.0, cy=31.0)
+PROJECTOR = Device(w=128, h=96, fl_x=260.0, fl_y=255.0, cx=66.0, cy=45.0)
+NAMES = ("frame_00000", "frame_00001", "frame_00002", "frame_00003")
+
+
+def look_at(position: ndarray, target: ndarray, roll: float) -> ndarray:
+    """Pose of a device that looks along its -z at `target`, turned by `roll` radian about its axis."""
+    z = (position - target) / np.linalg.norm(position - target)
+    x = np.cross((0.1, 0.2, 1.0), z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1) @ Rotation.from_euler("z", roll).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+def poses(frames: int = len(NAMES)) -> list[tuple[ndarray, ndarray]]:
+    """(T_world_camera, T_world_projector) of frames around the sphere, each with another baseline."""
+    out = []
+    for i in range(frames):
+        angle = 2 * np.pi * i / max(frames, 3)
+        position = 250 * np.array([np.cos(angle), np.sin(angle), 0.5 + 0.1 * i])
+        T_world_camera = look_at(position, np.array([2.0 * i, 0, 0]), 0.2 * i)
+        offset = T_world_camera[:3, :3] @ np.array([60.0 + 5 * i, 20.0 - 10 * i, 4.0])
+        out.append((T_world_camera, look_at(position + offset, np.array([0, 3.0 * i, 0]), 0.2 * i + 0.1)))
+    return out
+
+
+def pattern_image() -> ndarray:
+    """A smooth random pattern, uint8."""
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(PROJECTOR.h, PROJECTOR.w)), 2.0)
+    return np.clip(128 + 100 * noise / np.abs(noise).max(), 1, 255).astype(np.uint8)
+
+
+def correspondences(T_world_camera: ndarray, T_world_projector: ndarray) -> ndarray:
+    """Coordinates (h, w, 2) of the sphere by the formulas of the format, float32, NaN off the sphere and in shadow."""
+    x, y = np.meshgrid(np.arange(CAMERA.w) + 0.5, np.arange(CAMERA.h) + 0.5)
+    d = np.stack([(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T_world_camera[:3, :3].T
+    o = T_world_camera[:3, 3]
+    b, c = d @ o, o @ o - RADIUS**2
+    hit = b * b > c
+    p = o + (-b - np.sqrt(np.where(hit, b * b - c, 0)))[..., None] * d
+    to_projector = T_world_projector[:3, 3] - p
+    lit = hit & ((p * to_projector).sum(-1) > 0)
+    q = -to_projector @ T_world_projector[:3, :3]
+    xp = PROJECTOR.fl_x * q[..., 0] / -q[..., 2] + PROJECTOR.cx
+    yp = -PROJECTOR.fl_y * q[..., 1] / -q[..., 2] + PROJECTOR.cy
+    return np.where(lit[..., None], np.stack([xp, yp], -1), np.nan).astype(np.float32)
+
+
+def look_up(pattern: ndarray, coords: ndarray) -> ndarray:
+    """The pattern at the coordinates, 10 where there are none."""
+    from scipy.ndimage import map_coordinates
+
+    known = np.isfinite(coords[..., 0])
+    uv = np.where(known[..., None], coords, 0)
+    values = map_coordinates(pattern.astype(float), [uv[..., 1] - 0.5, uv[..., 0] - 0.5], order=1, mode="nearest")
+    return np.where(known, values, 10).round().astype(np.uint8)
+
+
+def write_sphere(root: Path, frames: int = len(NAMES), **settings: Any) -> Path:
+    """Write a valid scan; `settings` replace those of ScanWriter."""
+    pattern = pattern_image()
+    given = {"units": "mm", "scale": Scale(False), "projector": PROJECTOR, "pattern": pattern, "camera": CAMERA}
+    with ScanWriter(root, **{**given, **settings}) as writer:
+        for i, (T_world_camera, T_world_projector) in enumerate(poses(frames)):
+            coords = correspondences(T_world_camera, T_world_projector)
+            seen = look_up(pattern, coords)
+            writer.add_frame(
+                f"frame_{i:05d}",
+                image=seen // 2 + 5,
+                coords=coords,
+                pattern=seen,
+                mask=np.isfinite(coords[..., 0]),
+                T_world_camera=T_world_camera,
+                T_world_projector=T_world_projector,
+            )
+    return root
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change transforms.json as a user's faulty program might: nothing is checked."""
+    path = root / "transforms.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
+    change(document)
+    path.write_text(json.dumps(document), encoding="utf-8")
+
+
+def edit_coords(root: Path, name: str, change: Callable[[ndarray], ndarray]) -> None:
+    """Change the coordinates of one frame."""
+    path = root / "coords" / f"{name}.npz"
+    with np.load(path) as archive:
+        coords = archive["coords"]
+    np.savez(path, coords=change(coords))
+
+
+def only_fault(root: Path) -> Fault:
+    """The fault of a folder that must have exactly one."""
+    faults = check_scan(root)
+    assert len(faults) == 1, "\n".join(map(str, faults)) or "no fault"
+    return faults[0]
