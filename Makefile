@@ -67,7 +67,7 @@ demo: install
 	rm -rf $(DEMO)
 	$(BIN)/sl-synth --output $(DEMO)/scan
 	$(BIN)/ns-train sl-neus --data $(DEMO)/scan --output-dir $(DEMO)/run \
-	  --experiment-name cone-and-cylinder --timestamp demo --vis tensorboard
+	  --experiment-name cone-and-cylinder --timestamp demo
 	$(BIN)/sl-export --load-config $(DEMO_RUN)/config.yml --output $(DEMO)/mesh.ply --poses $(DEMO)/refined
 	$(BIN)/sl-eval --mesh $(DEMO)/mesh.ply --data $(DEMO)/scan --poses $(DEMO)/refined/transforms.json \
 	  --json $(DEMO)/evaluation.json --report $(DEMO)/report.html

@@ -1,0 +1,217 @@
+"""What the package promises as a whole: entry points, commands and their help, dependencies, layers, no network."""
+
+import ast
+import dataclasses
+import importlib
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import sl_nerfstudio
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # constraints.txt pins it; pytest needs it there too
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "sl_nerfstudio"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SCRIPTS: dict[str, str] = PROJECT["scripts"]
+
+# Folders in the order in which data walks through them: each imports only from itself and from those before it.
+LAYERS = (
+    "errors", "progress", "geometry", "scan", "pattern", "synthesis", "decoding", "calibration", "dataparser", "model",
+    "meshing", "evaluation", "cli", "methods",
+)  # fmt: skip
+
+# A dependency whose import is not called as its distribution is.
+IMPORTED_AS = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
+# Declared without being imported here, each with the reason.
+NOT_IMPORTED: dict[str, str] = {}
+
+# Runs a command's `main` with --help and prints the heavy modules that this loaded. Sockets raise.
+HELP = """
+import importlib, socket, sys
+def refuse(*a, **k): raise RuntimeError("a help text reached for the network")
+socket.socket.connect = socket.getaddrinfo = refuse
+module, function = sys.argv[1].split(":")
+sys.argv = [sys.argv[2], "--help"]
+try:
+    getattr(importlib.import_module(module), function)()
+except SystemExit as stop:
+    heavy = [name for name in ("torch", "open3d", "nerfstudio", "numba", "scipy", "skimage") if name in sys.modules]
+    print(f"exit {stop.code}, loaded {heavy}")
+"""
+
+
+def modules() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Absolute names of all modules that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                package = path.relative_to(ROOT).with_suffix("").parts[: -node.level]
+                yield ".".join((*package, *filter(None, [node.module])))
+            elif node.module:
+                yield node.module
+
+
+def layer(module: str) -> str:
+    """The folder (or file) directly below the package that a module belongs to."""
+    return (module.split(".") + [""])[1]
+
+
+def distribution_name(requirement: str) -> str:
+    return re.split(r"[\[<>=!~;\s]", requirement)[0].lower()
+
+
+# ------------------------------------------------------------------ metadata
+
+
+def test_version_is_that_of_the_installed_package():
+    assert importlib.metadata.version("sl-nerfstudio") == sl_nerfstudio.__version__
+
+
+@pytest.mark.parametrize("group", ["nerfstudio.method_configs", "nerfstudio.dataparser_configs"])
+def test_entry_points_load_under_the_name_they_are_registered_by(group):
+    declared = PROJECT["entry-points"][group]
+    found = {e.name: e for e in importlib.metadata.entry_points(group=group) if e.value in declared.values()}
+    assert found.keys() == declared.keys()
+    for name, entry in found.items():
+        specification = entry.load()
+        assert len(specification.description) > 10
+        if group == "nerfstudio.method_configs":
+            assert specification.config.method_name == name
+
+
+def test_help_templates_and_weights_are_inside_the_package_folder():
+    """The wheel holds the package folder and nothing else, so a file that code reads must lie there."""
+    templates = [path for path in PACKAGE.rglob("*.html*")]
+    assert templates, "the report's template"
+
+
+def test_constraints_are_plain_pins_that_satisfy_the_declared_ranges():
+    from packaging.requirements import Requirement
+
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pins = dict(line.split("==") for line in lines)
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line) for line in lines)
+    assert len(pins) == len(lines)
+    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(pins[requirement.name]), text
+
+
+def test_exactly_one_opencv():
+    wheels = {d.name for d in importlib.metadata.distributions() if "opencv" in d.name.lower()}
+    assert wheels == {"opencv-python-headless"}
+
+
+def test_imported_packages_are_the_declared_dependencies():
+    standard = sys.stdlib_module_names | {"sl_nerfstudio"}
+    imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
+    declared = {distribution_name(text) for text in PROJECT["dependencies"]} - NOT_IMPORTED.keys()
+    assert imported == {IMPORTED_AS.get(name, name) for name in declared}
+
+
+# ------------------------------------------------------------------ layout
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_folders_import_only_from_those_before_them(path):
+    own = path.relative_to(PACKAGE).with_suffix("").parts[0]
+    if own == "__init__":
+        return
+    for name in imports(path):
+        if name.startswith("sl_nerfstudio."):
+            assert LAYERS.index(layer(name)) <= LAYERS.index(own), f"{own} must not import {name}"
+
+
+def test_only_the_plugin_side_imports_nerfstudio():
+    """Its import takes ten seconds. meshing/ loads training runs, cli/ none of it before a command's flags are read."""
+    users = {layer(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in modules()
+             if any(name.split(".")[0] == "nerfstudio" for name in imports(path))}  # fmt: skip
+    assert users <= {"dataparser", "model", "methods", "meshing", "cli"}
+
+
+def test_no_url_and_no_machine_path_in_the_code():
+    for path in [*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.html*"), ROOT / "Makefile", ROOT / "constraints.txt"]:
+        text = path.read_text()
+        assert not re.search(r"https?://(?!www\.w3\.org/)", text), path
+        assert not re.search(r"(?<![\w.])/(home|root|work|tmp|mnt)/", text), path
+
+
+# ------------------------------------------------------------------ commands
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_help_needs_no_heavy_import_and_no_network(script):
+    environment = {**os.environ, "COLUMNS": "120", "NO_COLOR": "1"}
+    result = subprocess.run(
+        [sys.executable, "-c", HELP, SCRIPTS[script], script], capture_output=True, text=True, env=environment
+    )
+    assert result.stdout.splitlines()[-1] == "exit 0, loaded []", result.stderr
+    assert f"usage: {script}" in result.stdout
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_flag_says_what_it_is(script):
+    """What is left of a flag's help without its name, its type and its default has to be words."""
+    environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1"}
+    command = [sys.executable, "-c", HELP, SCRIPTS[script], script]
+    text = subprocess.run(command, capture_output=True, text=True, env=environment).stdout
+    entries = re.split(r"^│ (?=-|[A-Z]{2,}\b)", text.replace("│\n", "\n"), flags=re.MULTILINE)[1:]
+    assert len(entries) > 1
+    for entry in entries:
+        flag, *rest = re.split(r"\s{2,}|\n", entry, maxsplit=1)
+        explanation = re.sub(r"\((default|required|optional|repeatable)[^)]*\)|[│╰─╯╮╭]", "", " ".join(rest))
+        assert re.search(r"\w+ \w+", explanation), f"{script}: {flag} is not explained"
+
+
+def test_every_setting_of_the_methods_says_what_it_is():
+    """`ns-train sl-neus --help` shows the text below each field; fields that nerfstudio defines are its own."""
+    for name, cls in config_classes():
+        source = ast.parse(Path(sys.modules[cls.__module__].__file__ or "").read_text())
+        body = next(node for node in ast.walk(source) if isinstance(node, ast.ClassDef) and node.name == name).body
+        for statement, following in zip(body, [*body[1:], None], strict=True):
+            if not isinstance(statement, ast.AnnAssign) or "Suppress" in ast.unparse(statement.annotation):
+                continue
+            field = ast.unparse(statement.target)
+            explained = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+            assert field == "_target" or explained, f"{name}.{field} has no text below it"
+
+
+def config_classes() -> list[tuple[str, type]]:
+    """Every settings class of ours that the methods are made of."""
+    from sl_nerfstudio import methods
+
+    found: dict[str, type] = {}
+
+    def visit(value: object) -> None:
+        if not dataclasses.is_dataclass(value) or isinstance(value, type):
+            return
+        for cls in type(value).__mro__:
+            if cls.__module__.startswith("sl_nerfstudio"):
+                found[cls.__name__] = cls
+        for field in dataclasses.fields(value):
+            visit(getattr(value, field.name))
+
+    for specification in (methods.sl_neus, methods.sl_neus_paper):
+        visit(specification.config)
+        for entry in specification.config.optimizers.values():
+            visit(entry["optimizer"])
+            visit(entry["scheduler"])
+    assert {"SLModelConfig", "SLDataManagerConfig", "SLDataParserConfig"} <= found.keys()
+    return sorted(found.items())
