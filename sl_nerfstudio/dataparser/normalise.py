@@ -1,7 +1,7 @@
 """From the scan's world to the scene in which the field lives: object at 0, inside the unit sphere.
 
-The map is made from the triangulated points and from the first frame's orientation alone. Turn, shift or scale
-the world of a scan, and the normalised scene stays the same but for rounding.
+The map is made from the triangulated points and from the cameras' orientation alone. Turn, shift or scale the
+world of a scan, and the normalised scene stays the same but for rounding.
 """
 
 import numpy as np
@@ -22,11 +22,12 @@ _POINTS_PER_FRAME = 1000
 _FEWEST_POINTS = 16
 _NEIGHBOURS = 8
 _LONELY = 4.0  # times the usual distance to the neighbours: a wrong decoding
+_COMMON_UP = 0.3  # length of the mean of the cameras' up directions from which on they count as having one
 _INSIDE = 0.99  # share of the points that the object's sphere holds
 
 
 def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
-    """`S_scene_world`, with scene axes: x to the right of the first frame's camera, z up in its image, y into it.
+    """`S_scene_world`, with scene axes as `upright` makes them from the cameras.
 
     Raises UserError where hardly any pixel triangulates.
     """
@@ -40,11 +41,24 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
         )
     centre, radius = enclosing_sphere(without_lonely(points))
     scale = OBJECT_RADIUS / radius
-    R = _AXES @ scan.frames[0].T_world_camera[:3, :3].T
+    R = upright(scan.T_world_camera)
     return Similarity(scale, R, -scale * R @ centre)
 
 
-_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # camera (right, up, back) to scene (x, y, z)
+def upright(T_world_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "3 3"]:
+    """Rotation from world to scene axes: z is the cameras' mean up, x the first camera's right as far as it can be.
+
+    Where the cameras roll so freely that they have no common up, z is the first camera's.
+    """
+    up = T_world_camera[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < _COMMON_UP:
+        up = T_world_camera[0, :3, 1]
+    z = up / np.linalg.norm(up)
+    # right and back of the first camera are perpendicular: they cannot both lie along z
+    across = [axis - (axis @ z) * z for axis in T_world_camera[0, :3, [0, 2]]]
+    right, back = (np.linalg.norm(axis) for axis in across)
+    x = across[0] / right if right > 0.1 else np.cross(z, across[1] / back)
+    return np.stack([x, np.cross(z, x), z])
 
 
 def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarray, "n 3"], int]:

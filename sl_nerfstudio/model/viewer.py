@@ -23,6 +23,9 @@ CAMERA_COLOUR = (90, 160, 255)
 PROJECTOR_COLOUR = (255, 140, 40)
 _PATTERN_PIXELS = 256  # longest side of the pattern drawn on a projector
 _SECONDS_BETWEEN_UPDATES = 0.5
+_FRUSTUM_SIZE = 0.6  # of the devices' distance from the object, times nerfstudio's --viewer.camera-frustum-scale of 0.1
+_VIEWING_DISTANCE = 3.0  # scene units; the object's radius is 0.8
+_VIEWING_ANGLES = (0.35, 0.3)  # radian beside and above the first camera
 
 ScenePoses = tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n 4 4"]]
 
@@ -46,6 +49,10 @@ class SceneView(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
+        # nerfstudio takes cameras to stand within the unit box; here the object does, and they stand far outside.
+        # It draws its own frusta after this, from the same setting.
+        distance = float(np.median(np.linalg.norm(self._initial[0][:, :3, 3], axis=1)))
+        viewer.config.camera_frustum_scale *= _FRUSTUM_SIZE * distance * VISER_NERFSTUDIO_SCALE_RATIO
         scale = viewer.config.camera_frustum_scale
         cameras = [frame.camera for frame in self._scan.frames]
         projectors = [self._scan.projector] * len(cameras)
@@ -59,6 +66,13 @@ class SceneView(ViewerControl):
             self._frusta("refined/camera", cameras, camera_poses, CAMERA_COLOUR, scale),
             self._frusta("refined/projector", projectors, projector_poses, PROJECTOR_COLOUR, scale, pattern),
         )
+
+        self.viser_server.on_client_connect(self._look_at_object)
+
+    def _look_at_object(self, client: viser.ClientHandle) -> None:
+        client.camera.up_direction = (0.0, 0.0, 1.0)
+        client.camera.position = first_viewpoint(self._initial[0][0]) * VISER_NERFSTUDIO_SCALE_RATIO
+        client.camera.look_at = (0.0, 0.0, 0.0)
 
     def update(self, force: bool = False) -> None:
         """Move the coloured frusta to the current poses; at most twice a second, and only while somebody looks."""
@@ -109,6 +123,15 @@ class SceneView(ViewerControl):
             _place(handle, T)
             handles.append(handle)
         return handles
+
+
+def first_viewpoint(T_scene_camera: Float[ndarray, "4 4"]) -> Float[ndarray, "3"]:
+    """Near the object, a little beside and above the line to the first camera."""
+    towards = T_scene_camera[:3, 3] / np.linalg.norm(T_scene_camera[:3, 3])
+    azimuth = math.atan2(towards[1], towards[0]) + _VIEWING_ANGLES[0]
+    elevation = min(math.asin(towards[2]) + _VIEWING_ANGLES[1], 1.2)
+    direction = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    return _VIEWING_DISTANCE * np.array(direction)
 
 
 def vertical_fov(device: Device) -> float:

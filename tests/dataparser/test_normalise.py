@@ -4,11 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from tiny_scan import RADIUS, TinyScan
 
-from sl_nerfstudio.dataparser.normalise import enclosing_sphere, normalisation, without_lonely
+from sl_nerfstudio.dataparser.normalise import enclosing_sphere, normalisation, upright, without_lonely
 from sl_nerfstudio.dataparser.samples import build_samples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -54,12 +57,44 @@ def test_unit_and_world_frame_do_not_matter(
     )
 
 
-def test_scene_axes_are_those_of_the_first_camera(tiny_root: Path) -> None:
+def test_the_viewers_up_is_the_cameras_up(tiny_root: Path) -> None:
+    # the cameras stand around the y axis and look down by 0.3 rad
     scan, S = normalise(tiny_root)
-    right, up, back = S.poses(scan.T_world_camera)[0, :3, :3].T
-    np.testing.assert_allclose(right, [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(back, [0, -1, 0], atol=1e-12)
+    y_scene = S.R @ [0.0, 1.0, 0.0]
+    ups = scan.T_world_camera[:, :3, 1]
+    np.testing.assert_allclose(S.R @ ups.mean(0) / np.linalg.norm(ups.mean(0)), [0, 0, 1], atol=1e-12)
+    assert y_scene[2] > 0.95
+    right = S.poses(scan.T_world_camera)[0, :3, 0]
+    assert right[0] > 0.9 and abs(right[1]) < 1e-12
+
+
+@given(arrays(np.float64, (4, 3), elements=st.floats(-3, 3)), st.integers(1, 4))
+def test_upright_is_a_rotation_and_turns_with_the_world(vectors: ndarray, count: int) -> None:
+    R = Rotation.from_rotvec(vectors).as_matrix()
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = R[:count]
+    axes = upright(T)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) > 0
+    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    turned = T.copy()
+    turned[:, :3, :3] = turn @ T[:, :3, :3]
+    assume(abs(np.linalg.norm(T[:, :3, 1].mean(0)) - 0.3) > 1e-9)
+    np.testing.assert_allclose(upright(turned) @ turn, axes, atol=1e-9)
+
+
+def test_cameras_without_a_common_up_take_the_first_ones() -> None:
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])  # rolled by half a turn
+    np.testing.assert_allclose(upright(T), [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def test_a_first_camera_on_its_side_still_gives_axes() -> None:
+    roll = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # its right is the others' up
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[0, :3, :3] = roll
+    axes = upright(T)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
 def test_one_pixel_in_ten_wrong_changes_little(tmp_path: Path, tiny_root: Path) -> None:
