@@ -103,7 +103,7 @@ class GridPattern:
         return (image / supersampling**2).astype(np.float32)
 
     @cached_property
-    def _line_offsets(self) -> tuple[Float[ndarray, "rows segments 2"], Float[ndarray, "segments columns 2"]]:
+    def _line_offsets(self) -> tuple[Float[ndarray, "rows s 2"], Float[ndarray, "r columns 2"]]:
         """Offsets at both ends of each segment: segment k of a line runs from node k - 1 to node k.
 
         At the rim, where one of the nodes is missing, a segment keeps the offset of the other.

@@ -44,7 +44,7 @@ def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generat
 
 
 def look_at(
-    position: Float[ndarray, "*n 3"], target: Float[ndarray, "*n 3"], roll: Float[ndarray, "*n"]
+    position: Float[ndarray, "*n 3"], target: Float[ndarray, "*#n 3"], roll: Float[ndarray, "*n"]
 ) -> Float64[ndarray, "*n 4 4"]:
     """Pose of a device at `position` that looks at `target`; `roll` (radian) turns it about its line of sight."""
     back = position - target

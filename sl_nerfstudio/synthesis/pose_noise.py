@@ -35,6 +35,16 @@ class PoseNoise:
     baseline_length: float  # as a fraction
     first_baseline_exact: bool = True
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether the poses stay exact."""
+        return not (self.rotation_deg or self.translation or self.disturbs_relative)
+
+    @property
+    def disturbs_relative(self) -> bool:
+        """Whether auto-calibration errs."""
+        return bool(self.relative_rotation_deg or self.baseline_direction_deg or self.baseline_length)
+
 
 @dataclass(frozen=True)
 class Correspondences:
@@ -54,10 +64,12 @@ def disturb_poses(
     rng: np.random.Generator,
 ) -> Poses:
     """Starting poses: auto-calibration errors, registration of what they yield, registration errors."""
+    if noise.is_zero:
+        return truth
     T_camera_projector = np.linalg.inv(truth.T_world_camera) @ truth.T_world_projector
     calibrated = disturb_relative(T_camera_projector, noise, rng)
     camera = truth.T_world_camera.copy()
-    if noise.relative_rotation_deg or noise.baseline_direction_deg or noise.baseline_length:
+    if noise.disturbs_relative:
         for n, match in enumerate(matches):
             camera[n] = _registered(camera[n], calibrated[n], devices, match)
     motion = _motions_about(centre, len(camera), noise, rng)

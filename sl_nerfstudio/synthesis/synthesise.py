@@ -25,6 +25,7 @@ from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
+TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
 _GAIN = 1.05  # exposure: a surface of mean albedo, perpendicular, in full light, comes to 0.82 of full scale
 _WINDOW = 0.8  # of local normalisation, in periods of the pattern
 
@@ -54,9 +55,10 @@ def synthesise(config: SynthConfig, output: Path) -> None:
     if config.images_only:
         _write_captures(config, setup, output)
     else:
-        with _scan_writer(config, setup, output, setup.start) as writer:
+        with _scan_writer(config, setup, output) as writer:
             for index, frame in enumerate(_frames(config, setup)):
-                _add(writer, config, setup, frame, index, setup.start)
+                start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
+                _add(writer, frame, start, truth)
             _add_files(writer, config, setup, "ground_truth/mesh.ply")
 
 
@@ -109,9 +111,9 @@ def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
     return np.rint(255 * image).astype(np.uint8)
 
 
-def _scan_writer(config: SynthConfig, setup: Setup, root: Path, poses: Poses) -> ScanWriter:
+def _scan_writer(config: SynthConfig, setup: Setup, root: Path) -> ScanWriter:
     extra: dict[str, Any] = {}
-    if config.pose_sigma and setup.sigma is not None and poses is setup.start:
+    if config.pose_sigma and setup.sigma is not None:
         extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
     scale = Scale(True, "baseline of frame 0") if config.scale_known else Scale(False)
     return ScanWriter(
@@ -133,23 +135,22 @@ def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
     )
 
 
-def _add(
-    writer: ScanWriter, config: SynthConfig, setup: Setup, frame: SyntheticFrame, index: int, poses: Poses
-) -> None:
-    """Write a frame with the given poses; the true ones go along where they differ."""
+def _world_poses(config: SynthConfig, setup: Setup, poses: Poses, index: int) -> TwoPoses:
+    """Camera and projector of one frame in the axes and the unit that are written."""
     S_world_scene = world_from_scene(config, setup.scene)
-    camera, projector, true_camera, true_projector = S_world_scene.poses(
-        np.stack([p[index] for s in (poses, setup.truth) for p in (s.T_world_camera, s.T_world_projector)])
-    )
+    return S_world_scene.poses(poses.T_world_camera[index]), S_world_scene.poses(poses.T_world_projector[index])
+
+
+def _add(writer: ScanWriter, frame: SyntheticFrame, poses: TwoPoses, truth: TwoPoses | None) -> None:
     writer.add_frame(
         frame.name,
         image=frame.image,
         coords=frame.coords,
         mask=frame.mask,
         pattern=frame.pattern,
-        T_world_camera=camera,
-        T_world_projector=projector,
-        true_poses=None if poses is setup.truth else (true_camera, true_projector),
+        T_world_camera=poses[0],
+        T_world_projector=poses[1],
+        true_poses=truth,
     )
 
 
@@ -163,10 +164,10 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, mesh: str)
 
 def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
     """What a decoder starts from, and apart from it the scan that it should come to."""
-    exact = replace(config, noise=0.0, missing=0.0, wrong=0.0)
-    with _scan_writer(exact, setup, output / "ground_truth", setup.truth) as truth:
+    exact = replace(config, noise=0.0, missing=0.0, wrong=0.0, pose_sigma=False)
+    with _scan_writer(exact, setup, output / "ground_truth") as truth:
         for index, frame in enumerate(_frames(exact, setup)):
-            _add(truth, exact, setup, frame, index, setup.truth)
+            _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
             write_atomic(output / "images" / f"{frame.name}.png", encode_png(frame.image))
         _add_files(truth, exact, setup, "mesh.ply")
     write_atomic(output / "pattern.png", encode_png(_to_8_bit(setup.pattern)))

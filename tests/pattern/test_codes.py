@@ -1,0 +1,91 @@
+"""Code arrays: every 3x3 window tells where it is."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.pattern.codes import code_array, hamming_margin, rotate_codes, windows
+
+_AFTER_A_QUARTER_TURN = {0: 0, 1: 3, 2: 4, 3: 1, 4: 2}
+
+
+def _turned_once(window):
+    """Clockwise: what was in the left column, from bottom to top, becomes the upper row."""
+    size = len(window)
+    return [[_AFTER_A_QUARTER_TURN[window[size - 1 - j][i]] for j in range(size)] for i in range(size)]
+
+
+def _smallest_distances(codes):
+    """Upright and turned margins by comparing all pairs, in plain Python."""
+    rows, columns = codes.shape
+    all_windows = [codes[i : i + 3, j : j + 3].tolist() for i in range(rows - 2) for j in range(columns - 2)]
+    turned = []
+    for window in all_windows:
+        for _ in range(3):
+            window = _turned_once(window)
+            turned.append(window)
+    flat = [list(itertools.chain(*w)) for w in all_windows]
+    flat_turned = [list(itertools.chain(*w)) for w in turned]
+
+    def distance(a, b):
+        return sum(x != y for x, y in zip(a, b, strict=True))
+
+    upright = min(distance(a, b) for a, b in itertools.combinations(flat, 2))
+    return upright, min(upright, min(distance(a, b) for a in flat for b in flat_turned))
+
+
+def test_margins_agree_with_a_comparison_of_all_pairs():
+    codes = code_array(11, 9, seed=5)
+    assert _smallest_distances(codes) == (
+        hamming_margin(codes, rotations=False),
+        hamming_margin(codes, rotations=True),
+    )
+
+
+def test_margins_of_a_bad_array_agree_too():
+    codes = np.random.default_rng(0).integers(0, 2, (9, 9)).astype(np.int8)
+    assert _smallest_distances(codes) == (hamming_margin(codes, False), hamming_margin(codes, True))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_the_default_size_corrects_one_misread_cell(seed):
+    codes = code_array(40, 40, seed)
+    assert codes.shape == (40, 40)
+    assert set(np.unique(codes)) == {0, 1, 2, 3, 4}
+    assert hamming_margin(codes, rotations=False) == 3
+    assert hamming_margin(codes, rotations=True) == 2
+
+
+def test_symbols_are_about_equally_frequent():
+    share = np.bincount(code_array(40, 40, 0).ravel(), minlength=5) / 1600
+    assert share.min() > 0.16 and share.max() < 0.24
+
+
+def test_same_seed_same_array_and_other_seed_another():
+    assert np.array_equal(code_array(20, 15, 3), code_array(20, 15, 3))
+    assert not np.array_equal(code_array(20, 15, 3), code_array(20, 15, 4))
+
+
+def test_an_array_too_large_for_the_margin_still_comes():
+    codes = code_array(12, 12, margin=3, turned_margin=3)
+    assert hamming_margin(codes, rotations=False) == 3
+
+
+def test_smaller_than_a_window():
+    assert code_array(2, 7).shape == (2, 7)
+
+
+def test_four_quarter_turns_change_nothing():
+    codes = code_array(6, 8)
+    assert np.array_equal(rotate_codes(codes, 4), codes)
+    assert np.array_equal(rotate_codes(rotate_codes(codes, 1), 3), codes)
+    assert rotate_codes(codes, 1).tolist() == [
+        [_AFTER_A_QUARTER_TURN[codes[5 - j, i]] for j in range(6)] for i in range(8)
+    ]
+
+
+def test_windows_in_reading_order():
+    codes = np.arange(20, dtype=np.int8).reshape(4, 5) % 5
+    assert windows(codes).shape == (6, 9)
+    assert windows(codes)[4].tolist() == codes[1:4, 1:4].ravel().tolist()

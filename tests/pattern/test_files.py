@@ -1,0 +1,86 @@
+"""pattern.json: what is written comes back, and faults are named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.files import encode_grid, read_grid, read_pattern
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.images import encode_png
+
+
+@pytest.fixture
+def grid():
+    return GridPattern(w=160, h=120, period=16.0, line_width=3.0, gap=5.0, seed=9)
+
+
+@pytest.fixture
+def path(grid, tmp_path):
+    path = tmp_path / "pattern.json"
+    path.write_bytes(encode_grid(grid))
+    return path
+
+
+def test_a_grid_comes_back(grid, path):
+    back = read_grid(path)
+    assert np.array_equal(back.codes, grid.codes)
+    assert np.array_equal(back.render(), grid.render())
+
+
+def test_the_margins_are_stated(path):
+    document = json.loads(path.read_text())
+    assert document["hamming_margin"] >= 3 and document["hamming_margin_turned"] >= 2
+    assert document["rows"] == 7 and document["columns"] == 10
+    assert len(document["symbols"]) == 5
+
+
+def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path):
+    picture, described = tmp_path / "pattern.png", read_pattern(path)
+    picture.write_bytes(encode_png(np.rint(255 * grid.render()).astype(np.uint8)))
+    image, no_grid = read_pattern(picture)
+    assert no_grid is None and described[1] is not None
+    np.testing.assert_allclose(image, described[0], atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "dots"}, '"kind" is not "grid"'),
+        ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
+        ({"period": None}, "contradicts itself"),
+        ({"codes": [[0, 1], [2]]}, "contradicts itself"),
+        ({"codes": [[9] * 10] * 7}, "codes must be 0 to 4"),
+        ({"gap": 100}, "gap 100"),
+    ],
+)
+def test_faulty_descriptions(path, change, message):
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(UserError, match=message) as caught:
+        read_grid(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_field(path):
+    document = json.loads(path.read_text())
+    del document["line_width"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match="line_width is missing; write the file again"):
+        read_grid(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "nonsense"])
+def test_no_description_at_all(path, text):
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"pattern\.json"):
+        read_pattern(path)
+
+
+def test_a_picture_that_is_none(tmp_path):
+    path = tmp_path / "pattern.png"
+    path.write_bytes(b"no image")
+    with pytest.raises(UserError, match=r"pattern\.png"):
+        read_pattern(path)
+    with pytest.raises(UserError, match=r"absent\.png"):
+        read_pattern(tmp_path / "absent.png")
