@@ -26,7 +26,7 @@ def corner_weights(
     """Cell of each point, the interpolation weights of its corners, and their derivatives with respect to `p`."""
     half = layout.resolutions[level] / 2
     x = (p + 1) * half
-    cell = x.detach().floor().clamp(0, layout.resolutions[level] - 1)
+    cell = x.detach().nan_to_num(0).floor().clamp(0, layout.resolutions[level] - 1)
     t = x - cell
     slope = torch.full_like(t, half)
     if layout.smooth:

@@ -5,7 +5,7 @@ torch operations of it. It never sees autograd.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
@@ -34,6 +34,7 @@ class Pulled:
     mlp: tuple[Tensor, ...] | None
 
 
+@runtime_checkable
 class FieldBackend(Protocol):
     """An implementation of the field for one layout and activation."""
 

@@ -39,7 +39,8 @@ class RowAdam(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    self._step(parameter, group["lr"], *group["betas"], group["eps"])
+                    beta1, beta2 = group["betas"]
+                    self._step(parameter, group["lr"], beta1, beta2, group["eps"])
         return loss
 
     def _step(self, parameter: nn.Parameter, lr: float, beta1: float, beta2: float, eps: float) -> None:

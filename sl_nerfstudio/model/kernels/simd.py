@@ -34,7 +34,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
     Run-time type checkers wrap functions before this decorator sees them; numba wants the bare one.
     """
-    dispatcher = njit(nogil=True, fastmath={"contract", "reassoc", "nsz"})(inspect.unwrap(function))
+    dispatcher: Any = njit(nogil=True, fastmath={"contract", "reassoc", "nsz"})(inspect.unwrap(function))
     try:
         dispatcher.enable_caching()
     except RuntimeError:  # no folder to write to: compile at every start
