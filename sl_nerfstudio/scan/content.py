@@ -61,6 +61,7 @@ def check_content(
     mask = None if mask_path is None else _check_mask(mask_path, frame, draft, faults)
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
+    both = None if decoded is None else (decoded if mask is None else decoded & mask)
     if mask_path and coords_path and mask is not None and decoded is not None:
         for problem in _together_problems(mask, decoded):
             faults.add(problem, relative(mask_path, draft.root), frame.name)
@@ -69,12 +70,12 @@ def check_content(
     if "sl_pattern_path" in frame.paths:
         shown_path = pattern_path
         shown = None if pattern_path is None else _read_image(pattern_path, draft, frame.name, faults)
-    if shown is not None and shown_path is not None and where is not None and where.shape == shown.shape[:2]:
-        inside = shown[where]
+    compared = where if both is None else both
+    if shown is not None and shown_path is not None and compared is not None and compared.shape == shown.shape[:2]:
+        inside = shown[compared]
         if inside.size and inside.min() == inside.max():
             faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, draft.root), frame.name)
     digest = None if image is None or coords is None else _digest(image, coords)
-    both = None if decoded is None else (decoded if mask is None else decoded & mask)
     shift = None
     if coords is not None and both is not None and shown is not None and pattern is not None:
         shift = pattern_shift(coords, both, as_grey(shown), pattern)

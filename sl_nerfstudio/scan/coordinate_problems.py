@@ -88,11 +88,8 @@ def _range_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Itera
         return
     outside, absurd = _beyond(values, size, _OUTSIDE), _beyond(values, size, _ABSURD)
     if outside.mean() > _MANY_OUTSIDE or absurd.any():
-        share = (
-            f"{100 * outside.mean():.0f} % of the pixels"
-            if outside.mean() > _MANY_OUTSIDE
-            else f"{absurd.sum()} pixels"
-        )
+        many = bool(outside.mean() > _MANY_OUTSIDE)
+        share = f"{100 * outside.mean():.0f} % of the pixels" if many else f"{absurd.sum()} pixels"
         yield Problem(
             f"puts {share} outside the pattern ({span})",
             _outside_cause(values, size, many),

@@ -124,7 +124,7 @@ def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
         raise FileError(
             path,
             "is no image that can be read",
-            f"its head is damaged, or it is not one of {', '.join(FORMATS)}",
+            f"it is cut short or damaged, or not one of {', '.join(FORMATS)}",
             "export it again, best as PNG",
         ) from error
 

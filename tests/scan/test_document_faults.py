@@ -78,7 +78,9 @@ def test_a_number_that_is_none_counts_even_where_nothing_reads_it(sphere: Path) 
 def test_keys_given_twice(sphere: Path) -> None:
     path = sphere / "transforms.json"
     text = path.read_text().replace('"units": "mm"', '"units": "m", "units": "mm"')
-    path.write_text(text.replace('"file_path": "images/frame_00001.png"', '"file_path": "x", "file_path": "images/frame_00001.png"'))
+    path.write_text(
+        text.replace('"file_path": "images/frame_00001.png"', '"file_path": "x", "file_path": "images/frame_00001.png"')
+    )
     faults = check_scan(sphere)
     assert [(f.frame, f.field, f.problem) for f in faults] == [
         (None, "units", "stands there more than once"),
