@@ -1,11 +1,15 @@
 """A finished training run, loaded for export on whatever device there is."""
 
+import json
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 import yaml
 from jaxtyping import Float
@@ -15,6 +19,8 @@ from torch import Tensor
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
+
+_SAME_SCENE = 1e-3  # scene units: far above float32's rounding, far below what can be seen
 
 
 @runtime_checkable
@@ -79,13 +85,16 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
             "    remedy: give the scan of the training with --data FOLDER, or train again"
         ) from error
     pipeline.eval()
+    _require_same_scene(path.absolute().parent / "dataparser_transforms.json", pipeline.model.S_scene_world)
     return TrainedRun(pipeline.model, config, int(state["step"]))
 
 
 def _read_config(path: Path) -> Any:
-    from nerfstudio.engine.trainer import TrainerConfig
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
+        from nerfstudio.engine.trainer import TrainerConfig
 
-    from sl_nerfstudio.model.config import SLModelConfig
+        from sl_nerfstudio.model.config import SLModelConfig
 
     if not path.is_file():
         raise UserError(
@@ -160,6 +169,24 @@ def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str])
             f"{path}: lacks {len(missing)} of the model's weights, such as {min(missing)}\n"
             "    cause:  it was written by another version of this package, or with other settings\n"
             "    remedy: use the version that trained it, or train again"
+        )
+
+
+def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
+    """nerfstudio wrote down how the scene lay in the world in training; the scan must still say the same."""
+    try:
+        stated = json.loads(path.read_text(encoding="utf-8"))
+        trained = stated["scale"] * np.array(stated["transform"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # without that file nothing is known to differ
+    corners = S_scene_world.inverse().points(np.array(list(product((-1.0, 1.0), repeat=3))))
+    moved = corners @ trained[:, :3].T + trained[:, 3] - S_scene_world.points(corners)
+    if np.abs(moved).max() > _SAME_SCENE:
+        raise UserError(
+            f"{path}: the scan does not lie in the scene as it did when the run was trained "
+            f"(off by {np.abs(moved).max():.2g} of the scene's radius)\n"
+            "    cause:  its poses, unit or coordinates were changed, or another version of this package reads it\n"
+            "    remedy: give the unchanged scan with --data FOLDER, use the version that trained, or train again"
         )
 
 
