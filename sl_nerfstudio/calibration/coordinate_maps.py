@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sl_nerfstudio.calibration.compiled import compiled
+
 _HALF_WINDOW = 2  # pixels: 5 x 5 windows
 _MIN_PIXELS = 10  # decoded pixels a window must hold
 _MAX_ROUGHNESS = 2.0  # projector pixels: RMS distance of a window's pixels from their plane
@@ -98,7 +100,7 @@ class CoordinateMaps:
         return torch.where(inside[:, None], found, torch.full_like(found, float("nan")))
 
 
-@numba.njit(parallel=True, cache=True)
+@compiled
 def _fit_planes(values, offsets, widths, heights, frame, uv, plane, valid):  # noqa: ANN001, ANN202
     """Least-squares planes `c0 + cx dx + cy dy` around each position, from its window's decoded pixels."""
     for k in numba.prange(len(frame)):

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sl_nerfstudio.calibration.compiled import compiled
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.se3 import exp_se3, hat, inverse, rotate, transform
@@ -211,7 +212,7 @@ def normal_equations(
     return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
 
 
-@numba.njit(parallel=True, cache=True)
+@compiled
 def _accumulate(J, weight, columns, partial):  # noqa: ANN001, ANN202
     """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
     threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]
