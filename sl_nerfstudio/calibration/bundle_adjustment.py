@@ -64,7 +64,7 @@ class Adjustment:
     """What the joint adjustment found."""
 
     rig: Rig
-    covariance: Float[Tensor, "12*frames 12*frames"]  # of (delta, rho), gauge freedom projected out
+    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho), gauge freedom projected out
     noise_px: float  # estimated noise of one look-up, projector pixels
     iterations: int
     median_before_px: float
@@ -110,7 +110,7 @@ def observe(
     return Observations(rows[0], rows[1])
 
 
-def free_directions(refine: RefinePoses, frames: int) -> Float[Tensor, "12*frames k"]:
+def free_directions(refine: RefinePoses, frames: int) -> Float[Tensor, "unknowns k"]:
     """Columns: the increments (delta, rho) of all frames that a mode leaves free."""
     n, eye = frames, torch.eye(6 * frames, dtype=torch.float64)
     zero = torch.zeros_like(eye)
@@ -127,7 +127,7 @@ def free_directions(refine: RefinePoses, frames: int) -> Float[Tensor, "12*frame
 
 def prior_equations(
     prior: PosePrior, start: Rig, rig: Rig
-) -> tuple[Float[Tensor, "12*frames 12*frames"], Float[Tensor, "12*frames"]]:
+) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
     """Information matrix and gradient of the departure from the starting poses."""
     n = rig.frames
     delta = log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
@@ -155,7 +155,7 @@ def prior_equations(
     return H, torch.cat([(weight * delta).reshape(-1), (JtW @ e[..., None]).reshape(-1)])
 
 
-def gauge_directions(rig: Rig) -> Float[Tensor, "12*frames 7"]:
+def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
     """Increments that move the whole scene by a similarity: no residual feels them."""
     n = rig.frames
     out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
@@ -268,7 +268,7 @@ def _step(
     return rig, anchors, damping, 0.0
 
 
-def _covariance(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "12*frames 12*frames"]:
+def _covariance(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
     """Posterior covariance of (delta, rho) with the freedom of the whole scene projected out."""
     if B.shape[1] == 0:
         return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)

@@ -160,13 +160,13 @@ def _projector_view(
 class NormalEquations:
     """Gauss-Newton equations of the poses (delta of all frames, then rho of all frames), depths eliminated."""
 
-    H: Float[Tensor, "12*frames 12*frames"]
-    g: Float[Tensor, "12*frames"]
-    depth_by_pose: Float[Tensor, "anchors 12*frames"]
+    H: Float[Tensor, "unknowns unknowns"]
+    g: Float[Tensor, "unknowns"]
+    depth_by_pose: Float[Tensor, "anchors unknowns"]
     H_depth: Float[Tensor, "anchors"]
     g_depth: Float[Tensor, "anchors"]
 
-    def depth_step(self, step: Float[Tensor, "12*frames"]) -> Float[Tensor, "anchors"]:
+    def depth_step(self, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "anchors"]:
         """Change of the depths that goes with a step of the poses."""
         return -(self.g_depth + self.depth_by_pose @ step) / self.H_depth
 
