@@ -1,5 +1,7 @@
 """Fields with lively features, and the field's formula written a second time, for torch's own derivatives."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -8,7 +10,7 @@ from sl_nerfstudio.model.field import FieldConfig, SDFField
 from sl_nerfstudio.model.field_torch import knee
 
 
-def make_field(backend: str, dtype: torch.dtype = torch.float32, seed: int = 0, **options: object) -> SDFField:
+def make_field(backend: str, dtype: torch.dtype = torch.float32, seed: int = 0, **options: Any) -> SDFField:
     """A small field whose features matter: two dense levels, two hashed ones."""
     torch.manual_seed(seed)
     config = FieldConfig(
@@ -17,7 +19,7 @@ def make_field(backend: str, dtype: torch.dtype = torch.float32, seed: int = 0, 
     field = SDFField(config)
     with torch.no_grad():
         field.encoding.table.uniform_(-0.1, 0.1)
-        for layer in field.mlp:
+        for layer in (*field.hidden, field.last):
             layer.bias.add_(0.01 * torch.randn_like(layer.bias))
     return field.to(dtype)
 
@@ -27,11 +29,11 @@ def plain_sdf(field: SDFField, p: Tensor) -> Tensor:
     q = p.clamp(-1, 1)
     encoding = field.encoding
     h = torch.cat([q, encode(encoding.layout, encoding.table, encoding.level_weights, q)], -1)
-    for layer in field.mlp[:-1]:
+    for layer in field.hidden:
         h = knee(layer(h), field.config.knee)
     square = ((p - q) ** 2).sum(-1)
     outside = square > 0
-    return field.mlp[-1](h)[:, 0] + torch.where(outside, torch.where(outside, square, 1.0).sqrt(), 0.0)
+    return field.last(h)[:, 0] + torch.where(outside, torch.where(outside, square, 1.0).sqrt(), 0.0)
 
 
 def points_around(n: int, seed: int = 1) -> Tensor:

@@ -1,6 +1,7 @@
 """The field: both implementations against torch's own derivatives, and its behaviour as a distance."""
 
 import copy
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ def gradients(field: SDFField) -> list[Tensor]:
     return [torch.zeros_like(x) if x.grad is None else x.grad.clone() for x in field.parameters()]
 
 
-def reference(options: dict[str, object], p: Tensor, g: Tensor, v: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
+def reference(options: dict[str, Any], p: Tensor, g: Tensor, v: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
     """Values (f, df/dp) and parameter gradients of `g f + v . grad f`, by torch's double backward in float64."""
     field = make_field("torch", torch.float64, **options)
     field.set_level_weights(WEIGHTS.double())
@@ -35,7 +36,7 @@ def reference(options: dict[str, object], p: Tensor, g: Tensor, v: Tensor | None
 @pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
 @pytest.mark.parametrize("options", OPTIONS)
 def test_values_and_all_first_derivatives(
-    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, object]
+    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, Any]
 ) -> None:
     p, g = points_around(300), torch.randn(300).double()
     (f_true, n_true), parameters_true = reference(options, p, g, None)
@@ -54,7 +55,7 @@ def test_values_and_all_first_derivatives(
 @pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
 @pytest.mark.parametrize("options", OPTIONS)
 def test_the_gradient_trains_all_parameters_as_double_backward_does(
-    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, object]
+    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, Any]
 ) -> None:
     p, g, v = points_around(300), torch.randn(300).double(), torch.randn(300, 3).double()
     (f_true, n_true), parameters_true = reference(options, p, g, v)
@@ -223,7 +224,8 @@ def test_a_frozen_table_lets_the_mlp_learn_and_the_reverse() -> None:
     p = points_around(100).float()
     for frozen in ("encoding", "mlp"):
         field = make_field("numba")
-        getattr(field, frozen).requires_grad_(False)
+        for parameter in getattr(field, frozen).parameters():
+            parameter.requires_grad_(False)
         field.sdf_and_gradient(p)[1].square().sum().backward()
         field.sdf(p).sum().backward()
         for name, parameter in field.named_parameters():
@@ -234,7 +236,7 @@ def test_a_parameter_changed_between_forward_and_backward_is_noticed() -> None:
     field, p = make_field("numba"), points_around(10).float()
     f = field.sdf(p).sum()
     with torch.no_grad():
-        field.mlp[0].weight.add_(1)
+        field.last.weight.add_(1)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         f.backward()
 

@@ -22,12 +22,12 @@ from sl_nerfstudio.model.kernels.mlp import (
     to_input,
     to_layer_before,
 )
-from sl_nerfstudio.model.kernels.simd import FEATURES, contract, kernel
+from sl_nerfstudio.model.kernels.simd import FEATURES, contract, kernel, part
 
 _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
 
 
-@kernel
+@part
 def distance_to_box(p, i):
     """Distance of point i from [-1, 1]^3; not zero (NaN) for NaN."""
     square = _ZERO
@@ -37,7 +37,7 @@ def distance_to_box(p, i):
     return np.float32(sqrt(square))
 
 
-@kernel
+@part
 def apply_jacobian(network, scratch, count, p, start, out):
     """`out[start + i] = (d e / d p)^T ue` for each point of the chunk."""
     depth, levels = network.depth, (network.used - FIRST) // FEATURES
@@ -52,7 +52,7 @@ def apply_jacobian(network, scratch, count, p, start, out):
             out[start + i, 2] += z
 
 
-@kernel
+@part
 def add_outside(p, i, weight, out):
     """Add `weight` times the gradient of the distance to the box."""
     distance = distance_to_box(p, i)
@@ -83,7 +83,7 @@ def evaluate(grid, network, scratch, p, start, stop, f, gradient, want_gradient)
                 add_outside(p, i, _ONE, gradient)
 
 
-@kernel
+@part
 def spread_levels(network, rows_of, out, first, count):
     """Copy the level columns of a chunk [count, depth] to `out` [levels, n, 8], from point `first` on."""
     depth = network.depth

@@ -11,7 +11,16 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.model.encoding import PRIMES
-from sl_nerfstudio.model.kernels.simd import FEATURES, gather, gather_jacobian, kernel, prefetch, scatter
+from sl_nerfstudio.model.kernels.simd import (
+    FEATURES,
+    gather,
+    gather_jacobian,
+    kernel,
+    part,
+    prefetch,
+    scatter,
+    scatter_pair,
+)
 
 POINTS = 128
 """Points a chunk: its activations stay in the core's own cache."""
@@ -41,20 +50,20 @@ class Grid(NamedTuple):
     """Smoothstep interpolation."""
 
 
-@kernel
+@part
 def clamped(x):
     """`x` in [-1, 1]; NaN becomes -1, so that nothing is read outside the table."""
     x = x if x > -_ONE else -_ONE
     return x if x < _ONE else _ONE
 
 
-@kernel
+@part
 def inside(x):
     """1 where `clamped` is the identity, else 0: its derivative."""
     return _ONE if -_ONE <= x <= _ONE else _ZERO
 
 
-@kernel
+@part
 def along(x, resolution):
     """Cell and fraction of a coordinate in [-1, 1]."""
     u = (x + _ONE) * (_HALF * np.float32(resolution))
@@ -63,14 +72,14 @@ def along(x, resolution):
     return cell, u - np.float32(cell)
 
 
-@kernel
+@part
 def eased(t, smooth):
     """`t` and its slope 1, or with `smooth` = 1 (instead of 0) smoothstep `3 t^2 - 2 t^3` and its slope."""
     bent = t * t * (np.float32(3) - np.float32(2) * t)
     return t + smooth * (bent - t), _ONE + smooth * (np.float32(6) * t * (_ONE - t) - _ONE)
 
 
-@kernel
+@part
 def positions(x, y, z, resolution, offset, size, hashed):
     """Positions in the flat table of the eight corners of a cell; x varies fastest."""
     if hashed:
@@ -95,7 +104,7 @@ def positions(x, y, z, resolution, offset, size, hashed):
     return a << 3, a + 1 << 3, b << 3, b + 1 << 3, c << 3, c + 1 << 3, d << 3, d + 1 << 3
 
 
-@kernel
+@part
 def locate(px, py, pz, level):
     """Corners and fractions of a point in [-1, 1]^3 on a level (see `level_of`)."""
     resolution, offset, size, hashed = level
@@ -105,13 +114,13 @@ def locate(px, py, pz, level):
     return positions(x, y, z, resolution, offset, size, hashed), tx, ty, tz
 
 
-@kernel
+@part
 def level_of(grid, level):
     """What `locate` needs to know of a level."""
     return grid.resolutions[level], grid.offsets[level], grid.sizes[level], grid.hashed[level]
 
 
-@kernel
+@part
 def encode_level(grid, level, count, e, depth):
     """Write one level's columns of `e`."""
     place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
@@ -126,7 +135,7 @@ def encode_level(grid, level, count, e, depth):
         gather(grid.table, corners, t, weight, e, row + column)
 
 
-@kernel
+@part
 def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
     """Write one level's columns of `e` and `jac`."""
     place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
@@ -148,7 +157,7 @@ def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
         gather_jacobian(grid.table, corners, (tx, ty, tz), weight, e, row + column, (dx, dy, dz), jac, at, depth)
 
 
-@kernel
+@part
 def encode(grid, p, start, count, e, depth, used, jac, want_jacobian):
     """Encode points `start .. start + count` of `p` [n, 3] into `e`, and their derivatives into `jac`.
 
@@ -178,17 +187,18 @@ def encode(grid, p, start, count, e, depth, used, jac, want_jacobian):
             encode_level(grid, level, count, e, depth)
 
 
-@kernel
-def corner_weights(tx, ty, tz):
-    """Trilinear weights of the eight corners; x varies fastest."""
+@part
+def corner_weights(tx, ty, tz, scale):
+    """Trilinear weights, times `scale`, of the eight corners; x varies fastest."""
     ux, uy, uz = _ONE - tx, _ONE - ty, _ONE - tz
+    ux, tx = ux * scale, tx * scale
     a, b, c, d = uy * uz, ty * uz, uy * tz, ty * tz
     return ux * a, tx * a, ux * b, tx * b, ux * c, tx * c, ux * d, tx * d
 
 
-@kernel
+@part
 def corner_slopes(tx, ty, tz, vx, vy, vz):
-    """Derivatives of `corner_weights` in the direction `v` (of the fractions)."""
+    """Derivatives of the trilinear weights in the direction `v` (of the fractions)."""
     ux, uy, uz = _ONE - tx, _ONE - ty, _ONE - tz
     a, b, c, d = uy * uz, ty * uz, uy * tz, ty * tz
     va, vb = -vy * uz - uy * vz, vy * uz - ty * vz
@@ -227,18 +237,14 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
         tx, dx = eased(tx, smooth)
         ty, dy = eased(ty, smooth)
         tz, dz = eased(tz, smooth)
-        a, b, c, d, e, f, g, h = corner_weights(tx, ty, tz)
-        scatter(
-            gradient,
-            corners,
-            (weight * a, weight * b, weight * c, weight * d, weight * e, weight * f, weight * g, weight * h),
-            flat,
-            FEATURES * i,
-        )
+        weights = corner_weights(tx, ty, tz, weight)
         if with_slopes:
             vx = v[start + i, 0] * inside(px) * dx * slope
             vy = v[start + i, 1] * inside(py) * dy * slope
             vz = v[start + i, 2] * inside(pz) * dz * slope
-            scatter(gradient, corners, corner_slopes(tx, ty, tz, vx, vy, vz), flat_slopes, FEATURES * i)
+            changes = corner_slopes(tx, ty, tz, vx, vy, vz)
+            scatter_pair(gradient, corners, FEATURES * i, weights, flat, changes, flat_slopes)
+        else:
+            scatter(gradient, corners, FEATURES * i, weights, flat)
         for corner in corners:
             marks[corner // FEATURES] = 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.model.kernels.grid import POINTS
-from sl_nerfstudio.model.kernels.simd import kernel, multiply
+from sl_nerfstudio.model.kernels.simd import multiply, part
 
 _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
 
@@ -79,13 +79,13 @@ def make_scratch(depth: int, hidden: int, layers: int) -> Scratch:
     return Scratch(**{k: np.zeros(POINTS * width.get(k, layers * hidden), np.float32) for k in Scratch._fields})
 
 
-@kernel
+@part
 def slope(t):
     """Derivative of the activation."""
     return t * t * (np.float32(3) - np.float32(2) * t)
 
 
-@kernel
+@part
 def activate(z, at, bias, rows, hidden, knee, with_bias):
     """Replace `z + bias` by `knee(z)`, and put the place on the corner into `at`.
 
@@ -108,7 +108,7 @@ def activate(z, at, bias, rows, hidden, knee, with_bias):
             at[row + j] = t
 
 
-@kernel
+@part
 def forward(network, scratch, rows):
     """`a` and `t` of all hidden layers, from `e`."""
     w, hidden, size = network.weights, network.hidden, POINTS * network.hidden
@@ -121,7 +121,7 @@ def forward(network, scratch, rows):
         activate(a, scratch.t[layer * size :], w.bias[(layer - 1) * hidden :], rows, hidden, network.knee, True)
 
 
-@kernel
+@part
 def to_layer_before(network, d, layer, out, rows):
     """Adjoint of the activations of the layer before `layer`, from that of the pre-activations of `layer`."""
     hidden = network.hidden
@@ -129,7 +129,7 @@ def to_layer_before(network, d, layer, out, rows):
     multiply(d, hidden, 1, matrix, hidden, out, hidden, rows, hidden, hidden, False)
 
 
-@kernel
+@part
 def to_input(network, d, out, rows):
     """Adjoint of the encoded points, from that of the first layer's pre-activations."""
     depth, hidden = network.depth, network.hidden
@@ -137,7 +137,7 @@ def to_input(network, d, out, rows):
     multiply(d, hidden, 1, network.first_transposed, depth, out, depth, rows, n, hidden, False)
 
 
-@kernel
+@part
 def add_layer(network, gradient, layer, before, d, count, with_bias):
     """Add `before^T d` to the gradient of a layer's weights, and the sum of `d` to that of its bias."""
     hidden = network.hidden
@@ -154,7 +154,7 @@ def add_layer(network, gradient, layer, before, d, count, with_bias):
                 bias[j] += d[i * hidden + j]
 
 
-@kernel
+@part
 def derivatives(network, scratch, rows):
     """`h`, `u` of all layers and `ue`: the derivative of f, from `t`."""
     hidden, size, last = network.hidden, POINTS * network.hidden, network.weights.last
@@ -171,7 +171,7 @@ def derivatives(network, scratch, rows):
     to_input(network, scratch.u, scratch.ue, rows)
 
 
-@kernel
+@part
 def directional(network, scratch, rows):
     """`z_dot` and `a_dot` of all layers, from `e_dot` and `t`."""
     w, hidden, size = network.weights, network.hidden, POINTS * network.hidden

@@ -6,7 +6,7 @@ marked rows are listed first, and asked for before their turn.
 
 import numpy as np
 
-from sl_nerfstudio.model.kernels.simd import FEATURES, kernel, prefetch
+from sl_nerfstudio.model.kernels.simd import FEATURES, kernel, part, prefetch
 
 LIST = 1024
 """Rows listed at a time."""
@@ -14,7 +14,7 @@ _AHEAD = 12
 _ONE, _ZERO = np.float32(1), np.float32(0)
 
 
-@kernel
+@part
 def list_marked(marks, start, stop, rows):
     """Take marks away, from `start` on, until `rows` is full; gives the number of rows and where to go on."""
     words, n, row = marks.view(np.int64), 0, start

@@ -29,12 +29,20 @@ WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 """Shape of a tile: up to 3 vectors of WIDTH numbers times ROWS rows (24 of 32 registers, or 12 of 16)."""
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile with numba: no GIL, fused multiply-add allowed, kept on disk for the next start.
+_OPTIONS = {"nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """Compile with numba as a part of kernels: cannot be called from Python.
 
     Run-time type checkers wrap functions before this decorator sees them; numba wants the bare one.
     """
-    dispatcher: Any = njit(nogil=True, fastmath={"contract", "reassoc", "nsz"})(inspect.unwrap(function))
+    return njit(inspect.unwrap(function), no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile with numba: no GIL, fused multiply-add allowed, kept on disk for the next start."""
+    dispatcher: Any = njit(inspect.unwrap(function), no_cfunc_wrapper=True, **_OPTIONS)
     try:
         dispatcher.enable_caching()
     except RuntimeError:  # no folder to write to: compile at every start
@@ -135,7 +143,7 @@ def _tile(vectors: int) -> Any:
 _tile1, _tile2, _tile3 = _tile(1), _tile(2), _tile(3)
 
 
-@kernel
+@part
 def multiply(a, a_i, a_k, b, b_k, c, c_i, m, n, depth, add):
     """`c = a b` or `c += a b`; `a` [m, depth] with any strides, `b` [depth, n] and `c` [m, n] with row strides.
 
@@ -237,20 +245,37 @@ def gather_jacobian(typing: Any, table: Any, corners: Any, t: Any, weight: Any, 
     return signature, emit
 
 
-@intrinsic
-def scatter(typing: Any, table: Any, corners: Any, weights: Any, values: Any, position: Any):
-    """`table[corner c] += weights[c] * values[position:]` for the eight corners in turn."""
-    signature = types.void(table, corners, weights, values, types.int64)
+def _scatter(pairs: int) -> Any:
+    """`table[corner c] += sum over pairs of weights[c] * values[position:]` for the eight corners in turn."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        table, corners, weights, values, position = args
-        v = _load(builder, _pointer(context, builder, signature.args[3], values, position), _ROW)
-        rows = _rows(context, builder, signature.args[0], table, corners)
-        for row, weight in zip(rows, cgutils.unpack_tuple(builder, weights, 8), strict=True):
-            _store(builder, _fma(builder, _splat(builder, weight, _ROW), v, _load(builder, row, _ROW)), row)
+        table, corners, position, *rest = args
+        factors = []
+        for i in range(pairs):
+            weights, values = rest[2 * i : 2 * i + 2]
+            pointer = _pointer(context, builder, signature.args[4 + 2 * i], values, position)
+            factors.append((cgutils.unpack_tuple(builder, weights, 8), _load(builder, pointer, _ROW)))
+        for c, row in enumerate(_rows(context, builder, signature.args[0], table, corners)):
+            total = _load(builder, row, _ROW)
+            for weights, v in factors:
+                total = _fma(builder, _splat(builder, weights[c], _ROW), v, total)
+            _store(builder, total, row)
         return context.get_dummy_value()
 
-    return signature, emit
+    if pairs == 1:
+
+        def scatter(typing: Any, table: Any, corners: Any, position: Any, weights: Any, values: Any):
+            return types.void(table, corners, types.int64, weights, values), emit
+
+        return intrinsic(scatter)
+
+    def scatter_pair(typing: Any, table: Any, corners: Any, position: Any, w1: Any, v1: Any, w2: Any, v2: Any):
+        return types.void(table, corners, types.int64, w1, v1, w2, v2), emit
+
+    return intrinsic(scatter_pair)
+
+
+scatter, scatter_pair = _scatter(1), _scatter(2)
 
 
 def _sum(builder: Any, v: Any) -> Any:

@@ -1,0 +1,160 @@
+"""One training step, done by our field and by nerfstudio's torch HashEncoding with the same MLP.
+
+A step: sample rays, evaluate the field, render projector coordinates by SDF weights, L1, Eikonal term, backward to
+table, MLP and poses, optimiser. Nothing of it is left out for either side.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sl_nerfstudio.model.field import FieldConfig, SDFField
+from sl_nerfstudio.model.field_torch import knee
+from sl_nerfstudio.model.optim import RowAdam
+
+KAPPA = 100.0
+FRAMES = 22
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much a step computes."""
+
+    rays: int
+    samples: int
+    eikonal: int
+    near_surface: bool
+    """Samples in a band of 0.1 about the surface, or from the near side of the scene to its far side."""
+
+    @property
+    def points(self) -> int:
+        """Points rendered."""
+        return self.rays * self.samples
+
+
+SIZES = {
+    "paper": Size(rays=2024, samples=64, eikonal=4096, near_surface=False),
+    "lean": Size(rays=1024, samples=16, eikonal=4096, near_surface=True),
+}
+
+
+class Job:
+    """The part of a step that is the same for everybody: rays of a sphere seen from outside, poses, losses."""
+
+    def __init__(self, size: Size, seed: int = 0) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.size = size
+        self.shift = nn.Parameter(torch.zeros(FRAMES, 3))  # stands for the poses: points are differentiated, too
+        self.frame = torch.randint(FRAMES, (size.rays,), generator=generator)
+        aim = F.normalize(torch.randn(size.rays, 3, generator=generator), dim=-1) * 0.5
+        eye = F.normalize(aim + 0.3 * torch.randn(size.rays, 3, generator=generator), dim=-1) * 3.0
+        self.direction = F.normalize(aim - eye, dim=-1)
+        self.origin = eye
+        self.hit = (aim - eye).norm(dim=-1)
+        self.generator = generator
+        self.target = self._coordinates(aim) + 0.002 * torch.randn(size.rays, 2, generator=generator)
+
+    @staticmethod
+    def _coordinates(p: Tensor) -> Tensor:
+        """Pinhole projector at (0, 0, 4)."""
+        return p[..., :2] / (4.0 - p[..., 2:])
+
+    def rays(self) -> Tensor:
+        """Points along the rays, [rays, samples, 3]."""
+        half = 0.05 if self.size.near_surface else 1.0
+        steps = torch.rand(self.size.rays, self.size.samples, generator=self.generator)
+        steps = (torch.arange(self.size.samples) + steps) / self.size.samples
+        t = self.hit[:, None] - half + 2 * half * steps
+        return self.origin[:, None] + self.shift[self.frame][:, None] + t[..., None] * self.direction[:, None]
+
+    def eikonal_points(self) -> Tensor:
+        """Half of them anywhere, half near the surface."""
+        p = torch.rand(self.size.eikonal, 3, generator=self.generator) * 2 - 1
+        p[::2] = F.normalize(p[::2], dim=-1) * (0.5 + 0.02 * torch.randn(len(p[::2]), 1, generator=self.generator))
+        return p
+
+    def loss(self, sdf: Tensor, points: Tensor, gradient: Tensor) -> Tensor:
+        """Rendered coordinates against their target, and the Eikonal term."""
+        phi = torch.sigmoid(KAPPA * sdf.view(self.size.rays, self.size.samples))
+        alpha = ((phi[:, :-1] - phi[:, 1:]) / phi[:, :-1].clamp_min(1e-12)).clamp(0, 1)
+        light = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha + 1e-7], -1), -1)[:, :-1]
+        rendered = ((light * alpha)[..., None] * self._coordinates(points[:, :-1])).sum(1)
+        return (rendered - self.target).abs().mean() + 0.1 * ((gradient.norm(dim=-1) - 1) ** 2).mean()
+
+
+class Ours:
+    """Our field, with the optimisers that the methods use."""
+
+    def __init__(self, size: Size) -> None:
+        torch.manual_seed(0)
+        self.job = Job(size)
+        self.field = SDFField(FieldConfig())
+        self.optimisers = [
+            RowAdam([self.field.encoding.table], lr=1e-3),
+            torch.optim.Adam([*self.field.mlp.parameters(), self.job.shift], lr=1e-4, fused=True),
+        ]
+
+    def step(self) -> float:
+        """One step; the loss before it."""
+        for optimiser in self.optimisers:
+            optimiser.zero_grad()
+        points = self.job.rays()
+        sdf = self.field.sdf(points.reshape(-1, 3))
+        _, gradient = self.field.sdf_and_gradient(self.job.eikonal_points())
+        loss = self.job.loss(sdf, points, gradient)
+        loss.backward()
+        for optimiser in self.optimisers:
+            optimiser.step()
+        return loss.item()
+
+
+class Theirs:
+    """nerfstudio's encoding in torch, gradients by double backward, torch's default Adam over everything."""
+
+    def __init__(self, size: Size, activation: Callable[[Tensor], Tensor]) -> None:
+        from nerfstudio.field_components.encodings import HashEncoding
+
+        torch.manual_seed(0)
+        self.job = Job(size)
+        self.activation = activation
+        self.encoding = HashEncoding(
+            num_levels=5, min_res=16, max_res=256, log2_hashmap_size=19, features_per_level=8, implementation="torch"
+        )
+        self.mlp = SDFField(FieldConfig()).mlp
+        parameters = [*self.encoding.parameters(), *self.mlp.parameters(), self.job.shift]
+        self.optimiser = torch.optim.Adam(parameters, lr=1e-3)
+
+    def sdf(self, p: Tensor) -> Tensor:
+        """The same network on nerfstudio's features, which want points in [0, 1]^3."""
+        h = torch.cat([p, self.encoding((p + 1) / 2)], -1)
+        for layer in list(self.mlp)[:-1]:
+            h = self.activation(layer(h))
+        return self.mlp[-1](h)[:, 0]
+
+    def step(self) -> float:
+        """One step; the loss before it."""
+        self.optimiser.zero_grad()
+        points = self.job.rays()
+        sdf = self.sdf(points.reshape(-1, 3))
+        p = self.job.eikonal_points().requires_grad_()
+        (gradient,) = torch.autograd.grad(self.sdf(p).sum(), p, create_graph=True)
+        loss = self.job.loss(sdf, points, gradient)
+        loss.backward()
+        self.optimiser.step()
+        return loss.item()
+
+
+def _softplus(z: Tensor) -> Tensor:
+    return F.softplus(z, beta=100)
+
+
+VARIANTS: dict[str, Callable[[Size], Ours | Theirs]] = {
+    "ours": Ours,
+    "nerfstudio": lambda size: Theirs(size, _softplus),
+    "nerfstudio, our activation": lambda size: Theirs(size, lambda z: knee(z, 0.02)),
+    "nerfstudio, ReLU": lambda size: Theirs(size, F.relu),
+}
+"""Softplus with beta 100 is nerfstudio's own choice for SDFs; ReLU costs least, but its gradient does not train."""

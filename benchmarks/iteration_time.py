@@ -1,0 +1,159 @@
+"""Time of one whole training step: ours, nerfstudio's torch HashEncoding with the same MLP, and the machine's floor.
+
+python -m benchmarks.iteration_time [--sizes paper lean] [--rounds 15] [--output benchmarks/results/iteration_time.json]
+
+The variants take turns, one step each, so that whatever else the machine does hits all of them alike.
+"""
+
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads sleep: they would slow down whoever is measured next
+
+import json
+import platform
+import re
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import torch
+import tyro
+
+from benchmarks.iteration_step import SIZES, VARIANTS
+from benchmarks.roofline import Floor, Machine, floor_of, measure_machine
+
+
+@dataclass(frozen=True)
+class Config:
+    """Time of one whole training step."""
+
+    sizes: tuple[str, ...] = ("paper", "lean")
+    """Which steps: paper (2024 rays x 64 samples), lean (1024 x 16)."""
+    rounds: int = 15
+    """Steps of each variant that are timed, after two that are not."""
+    threads: int = 0
+    """Threads; 0: as many as there are cores."""
+    output: Path | None = None
+    """Where to write the figures as JSON."""
+    memory_of: str | None = None
+    """Only run this variant of the first size for three steps and print the process's peak memory in MB."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Milliseconds a step."""
+
+    size: str
+    variant: str
+    median: float
+    best: float
+    quartiles: tuple[float, float]
+    peak_memory_mb: float
+    """Of a process that does nothing else, with everything it imports."""
+
+
+def measure(size: str, rounds: int, threads: int) -> list[Row]:
+    """Time all variants, taking turns."""
+    jobs = {name: make(SIZES[size]) for name, make in VARIANTS.items()}
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn in range(rounds + 2):
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            job.step()
+            if turn >= 2:
+                times[name].append((time.perf_counter() - start) * 1e3)
+    rows = []
+    for name, values in times.items():
+        low, _, high = statistics.quantiles(values, n=4)
+        rows.append(Row(size, name, statistics.median(values), min(values), (low, high), _memory(size, name, threads)))
+    return rows
+
+
+def _memory(size: str, variant: str, threads: int) -> float:
+    command = [sys.executable, "-m", "benchmarks.iteration_time", "--sizes", size, "--memory-of", variant]
+    done = subprocess.run([*command, "--threads", str(threads)], capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def _peak_memory_mb() -> float:
+    """Of this process; `getrusage` would count the process that started it, too."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        return int(re.search(r"VmHWM:\s+(\d+) kB", status.read_text())[1]) / 1024  # pyright: ignore
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # macOS, in bytes
+
+
+def report(rows: list[Row], floor: Floor, machine: Machine) -> str:
+    """A table for people."""
+    ours = next(row for row in rows if row.variant == "ours")
+    lines = [
+        f"{ours.size}: {SIZES[ours.size]}",
+        f"{'':28s}{'median':>9s}{'best':>9s}{'quartiles':>19s}{'x ours':>8s}{'x floor':>9s}{'peak MB':>9s}",
+    ]
+    for row in rows:
+        quartiles = "{:.1f} .. {:.1f}".format(*row.quartiles)
+        lines.append(
+            f"{row.variant:28s}{row.median:9.1f}{row.best:9.1f}{quartiles:>19s}{row.median / ours.median:8.1f}"
+            f"{row.best / floor.total_ms:9.2f}{row.peak_memory_mb:9.0f}"
+        )
+    lines.append(
+        f"floor {floor.total_ms:.1f} ms: {floor.gflop:.2f} GFLOP at {machine.product_gflops:.0f} GFLOP/s "
+        f"= {floor.products_ms:.1f} ms, {floor.megabytes:.0f} MB at {machine.bandwidth_gb:.1f} GB/s "
+        f"= {floor.memory_ms:.1f} ms ({floor.rows} table rows touched)"
+    )
+    return "\n".join(lines)
+
+
+def _description(threads: int) -> dict[str, object]:
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
+    return {
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": commit.stdout.strip(),
+        "machine": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "threads": threads,
+        "load": os.getloadavg(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def _cpuinfo() -> list[str]:
+    path = Path("/proc/cpuinfo")
+    return path.read_text().splitlines() if path.is_file() else []
+
+
+def main(config: Config) -> None:
+    """Measure, print, write."""
+    threads = config.threads or os.cpu_count() or 1
+    torch.set_num_threads(threads)
+    if config.memory_of is not None:
+        job = VARIANTS[config.memory_of](SIZES[config.sizes[0]])
+        for _ in range(3):
+            job.step()
+        print(_peak_memory_mb())
+        return
+    result: dict[str, object] = _description(threads)
+    for size in config.sizes:
+        rows = measure(size, config.rounds, threads)
+        machine = measure_machine()
+        floor = floor_of(SIZES[size], machine)
+        print(report(rows, floor, machine), flush=True)
+        result[size] = {
+            "milliseconds": [asdict(row) for row in rows],
+            "machine": asdict(machine),
+            "floor": {**asdict(floor), "total_ms": floor.total_ms},
+        }
+    if config.output is not None:
+        config.output.parent.mkdir(parents=True, exist_ok=True)
+        config.output.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
