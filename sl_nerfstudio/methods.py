@@ -44,13 +44,13 @@ sl_neus = MethodSpecification(
     config=_trainer(
         "sl-neus",
         SLModelConfig(),
-        rays=1024,
+        rays=4096,
         iterations=1000,
         optimizers={
-            "table": _group(RowAdamOptimizerConfig(lr=1e-2), DecaySchedulerConfig(final=0.05)),
-            "mlp": _group(FusedAdamOptimizerConfig(lr=2e-3, eps=1e-15), DecaySchedulerConfig(final=0.05)),
-            "camera_opt": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.01)),
-            "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.01)),
+            "table": _group(RowAdamOptimizerConfig(lr=1e-3), DecaySchedulerConfig(final=0.02)),
+            "mlp": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.02)),
+            "camera_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
+            "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
         },
     ),
     description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU.",

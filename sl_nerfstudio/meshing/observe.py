@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_rays
@@ -21,16 +22,19 @@ LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
 LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""
 
+OFF_MASK_PX = 3
+"""Farther than this beside the mask, in camera pixels, a vertex that should be lit is none of the object's."""
+
 ENOUGH = 3  # confirmations more than denials: further frames are not asked about the vertex
 
 
 @dataclass(frozen=True)
 class Votes:
-    """Number of frames that saw each vertex, by what they decoded there."""
+    """Number of frames that should see and light each vertex, by what they decoded there."""
 
     confirmed: Int64[ndarray, "v"]  # the decoded coordinate is the one that the vertex predicts
     silent: Int64[ndarray, "v"]  # the pattern falls there, but what was decoded nearby, if anything, proves nothing
-    denied: Int64[ndarray, "v"]  # another coordinate was decoded: the camera saw something else there
+    denied: Int64[ndarray, "v"]  # another coordinate was decoded, or the pattern does not fall there although it should
     residual_px: Float[ndarray, "n"]  # median of each frame; NaN where nothing was decoded on the mesh
 
 
@@ -79,20 +83,29 @@ def collect_votes(
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
         asked = np.flatnonzero(always | (confirmed - denied < ENOUGH))
-        vertex, least, most = frame_residuals(
-            mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector
-        )
-        vertex = asked[vertex]
-        known = most[always[vertex] & np.isfinite(most)]
+        view = look(mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector)
+        vertex = asked[view.vertex]
+        known = view.most[always[vertex] & np.isfinite(view.most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
-        confirmed[vertex] += most <= threshold
-        denied[vertex] += least > threshold
-        silent[vertex] += ~(most <= threshold) & ~(least > threshold)
+        agrees, differs = view.most <= threshold, (view.least > threshold) | view.off_mask
+        confirmed[vertex] += agrees
+        denied[vertex] += differs
+        silent[vertex] += ~agrees & ~differs
     return Votes(confirmed, silent, denied, np.array(medians))
 
 
-def frame_residuals(
+@dataclass(frozen=True)
+class View:
+    """What one frame says about the vertices that it should see and light; distances in pattern pixels."""
+
+    vertex: Int64[ndarray, "m"]
+    off_mask: Bool[ndarray, "m"]  # the pattern does not fall there, nor within OFF_MASK_PX
+    least: Float[ndarray, "m"]  # distance of the decoded from the predicted coordinate: at least; NaN if not known
+    most: Float[ndarray, "m"]  # at most
+
+
+def look(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
     occluder: Occluder,
@@ -100,30 +113,41 @@ def frame_residuals(
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> tuple[Int64[ndarray, "m"], Float[ndarray, "m"], Float[ndarray, "m"]]:
-    """Vertices that the frame saw, and how far the decoded coordinate is, at least and at most, from the predicted one.
+) -> View:
+    """What a frame says about the vertices that it should see and light.
 
-    Seen means: they face camera and projector, fall inside the mask and inside the pattern, and the mesh hides them
-    from neither. The distances are in pattern pixels; NaN if neither the pixel nor any of its neighbours was decoded.
+    They face camera and projector, fall inside image and pattern, and the mesh hides them from neither. Those that fall
+    just beside the mask are left out: the mask's border is as uncertain as the poses are.
     """
     vertex = np.arange(len(vertices), dtype=np.int64)
     for T in (T_world_camera, T_world_projector):
         vertex = vertex[_faces(vertices[vertex], normals[vertex], T)]
     uv_camera, inside = _pixels(vertices[vertex], frame.camera, T_world_camera)
     vertex, uv_camera = vertex[inside], uv_camera[inside]
-    pixel = np.floor(uv_camera).astype(np.int64)
-    mask: ndarray = binary_dilation(frame.read_mask(), np.ones((3, 3), dtype=bool), iterations=MASK_MARGIN)
-    masked: ndarray = mask[pixel[:, 1], pixel[:, 0]]
-    vertex, uv_camera = vertex[masked], uv_camera[masked]
     uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
     vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
+    mask = frame.read_mask()
+    # No margin inside: one pixel of it let the sides of a 6 mm plate grow far beyond their lower edge.
+    on_mask, near_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
+    said = on_mask | ~near_mask
+    vertex, uv_camera, uv_projector, on_mask = vertex[said], uv_camera[said], uv_projector[said], on_mask[said]
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
-        vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
+        vertex, uv_camera, uv_projector, on_mask = vertex[free], uv_camera[free], uv_projector[free], on_mask[free]
     slope = _slope(
         vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector
     )
-    return vertex, *_offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, slope)
+    least, most = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, slope)
+    return View(vertex, ~on_mask, np.where(on_mask, least, np.nan), np.where(on_mask, most, np.nan))
+
+
+def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:
+    return np.asarray(binary_dilation(mask, np.ones((3, 3), dtype=bool), iterations=pixels))
+
+
+def _look_up(mask: Bool[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Bool[ndarray, "n"]:
+    pixel = np.floor(uv).astype(np.int64)
+    return mask[pixel[:, 1], pixel[:, 0]]
 
 
 def _faces(

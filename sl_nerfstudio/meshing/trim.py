@@ -13,8 +13,10 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.observe import Occluder, Votes, collect_votes
 from sl_nerfstudio.scan.types import Scan
 
-HOLE_SHARE, SPECK_SHARE = 2e-3, 1e-4
-"""Of the kept area: smaller gaps inside the observed surface stay closed, smaller pieces apart from it are dropped."""
+HOLE_SHARE, SILENT_SHARE, SPECK_SHARE = 2e-3, 2e-2, 1e-4
+"""Of the kept area: smaller gaps inside the observed surface stay closed (larger ones where the pattern was seen but not
+decoded), smaller pieces apart from it are dropped."""
+BADLY_DECODED = 0.25  # share of undecoded sightings above which a mask counts as evidence
 _LEAST_SHARE = 0.1  # observed vertices, of those seen: with fewer, the agreement is chance
 _SECOND_LOOK_SHARE = 1e-3  # denied vertices, of all, that are removed from the occluders before looking again
 
@@ -74,10 +76,16 @@ def trim_to_observed(
 
 
 def _observed(votes: Votes) -> Bool[ndarray, "v"]:
-    """Confirmed at least as often as denied; or never confirmed, but silently seen more often than denied."""
+    """Confirmed at least as often as denied; or never confirmed, but silently seen more often than denied.
+
+    The latter only in scans that decode badly. Where decoding rarely fails, real surface is confirmed by some frame,
+    and what falls into masks without ever being confirmed is the invented continuation of a visible side; what little
+    real surface is undecoded there is a gap, which `_small_gaps` closes.
+    """
     by_code = (votes.confirmed > 0) & (votes.confirmed >= votes.denied)
     by_mask = (votes.confirmed == 0) & (votes.silent > votes.denied)
-    return by_code | by_mask
+    silent, confirmed = int(votes.silent.sum()), int(votes.confirmed.sum())
+    return by_code | by_mask if silent > BADLY_DECODED * (silent + confirmed) else by_code
 
 
 def _denied(votes: Votes) -> Bool[ndarray, "v"]:
@@ -117,7 +125,9 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[
     beside[label[mixed[gap[mixed]]]] = True
     members = np.bincount(label[gap], minlength=count)
     several = np.bincount(label[gap], (votes.denied[gap] > 1).astype(float), count)
-    good = beside & (area < HOLE_SHARE * areas[~touched].sum()) & (several <= 0.5 * members)
+    silent = np.bincount(label[gap], (votes.silent[gap] > 0).astype(float), count)
+    share = np.where(silent > 0.5 * members, SILENT_SHARE, HOLE_SHARE)
+    good = beside & (area < share * areas[~touched].sum()) & (several <= 0.5 * members)
     return gap & good[label]
 
 

@@ -15,13 +15,13 @@ from sl_nerfstudio.model.schedule import AnnealingConfig
 class LossConfig:
     """Weights of the losses. Lengths are in scene units (the object's radius is 0.8)."""
 
-    coordinates: float = 1.0
+    coordinates: float = 0.1
     """Weight of the rendered coordinates' L1 error, converted to a length by the scan's median depth sensitivity."""
     coordinates_per_pixel: float | None = None
     """If set, the weight of the coordinates' L1 error in pattern pixels, in place of `coordinates`."""
-    pattern: float = 0.02
+    pattern: float = 0.005
     """Weight of the pattern term, 1 - cosine of rendered and captured intensities."""
-    eikonal: float = 0.02
+    eikonal: float = 0.1
     """Weight of the Eikonal term, the mean squared departure of the field's slope from one."""
     surface: float = 1.0
     """Weight of the direct term |f| at triangulated points."""
@@ -39,7 +39,7 @@ class SamplingConfig:
     """Samples a ray for volume rendering."""
     half_width: float = 4.0
     """Half the interval sampled around the surface, in units of 1 / kappa (plus one cell of the cached grid)."""
-    render_rays: int = 512
+    render_rays: int = 256
     """Rays of a batch that are volume rendered; all of the batch's decoded rays serve the direct terms."""
     eikonal_points: int = 1024
     """Random points of the scene at which the Eikonal term is evaluated, besides the surface points."""
