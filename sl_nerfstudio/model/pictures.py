@@ -43,9 +43,10 @@ def outputs(model: "SLModel", bundle: RayBundle) -> dict[str, Tensor]:
         "coordinate_x": torch.where(opaque, seen.coordinates[:, 0], 0.0)[:, None],
         "coordinate_y": torch.where(opaque, seen.coordinates[:, 1], 0.0)[:, None],
     }
-    error = (seen.coordinates - model.measured_coordinates(p, views)).norm(dim=-1)
-    share = torch.where(opaque, torch.nan_to_num(error / _RESIDUAL_WHITE_PX, nan=0.0), 0.0)
-    result["residual"] = share.clamp(0, 1)[:, None]
+    if "sl_uv" not in (bundle.metadata or {}):  # single pixels of a batch bring their measured coordinates along
+        error = (seen.coordinates - model.measured_coordinates(p, views)).norm(dim=-1)
+        share = torch.where(opaque, torch.nan_to_num(error / _RESIDUAL_WHITE_PX, nan=0.0), 0.0)
+        result["residual"] = share.clamp(0, 1)[:, None]
     return result
 
 

@@ -77,6 +77,19 @@ class SLPipeline(VanillaPipeline):
             self.datamanager.stand_at(self._sl_model.poses_scene()[0])
 
     @torch.no_grad()
+    def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs, losses and metrics of held-out pixels; the losses are what the metrics lack of a perfect fit."""
+        self.eval()
+        rays, batch = self.datamanager.next_eval(step)
+        outputs = self._outputs(rays)
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        losses = {"pattern": 1 - metrics["pattern_cosine"]}
+        if "coordinate_px" in metrics:  # at least one of the pixels is decoded
+            losses["coordinate_px"] = metrics["coordinate_px"]
+        self.train()
+        return outputs, losses, metrics
+
+    @torch.no_grad()
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, float]:

@@ -2,7 +2,8 @@ import warnings
 from pathlib import Path
 
 import pytest
-from tiny_scan import TinyScan
+
+from tests.dataparser.tiny_scan import TinyScan
 
 with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
     warnings.simplefilter("ignore")

@@ -7,13 +7,13 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from tiny_scan import CAMERA, TinyScan
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
 from sl_nerfstudio.errors import ScanError, UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, transform
+from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
 # nerfstudio's Cameras index in a way that torch has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:Using a non-tuple sequence for multidimensional indexing:UserWarning")

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
-from tiny_scan import RADIUS, TinyScan
 
 from sl_nerfstudio.dataparser.normalise import enclosing_sphere, normalisation, upright, without_lonely
 from sl_nerfstudio.dataparser.samples import build_samples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan, read_scan
+from tests.dataparser.tiny_scan import RADIUS, TinyScan
 
 
 def directions(count: int, seed: int) -> ndarray:

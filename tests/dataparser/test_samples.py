@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_scan import CAMERA, TinyScan
 
 from sl_nerfstudio.dataparser.held_out import held_out_pixels
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import Scan, read_scan
+from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
 
 @pytest.fixture(scope="module")
