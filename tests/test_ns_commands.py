@@ -1,0 +1,434 @@
+"""nerfstudio's commands on a small scan: their own entry points, called in this process to import nerfstudio once."""
+
+import copy
+import json
+import math
+import subprocess
+import sys
+import urllib.request
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from PIL import Image
+from tests.dataparser.tiny_scan import RADIUS, TinyScan
+
+with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
+    warnings.simplefilter("ignore")
+    from nerfstudio.configs.base_config import ViewerConfig
+    from nerfstudio.scripts import eval as ns_eval
+    from nerfstudio.scripts import exporter as ns_export
+    from nerfstudio.scripts import render as ns_render
+    from nerfstudio.scripts import train as ns_train
+    from nerfstudio.utils import writer
+    from nerfstudio.utils.eval_utils import eval_setup
+    from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.model.pipeline import SLPipeline
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
+
+SMALL = (
+    "--pipeline.model.sdf.log2-table-size 12 --pipeline.model.sdf.max-resolution 64 "
+    "--pipeline.model.sdf.hidden 32 --pipeline.datamanager.train-num-rays-per-batch 256 "
+    "--logging.steps-per-log 20 --steps-per-eval-batch 20 "
+).split()
+STEPS = 60
+
+
+@pytest.fixture(autouse=True)
+def _fresh_writers() -> Iterator[None]:
+    """nerfstudio keeps its log writers in a module; one command must not write into another's folder."""
+    yield
+    for event_writer in writer.EVENT_WRITERS:
+        tensorboard = getattr(event_writer, "tb_writer", None)
+        if tensorboard is not None:
+            tensorboard.close()
+    writer.EVENT_WRITERS.clear()
+    writer.GLOBAL_BUFFER.clear()
+
+
+def call(entry: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["ns-command", *map(str, arguments)])
+    entry()
+
+
+def train(monkeypatch: pytest.MonkeyPatch, root: Path, output: Path, steps: int, *more: object) -> Path:
+    """Train and give the run's config.yml."""
+    call(
+        ns_train.entrypoint,
+        monkeypatch,
+        *("sl-neus", "--data", root, "--output-dir", output, "--max-num-iterations", steps, *SMALL, *more),
+    )
+    (config,) = output.glob("*/sl-neus/*/config.yml")
+    return config
+
+
+@pytest.fixture(scope="module")
+def module_patch() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    S = Similarity(0.001, np.diag([1.0, -1.0, -1.0]), np.array([0.5, -0.25, 2.0]))
+    return TinyScan(units="m", S_world_mm=S, undecoded=0.05).write(tmp_path_factory.mktemp("scans") / "sphere")
+
+
+@pytest.fixture(scope="module")
+def config(root: Path, tmp_path_factory: pytest.TempPathFactory, module_patch: pytest.MonkeyPatch) -> Path:
+    return train(module_patch, root, tmp_path_factory.mktemp("outputs"), STEPS)
+
+
+@pytest.fixture(scope="module")
+def pipeline(config: Path) -> SLPipeline:
+    loaded = eval_setup(config)[1]
+    assert isinstance(loaded, SLPipeline)
+    return loaded
+
+
+def world(p_mm: np.ndarray) -> np.ndarray:
+    return np.array([0.5, -0.25, 2.0]) + 0.001 * np.array([1, -1, -1]) * p_mm
+
+
+def distance_to_sphere_mm(vertices: np.ndarray) -> np.ndarray:
+    return np.abs(np.linalg.norm(vertices - world(np.zeros(3)), axis=1) * 1000 - RADIUS)
+
+
+# ---- training
+
+
+def test_training_saves_and_says_what_next(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = train(monkeypatch, root, tmp_path / "a folder", 3)
+    assert [p.name for p in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000002.ckpt"]
+    settings = yaml.load(config.read_text(), Loader=yaml.Loader)
+    assert settings.data == root and settings.data.is_absolute()
+    assert settings.output_dir.is_absolute()  # so that every command works from any folder
+    assert settings.pipeline.model.schedule_iterations == 3
+    said = capfd.readouterr().out
+    assert f"ns-viewer --load-config '{config}'" in said
+    assert f"sl-export --load-config '{config}' --output mesh.ply --poses refined/" in said
+    assert f"sl-eval   --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in said
+
+
+def test_resumed_run_equals_an_uninterrupted_one(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def final(config: Path) -> dict[str, torch.Tensor]:
+        (checkpoint,) = (config.parent / "nerfstudio_models").iterdir()
+        assert checkpoint.name == "step-000000023.ckpt"
+        return torch.load(checkpoint)
+
+    # without rendering: its cached grid is made anew on resume, a few steps fresher than in an uninterrupted run
+    warm = ("--pipeline.model.warm-start", 1.0)
+    whole = final(train(monkeypatch, root, tmp_path / "whole", 24, *warm))
+    half = train(monkeypatch, root, tmp_path / "half", 12, "--schedule-iterations", 24, *warm)
+    models = half.parent / "nerfstudio_models"
+    rest = final(train(monkeypatch, root, tmp_path / "rest", 12, "--load-dir", models, *warm))
+    assert whole["schedulers"] == rest["schedulers"]  # the resumed run follows the first one's schedule, unasked
+    for name, value in whole["pipeline"].items():
+        torch.testing.assert_close(rest["pipeline"][name], value, rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call(
+        ns_train.entrypoint,
+        monkeypatch,
+        *("sl-neus-paper", "--data", root, "--output-dir", tmp_path, "--max-num-iterations", 3, *SMALL),
+    )
+    assert list(tmp_path.glob("*/sl-neus-paper/*/nerfstudio_models/step-000000002.ckpt"))
+
+
+# ---- refusals: a message, status 1, nothing written
+
+
+def start(root: Path | None, **settings: Any) -> None:
+    """What ns-train does with its parsed command line."""
+    config = copy.deepcopy(sl_neus.config)
+    config.data = root
+    for name, value in settings.items():
+        setattr(config, name, value)
+    ns_train.main(config)
+
+
+def refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *a: Any, **k: Any
+) -> str:
+    """The message; checks that nothing was written."""
+    empty = tmp_path / "here"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    with pytest.raises(SystemExit) as exit_:
+        start(*a, **k)
+    assert exit_.value.code == 1
+    assert not list(empty.iterdir())
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err
+    return err
+
+
+def edit(root: Path, change: Callable[[dict], Any]) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    change(content)
+    (root / "transforms.json").write_text(json.dumps(content))
+
+
+def invert_poses(content: dict) -> None:
+    for frame in content["frames"]:
+        for key in ("transform_matrix", "projector_transform_matrix"):
+            frame[key] = np.linalg.inv(frame[key]).tolist()
+
+
+def set_in_frame(number: int, key: str, value: Any) -> Callable[[Path], None]:
+    return lambda root: edit(root, lambda content: content["frames"][number].update({key: value}))
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 250], [0, 0, 0, 1]]
+NOT_A_NUMBER = [[math.nan, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 250], [0, 0, 0, 1]]
+FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated image": (lambda r: truncate(r / "images/frame_00001.png"), "images/frame_00001.png"),
+    "missing coords": (lambda r: (r / "coords/frame_00002.npz").unlink(), "coords/frame_00002.npz"),
+    "mirrored pose": (set_in_frame(1, "transform_matrix", MIRRORED), "transform_matrix"),
+    "NaN pose": (set_in_frame(1, "projector_transform_matrix", NOT_A_NUMBER), "projector_transform_matrix"),
+    "focal length 0": (lambda r: edit(r, lambda c: c.update(fl_x=0)), "fl_x"),
+    "world-to-camera": (lambda r: edit(r, invert_poses), "world"),
+    "empty mask": (
+        lambda r: Image.fromarray(np.zeros((40, 48), np.uint8)).save(r / "masks/frame_00000.png"),
+        "masks/frame_00000.png",
+    ),
+    "path outside": (set_in_frame(0, "file_path", "../images/frame_00000.png"), "file_path"),
+    "one frame": (lambda r: edit(r, lambda c: c.update(frames=c["frames"][:1])), "frame"),
+    "frame twice": (lambda r: edit(r, lambda c: c["frames"].append(c["frames"][0])), "frame_00000"),
+    "no transforms.json": (lambda r: (r / "transforms.json").unlink(), "transforms.json"),
+}
+
+
+@pytest.mark.parametrize("damage, named", FAULTS.values(), ids=FAULTS.keys())
+def test_bad_scans_do_not_start(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    damage: Callable[[Path], Any],
+    named: str,
+) -> None:
+    root = TinyScan().write(tmp_path / "scan")
+    damage(root)
+    message = refused(tmp_path, monkeypatch, capfd, root)
+    assert message.startswith("error: ") and str(root) in message
+    assert named in message and "remedy: " in message
+
+
+@pytest.mark.parametrize(
+    "settings, expected",
+    [
+        ({"max_num_iterations": 0}, "--max-num-iterations 0: at least 1"),
+        ({"load_dir": Path("nowhere")}, "--load-dir nowhere: no checkpoint step-*.ckpt there"),
+        ({"load_checkpoint": Path("none.ckpt")}, "--load-checkpoint none.ckpt: no such file"),
+    ],
+)
+def test_bad_settings_do_not_start(
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    settings: dict[str, Any],
+    expected: str,
+) -> None:
+    assert expected in refused(tmp_path, monkeypatch, capfd, root, **settings)
+
+
+def test_without_a_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    assert "no scan given. Add --data FOLDER" in refused(tmp_path, monkeypatch, capfd, None)
+
+
+def test_truncated_checkpoint(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "step-000000005.ckpt"
+    torch.save({"schedulers": {}, "weights": torch.zeros(1000)}, checkpoint)
+    truncate(checkpoint)
+    message = refused(tmp_path, monkeypatch, capfd, root, load_dir=tmp_path)
+    assert "step-000000005.ckpt: cannot be read as a checkpoint" in message
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
+def test_a_gpu_that_is_not_there(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    machine = copy.deepcopy(sl_neus_paper.config.machine)
+    machine.device_type = "cuda"
+    assert "--machine.device-type cuda" in refused(tmp_path, monkeypatch, capfd, root, machine=machine)
+
+
+def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
+    """The installed ns-train, in a process of its own."""
+    root = TinyScan(frames=2).write(tmp_path / "scan")
+    (root / "coords/frame_00001.npz").unlink()
+    (tmp_path / "here").mkdir()
+    done = subprocess.run(
+        [str(Path(sys.executable).with_name("ns-train")), "sl-neus", "--data", str(root)],
+        cwd=tmp_path / "here",
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "coords/frame_00001.npz" in done.stderr and "remedy:" in done.stderr
+    assert not list((tmp_path / "here").iterdir())
+
+
+# ---- what can be done with a result
+
+
+def test_eval_writes_finite_json_about_held_out_pixels(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_constants(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    call(
+        ns_eval.entrypoint,
+        monkeypatch,
+        *("--load-config", config, "--output-path", tmp_path / "out.json", "--render-output-path", tmp_path / "images"),
+    )
+    results = json.loads((tmp_path / "out.json").read_text(), parse_constant=no_constants)["results"]
+    assert results["coordinate_px"] < 3 and results["coordinate_px_std"] >= 0
+    assert {p.name.split("_")[1] for p in (tmp_path / "images").iterdir()} == {"00000", "00001", "00002"}
+
+
+def test_export_pointcloud_in_the_scans_units(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call(
+        ns_export.entrypoint,
+        monkeypatch,
+        *("pointcloud", "--load-config", config, "--output-dir", tmp_path, "--num-points", 3000),
+        *("--num-rays-per-batch", 2000, "--save-world-frame", True),
+    )
+    cloud = trimesh.load(tmp_path / "point_cloud.ply")
+    assert np.median(distance_to_sphere_mm(np.asarray(cloud.vertices))) < 2
+
+
+def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call(
+        ns_export.entrypoint,
+        monkeypatch,
+        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 3000),
+        *("--num-rays-per-batch", 2000, "--texture-method", "point_cloud"),
+    )
+    assert len(trimesh.load(tmp_path / "poisson_mesh.ply").faces) > 100
+
+
+def test_export_tsdf(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline) -> None:
+    call(
+        ns_export.entrypoint,
+        monkeypatch,
+        *("tsdf", "--load-config", config, "--output-dir", tmp_path, "--resolution", 48, "--downscale-factor", 1),
+        *("--texture-method", "tsdf"),
+    )
+    mesh = trimesh.load(tmp_path / "tsdf_mesh.ply")
+    S = pipeline.datamanager.dataparser.loaded.S_scene_world.inverse()
+    # half of the mesh is the unseen inside of nerfstudio's volume; the sphere must be in it
+    assert (distance_to_sphere_mm(S.points(np.asarray(mesh.vertices))) < 3).mean() > 0.3
+
+
+def test_export_cameras_gives_the_refined_poses(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline
+) -> None:
+    call(ns_export.entrypoint, monkeypatch, "cameras", "--load-config", config, "--output-dir", tmp_path)
+    refined = pipeline._sl_model.poses_scene()[0]
+    for name in ("transforms_train.json", "transforms_eval.json"):
+        frames = json.loads((tmp_path / name).read_text())
+        np.testing.assert_allclose([f["transform"] for f in frames], refined[:, :3].numpy(), atol=1e-5)
+
+
+def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call(
+        ns_render.entrypoint,
+        monkeypatch,
+        *("dataset", "--load-config", config, "--output-path", tmp_path, "--split", "train+test"),
+        *("--downscale-factor", 2, "--image-format", "png"),
+    )
+    for split in ("train", "test"):
+        for output in ("gt-rgb", "rgb", "depth", "normals", "accumulation", "coordinates", "pattern", "residual"):
+            assert Image.open(tmp_path / split / output / "frame_00001.png").size == (24, 20)
+
+
+# ---- the viewer
+
+
+@pytest.fixture
+def viewer(pipeline: SLPipeline, tmp_path: Path) -> Iterator[Viewer]:
+    settings = ViewerConfig(websocket_host="127.0.0.1")
+    viewer = Viewer(settings, tmp_path / "viewer.log", pipeline.datamanager.get_datapath(), pipeline)
+    viewer.init_scene(pipeline.datamanager.train_dataset, "completed")
+    yield viewer
+    viewer.viser_server.stop()
+
+
+def test_viewer_shows_cameras_and_projectors_before_and_after(viewer: Viewer, pipeline: SLPipeline) -> None:
+    port = viewer.viser_server.get_port()
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as page:
+        assert page.status == 200
+    view = pipeline.scene_view
+    loaded = pipeline.datamanager.dataparser.loaded
+    starting = [loaded.S_scene_world.poses(T) for T in (loaded.scan.T_world_camera, loaded.scan.T_world_projector)]
+    refined = [T.numpy() for T in pipeline._sl_model.poses_scene()]
+    for handles, poses in zip((*view._starting, *view._refined), (*starting, *refined), strict=True):
+        positions = [h.position for h in handles]
+        np.testing.assert_allclose(positions, poses[:, :3, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-4)
+    names = {p[0].split("/")[-1] for p in viewer.viewer_elements}
+    assert {"show_projectors", "show_starting", "projector_of_frame"} <= names
+
+
+def test_viewer_frusta_follow_the_poses(viewer: Viewer, pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, projector = pipeline._sl_model.poses_scene()
+    camera, projector = camera.clone(), projector.clone()
+    camera[:, 0, 3] += 1
+    projector[:, 1, 3] -= 1
+    view = pipeline.scene_view
+    monkeypatch.setattr(view, "_current_poses", lambda: (camera, projector))
+    before = [h.position for h in view._starting[0]]
+    view.update(force=True)
+    for handles, poses in ((view._refined[0], camera), (view._refined[1], projector)):
+        np.testing.assert_allclose([h.position for h in handles], poses[:, :3, 3].numpy() * 10, atol=1e-4)
+    np.testing.assert_allclose(
+        [viewer.camera_handles[i].position for i in range(3)], camera[:, :3, 3].numpy() * 10, atol=1e-4
+    )
+    np.testing.assert_array_equal([h.position for h in view._starting[0]], before)
+
+
+def test_viewer_checkboxes_hide_frusta(viewer: Viewer, pipeline: SLPipeline) -> None:
+    view = pipeline.scene_view
+    shown = lambda handles: [h.visible for h in handles]  # noqa: E731
+    assert view.show_projectors.gui_handle is not None and view.show_starting.gui_handle is not None
+    view.show_projectors.gui_handle.value = False
+    view._set_visibility()
+    assert not any(shown(view._refined[1]) + shown(view._starting[1])) and all(shown(view._starting[0]))
+    view.show_projectors.gui_handle.value = True
+    view.show_starting.gui_handle.value = False
+    view._set_visibility()
+    assert all(shown(view._refined[1])) and not any(shown(view._starting[0]) + shown(view._starting[1]))
+
+
+def test_every_output_can_be_shown(pipeline: SLPipeline) -> None:
+    """The viewer knows floats of one or three channels only, and asks from cameras of no frame."""
+    cameras = copy.deepcopy(pipeline.datamanager.train_dataset.cameras[0:1])
+    cameras.metadata = {"cam_idx": 0}
+    outputs = pipeline.model.eval().get_outputs_for_camera(cameras)
+    assert {"rgb", "depth", "accumulation", "normals", "coordinates", "pattern", "residual"} <= set(outputs)
+    for name, image in outputs.items():
+        assert image.dtype == torch.float32 and image.shape in {(40, 48, 1), (40, 48, 3)}, name
+        assert image.isfinite().all(), name
