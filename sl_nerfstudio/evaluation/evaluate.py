@@ -45,6 +45,7 @@ class Evaluation:
     surface: dict[str, SurfaceScore]  # alignment -> score; empty without a reference
     pose_errors: PoseErrors | None  # of the poses that were evaluated
     initial_pose_errors: PoseErrors | None  # of the scan's own poses, where they are others
+    starting_poses: bool  # the scan's own poses were evaluated, not refined ones
 
 
 def evaluate(
@@ -77,6 +78,7 @@ def evaluate(
         surface=scores,
         pose_errors=_pose_errors(poses, true_poses),
         initial_pose_errors=_pose_errors(initial, true_poses) if moved else None,
+        starting_poses=not moved,
     )
 
 
@@ -114,12 +116,14 @@ def mesh_reference(mesh: Mesh, scan: Scan, poses: Poses, samples: int = 100_000,
     """A true mesh with the part of it that `scan` could observe with `poses` (the true ones, if known)."""
     surface = Surface(mesh)
     points, normals = surface.sample(samples, seed + 1)
-    frames = (
+    frames = [
         (frame.camera, T_c, scan.projector, T_p)
         for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    )
+    ]
     seen = observable(points, normals, surface, frames)
-    if not seen.any():
+    # A closed mesh that is inside out shows next to nothing; turned round, it shows much more.
+    few = seen.mean() < 0.05
+    if not seen.any() or (few and observable(points, -normals, surface, frames).mean() > 4 * seen.mean()):
         raise UserError(
             "no part of the reference mesh is both seen by a camera and lit by its projector\n"
             f"    cause:  it is inside out, in another unit than the scan ({scan.units}), or in other axes\n"

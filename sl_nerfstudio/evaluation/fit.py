@@ -162,7 +162,7 @@ def fit_figures(name: str, masked: int, pixels: FramePixels) -> FrameFit:
         lit_share=_mean(pixels.lit),
         decoded_share=_mean(pixels.decoded),
         coordinate_px_median=_median(pixels.coordinate),
-        coordinate_px_p95=_percentile(pixels.coordinate, 95),
+        coordinate_px_p95=_percentile(pixels.coordinate, 95.0),
         epipolar_px_median=_median(np.abs(pixels.epipolar)),
         pattern_cosine=_cosine(pixels.captured[both], pixels.rendered[both]),
         depth_per_px=_median(pixels.depth_per_px),
@@ -197,7 +197,7 @@ class FitAccumulator:
         weight = np.array([f.pixels for f in self._frames], np.float64)
         return Fit(
             coordinate_px_median=_median(coordinate),
-            coordinate_px_p95=_percentile(coordinate, 95),
+            coordinate_px_p95=_percentile(coordinate, 95.0),
             epipolar_px_median=_median(np.concatenate(self._epipolar)),
             pattern_cosine=float(ab / np.sqrt(aa * bb)) if aa * bb > 0 else float("nan"),
             hit_share=float(np.average([f.hit_share for f in self._frames], weights=weight)) if weight.sum() else 0.0,
@@ -225,7 +225,7 @@ def _known(values: Float[ndarray, "n"]) -> Float[ndarray, "m"]:
 
 
 def _median(values: Float[ndarray, "n"]) -> float:
-    return _percentile(values, 50)
+    return _percentile(values, 50.0)
 
 
 def _percentile(values: Float[ndarray, "n"], percent: float) -> float:

@@ -32,7 +32,7 @@ class ColourScale:
     def css_gradient(self, stops: int = 9) -> str:
         """The scale as a CSS background, left to right."""
         values = np.linspace(self.lower, self.upper, stops)
-        colours = ", ".join("#" + bytes(int(round(255 * c)) for c in rgb).hex() for rgb in self(values))
+        colours = ", ".join("#" + bytes(np.round(255 * rgb).astype(np.uint8)).hex() for rgb in self(values))
         return f"linear-gradient(to right, {colours})"
 
 
@@ -63,9 +63,7 @@ class View:
     up: Float[ndarray, "3"]
 
 
-def views_of(
-    T_world_camera: Float[ndarray, "n 4 4"], centre: Float[ndarray, "3"], count: int = 3
-) -> list[View]:
+def views_of(T_world_camera: Float[ndarray, "n 4 4"], centre: Float[ndarray, "3"], count: int = 3) -> list[View]:
     """Views from where cameras stood, as different from each other as possible: sides the scan really saw."""
     towards = T_world_camera[:, :3, 3] - centre
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
@@ -142,9 +140,7 @@ def _barycentric(surface: Surface, face: ndarray, p: Float[ndarray, "n 3"]) -> F
     return np.clip(np.stack([u, v, 1 - u - v], 1), 0, 1)
 
 
-def pixel_map(
-    row: ndarray, column: ndarray, stride: int, rgb: Float[ndarray, "n 3"]
-) -> Float[ndarray, "h w 3"]:
+def pixel_map(row: ndarray, column: ndarray, stride: int, rgb: Float[ndarray, "n 3"]) -> Float[ndarray, "h w 3"]:
     """An image of scattered pixels (every stride-th of a frame), cropped to them; white elsewhere."""
     if len(row) == 0:
         return np.ones((1, 1, 3))

@@ -1,0 +1,127 @@
+"""What classical fusion reaches: Open3D TSDF with initial, ICP-registered and true poses, on scans with truth.
+
+python benchmarks/tsdf_baseline.py SCAN [SCAN ...] [--output results.json]
+"""
+
+import json
+import platform
+import subprocess
+import time
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
+from sl_nerfstudio.evaluation.metrics import SurfaceScore
+from sl_nerfstudio.evaluation.poses import compare_poses
+from sl_nerfstudio.evaluation.registration import register
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.tsdf import fuse
+from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
+from sl_nerfstudio.scan import read_ground_truth, read_scan
+
+
+@dataclass(frozen=True)
+class Config:
+    """TSDF fusion with initial, ICP-registered and true poses."""
+
+    scans: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Scan folders with ground_truth/."""
+    output: Path | None = None
+    """Where to write the figures as JSON, with machine, date and commit."""
+    meshes: Path | None = None
+    """Folder for the fused meshes, SCAN-POSES.ply."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fusion; lengths in the scan's unit, after rigid ICP."""
+
+    scan: str
+    poses: str
+    units: str
+    seconds: float
+    accuracy_rmse: float
+    accuracy_median: float
+    completeness_rmse: float
+    completeness_median: float
+    accuracy_rmse_similarity: float
+    scale: float
+    camera_translation_rmse: float
+    camera_rotation_rmse_deg: float
+
+
+def measure(root: Path, meshes: Path | None) -> list[Row]:
+    """All three kinds of poses on one scan. Raises UserError for a scan without truth."""
+    scan = read_scan(root)
+    truth = read_ground_truth(scan)
+    if truth.mesh_path is None or truth.T_world_camera is None or truth.T_world_projector is None:
+        raise UserError(f"{root}: has no complete ground_truth/\n    remedy: make one with sl-synth")
+    true = Poses(truth.T_world_camera, truth.T_world_projector)
+    initial = Poses(scan.T_world_camera, scan.T_world_projector)
+    reference = mesh_reference(read_mesh(truth.mesh_path), scan, true)
+    rows = []
+    for name in ("initial", "registered", "true"):
+        start = time.perf_counter()
+        poses = {"initial": initial, "true": true}.get(name) or register(scan, initial)
+        mesh = fuse(scan, poses)
+        seconds = time.perf_counter() - start
+        if meshes is not None:
+            write_mesh(meshes / f"{root.name}-{name}.ply", mesh)
+        scores = score_alignments(Surface(mesh), reference, poses, true)
+        errors = compare_poses(
+            poses.T_world_camera, poses.T_world_projector, true.T_world_camera, true.T_world_projector
+        )
+        rows.append(_row(root.name, name, scan.units, seconds, scores["rigid"], scores["similarity"], errors.camera))
+    return rows
+
+
+def _row(scan, poses, units, seconds, rigid: SurfaceScore, similarity: SurfaceScore, camera) -> Row:
+    return Row(
+        scan=scan,
+        poses=poses,
+        units=units,
+        seconds=seconds,
+        accuracy_rmse=rigid.accuracy.rmse,
+        accuracy_median=rigid.accuracy.median,
+        completeness_rmse=rigid.completeness.rmse,
+        completeness_median=rigid.completeness.median,
+        accuracy_rmse_similarity=similarity.accuracy.rmse,
+        scale=similarity.scale,
+        camera_translation_rmse=camera.translation_rmse,
+        camera_rotation_rmse_deg=camera.rotation_rmse_deg,
+    )
+
+
+def main() -> None:
+    """Measure, print, write."""
+    config = tyro.cli(Config)
+    rows: list[Row] = []
+    print("scan                 poses       accuracy RMS   median completeness RMS with scale      s")
+    for root in config.scans:
+        for row in measure(root, config.meshes):
+            rows.append(row)
+            print(
+                f"{row.scan:20} {row.poses:11} {row.accuracy_rmse:9.3f} {row.units:2} {row.accuracy_median:8.3f} "
+                f"{row.completeness_rmse:16.3f} {row.accuracy_rmse_similarity:10.3f} {row.seconds:6.1f}",
+                flush=True,
+            )
+    if config.output:
+        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+        result = {
+            "machine": f"{platform.processor() or platform.machine()}, {platform.system()}",
+            "date": datetime.now(timezone.utc).date().isoformat(),
+            "commit": commit,
+            "rows": [asdict(row) for row in rows],
+        }
+        config.output.parent.mkdir(parents=True, exist_ok=True)
+        config.output.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,158 @@
+"""sl-eval: compare a mesh and its poses with a scan, and with the truth where it is known."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.errors import UserError
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.evaluation.evaluate import Evaluation
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Evaluate a mesh and its poses on a scan, and against the truth where it is known."""
+
+    mesh: Path
+    """The surface, in the scan's unit and world axes: .ply, .obj, .stl or .glb."""
+    data: Path
+    """The scan folder. Its ground_truth/ is used if it is there."""
+    poses: Path | None = None
+    """transforms.json with the poses to evaluate, such as refined/transforms.json; default: the scan's own.
+    training.json beside it goes into the report."""
+    json: Path | None = None
+    """Where to write all figures."""
+    report: Path | None = None
+    """Where to write the report, one HTML file that needs no network."""
+    reference: Path | None = None
+    """Compare with this instead of ground_truth/mesh.ply: a mesh, or points in an .npz file under the key `xyz`."""
+    f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D [D ...]")] = ()
+    """Distances for the F-score, in the scan's unit; default: four round ones from 0.1 % to 1 % of the truth's size."""
+    samples: int = 100_000
+    """Points that are spread over each surface to measure distances."""
+    seed: int = 0
+    """Of these points: the same seed gives the same figures."""
+
+
+def evaluate_scan(config: EvalConfig) -> None:
+    """Do what the command line asks for. Raises UserError for anything a user can mend."""
+    _check(config)
+    from sl_nerfstudio.cli.evaluate_files import read_poses_file, read_reference, read_sigmas, read_training
+    from sl_nerfstudio.evaluation.evaluate import Poses, evaluate
+    from sl_nerfstudio.evaluation.result_json import to_json
+    from sl_nerfstudio.evaluation.thumbnails import ThumbnailCollector
+    from sl_nerfstudio.meshing.mesh_io import read_mesh
+    from sl_nerfstudio.scan import read_ground_truth, read_scan
+    from sl_nerfstudio.scan.atomic import write_atomic
+
+    mesh = read_mesh(config.mesh)
+    scan = read_scan(config.data)
+    truth = read_ground_truth(scan)
+    poses_path = config.poses / "transforms.json" if config.poses and config.poses.is_dir() else config.poses
+    poses = read_poses_file(poses_path, scan) if poses_path else Poses(scan.T_world_camera, scan.T_world_projector)
+    true_poses = None
+    if truth.T_world_camera is not None and truth.T_world_projector is not None:
+        true_poses = Poses(truth.T_world_camera, truth.T_world_projector)
+    reference = read_reference(
+        config.reference or truth.mesh_path, scan, true_poses or poses, config.samples, config.seed
+    )
+    thumbnails = ThumbnailCollector()
+    evaluation = evaluate(
+        mesh, scan, poses, reference, true_poses, config.f_distances, config.samples, config.seed,
+        on_frame=thumbnails if config.report else None,
+    )  # fmt: skip
+    results: dict[Path, str] = {}
+    if config.json:
+        results[config.json] = json.dumps(to_json(evaluation), indent=2, allow_nan=False) + "\n"
+    if config.report:
+        from sl_nerfstudio.evaluation.report import ReportInput, render_report
+
+        results[config.report] = render_report(
+            ReportInput(
+                evaluation, scan, mesh, poses, thumbnails.frames,
+                mesh_name=config.mesh.name,
+                poses_name=f"{poses_path.parent.name}/{poses_path.name}" if poses_path else "",
+                pose_sigma=read_sigmas(poses_path, scan) if poses_path else [],
+                training=read_training(poses_path.with_name("training.json")) if poses_path else None,
+            )
+        )  # fmt: skip
+    for path, text in results.items():
+        write_atomic(path, text.encode())
+    print_summary(evaluation, list(results))
+
+
+def _check(config: EvalConfig) -> None:
+    """Faults that the flags show by themselves."""
+    for distance in config.f_distances:
+        if not 0 < distance < float("inf"):
+            raise UserError(
+                f"--f-distances: {distance:g} is no distance\n    remedy: give numbers above 0, in the scan's unit"
+            )
+    if config.samples < 1000:
+        raise UserError(
+            f"--samples: {config.samples} points are too few for stable figures\n    remedy: give at least 1000"
+        )
+    if config.seed < 0:
+        raise UserError(f"--seed: {config.seed} is negative\n    remedy: give a whole number of at least 0")
+    if config.reference and config.reference.suffix.lower() == ".npy":
+        raise UserError(
+            f"--reference: {config.reference} is an .npy file\n    remedy: give an .npz file with the key xyz"
+        )
+
+
+def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
+    """The figures that matter as tables on stdout."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    units = evaluation.units
+    if evaluation.surface:
+        table = Table(title=f"Distances in {units}", title_justify="left")
+        for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):
+            table.add_column(column, justify="right" if column.strip() else "left")
+        for name, score in evaluation.surface.items():
+            a, c = score.accuracy, score.completeness
+            chamfer, scale = f"{score.chamfer:.3g}", f"{score.scale:.5f}"
+            table.add_row(name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale)
+            table.add_row("", "completeness", *(f"{v:.3g}" for v in (c.mean, c.median, c.rmse, c.p95)), "", "")
+        console.print(table)
+    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
+    if any(errors for _, errors in rows):
+        table = Table(title="Pose errors, RMS", title_justify="left")
+        for column in ("", f"camera {units}", "deg", f"projector {units}", "deg", "scale"):
+            table.add_column(column, justify="right" if column else "left")
+        for name, errors in rows:
+            if errors is not None:
+                values = [
+                    v for d in (errors.camera, errors.projector) for v in (d.translation_rmse, d.rotation_rmse_deg)
+                ]
+                table.add_row(name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %")
+        console.print(table)
+    fit = evaluation.fit
+    table = Table(title="Fit to the captures", title_justify="left")
+    for column in ("coordinates px (median)", "epipolar px (median)", "pattern cosine", "covered"):
+        table.add_column(column, justify="right")
+    table.add_row(
+        f"{fit.coordinate_px_median:.3f}",
+        f"{fit.epipolar_px_median:.3f}",
+        f"{fit.pattern_cosine:.4f}",
+        f"{fit.hit_share:.1%}",
+    )
+    console.print(table)
+    for path in written:
+        console.print(f"written: {path}", highlight=False, soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point of `sl-eval`."""
+    run(lambda: evaluate_scan(tyro.cli(EvalConfig, prog="sl-eval")))
+
+
+if __name__ == "__main__":
+    main()

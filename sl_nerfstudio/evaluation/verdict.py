@@ -1,0 +1,152 @@
+"""Good, acceptable or poor: what the figures say about a scan, and what to do next."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.reference import MeshReference
+
+Band = Literal["good", "acceptable", "poor", "unknown"]
+_ORDER: dict[str, int] = {"good": 0, "unknown": 0, "acceptable": 1, "poor": 2}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure, judged."""
+
+    name: str
+    value: float
+    text: str  # the value with its unit
+    band: Band
+    good: str  # the limit of "good", in words
+    acceptable: str
+    meaning: str
+    advice: str  # what to do if it is not good
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The worst of the checks, and all of them."""
+
+    band: Band
+    sentence: str
+    checks: tuple[Check, ...]
+    hints: tuple[str, ...] = ()  # explanations that come before the advice of the checks
+
+    @property
+    def next_steps(self) -> list[str]:
+        """What to do, worst first; nothing for a good scan."""
+        bad = sorted((c for c in self.checks if _ORDER[c.band]), key=lambda c: -_ORDER[c.band])
+        return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad)]
+
+
+def judge(evaluation: Evaluation) -> Verdict:
+    """Judge an evaluation by fixed bands."""
+    fit = evaluation.fit
+    checks = [
+        _check(
+            "Coordinate residual", fit.coordinate_px_median, "{:.2f} px", 0.6, 1.5, "≤ {} px",
+            "Median distance between where the surface puts a pattern point and where it was decoded.",
+            "the surface does not explain the captures: train longer, check the poses and the lens data, or decode "
+            "again",
+        ),
+        _check(
+            "Epipolar residual", fit.epipolar_px_median, "{:.2f} px", 0.5, 1.2, "≤ {} px",
+            "Median distance of decoded points from their epipolar curve: the pose of each projector against its "
+            "camera, whatever the surface.",
+            "refine the poses (refine-poses free), and check the intrinsics of camera and projector",
+        ),
+        _check(
+            "Pattern agreement", fit.pattern_cosine, "{:.3f}", 0.9, 0.75, "≥ {}",
+            "Cosine between captured and rendered pattern over all lit pixels; 1 is identical up to brightness.",
+            "look at the pictures below: blur, ambient light or a wrong pattern file lower it",
+        ),
+        _check(
+            "Coverage", 100 * fit.hit_share, "{:.1f} %", 97, 85, "≥ {} %",
+            "Share of the pixels with pattern on the object for which the mesh has surface.",
+            "export with --keep-unobserved to see whether surface was cut away; else add frames that see the missing "
+            "parts",
+        ),
+        _worst_frame(evaluation),
+        _geometry(evaluation),
+    ]  # fmt: skip
+    if evaluation.reference is not None and "rigid" in evaluation.surface:
+        checks.insert(0, _accuracy(evaluation))
+    band: Band = max((c.band for c in checks), key=lambda b: _ORDER[b])
+    return Verdict(band, _sentence(band, evaluation), tuple(checks), _hints(evaluation, band))
+
+
+def _check(
+    name: str, value: float, form: str, good: float, acceptable: float, limit: str, meaning: str, advice: str
+) -> Check:
+    """Judge `value`; whether larger is better follows from the order of the limits."""
+    sign = 1 if good < acceptable else -1
+    band: Band = "poor"
+    if not math.isfinite(value):
+        band = "unknown"
+    elif sign * value <= sign * good:
+        band = "good"
+    elif sign * value <= sign * acceptable:
+        band = "acceptable"
+    text = form.format(value) if math.isfinite(value) else "none"
+    return Check(name, value, text, band, limit.format(f"{good:g}"), limit.format(f"{acceptable:g}"), meaning, advice)
+
+
+def _accuracy(evaluation: Evaluation) -> Check:
+    reference = evaluation.reference
+    score = evaluation.surface["rigid"]
+    exact = isinstance(reference, MeshReference)
+    rmse = score.accuracy.rmse if exact else score.completeness.rmse
+    percent = 100 * rmse / reference.size if reference is not None else math.nan
+    way = "of the surface from the truth" if exact else "of the reference points from the surface"
+    return _check(
+        "Accuracy" if exact else "Distance from reference", percent,
+        f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.units})", 0.25, 1.0,
+        "≤ {} %", f"RMS distance {way} after rigid alignment, in percent of the size of the reference.",
+        "see where the error colours are strong: all over means poses or scale, patches mean too few frames there",
+    )  # fmt: skip
+
+
+def _worst_frame(evaluation: Evaluation) -> Check:
+    known = [(f.coordinate_px_median, f.name) for f in evaluation.fit.frames if math.isfinite(f.coordinate_px_median)]
+    worst, name = max(known, default=(math.nan, ""))
+    ratio = worst / evaluation.fit.coordinate_px_median if known else math.nan
+    return _check(
+        "Worst frame", ratio, f"{{:.1f}} times the median ({name})", 2, 4, "≤ {} times",
+        "Coordinate residual of the worst frame against the whole scan: one frame must not contradict the others.",
+        f"look at {name or 'it'} below; if its pose or decoding is wrong, leave the frame out and train again",
+    )  # fmt: skip
+
+
+def _geometry(evaluation: Evaluation) -> Check:
+    fit = evaluation.fit
+    return _check(
+        "Ray angle", fit.ray_angle_deg, "{:.1f}°", 8, 4, "≥ {}°",
+        f"Angle between camera ray and projector ray on the surface (median). Here one pattern pixel is worth "
+        f"{fit.depth_per_px:.3g} {evaluation.units} of depth: a low residual proves little where that is much.",
+        "hold the projector further from the camera in the next scan, or trust the calibrated relative pose "
+        "(refine-poses known-rig)",
+    )  # fmt: skip
+
+
+def _hints(evaluation: Evaluation, band: Band) -> tuple[str, ...]:
+    if _ORDER[band] and evaluation.starting_poses:
+        return (
+            "These figures are for the scan's starting poses: if the surface was trained with refined ones, "
+            "give them with --poses",
+        )
+    return ()
+
+
+def _sentence(band: Band, evaluation: Evaluation) -> str:
+    evidence = "judged against the reference and by its fit to the captures" if evaluation.reference is not None else (
+        "judged by its fit to the captures alone: no truth is known, so errors that all frames share stay unseen"
+    )  # fmt: skip
+    start = {
+        "good": "The surface explains the captures, and nothing stands out",
+        "acceptable": "The scan is usable; some figures are weaker than they could be",
+        "poor": "At least one figure says that something is wrong",
+        "unknown": "There is too little to judge",
+    }[band]
+    return f"{start} ({evidence})."
