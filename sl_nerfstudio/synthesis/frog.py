@@ -1,7 +1,7 @@
 """A sitting frog, about 120 x 99 x 68 mm: thin legs, deep folds, much that hides other parts."""
 
 from sl_nerfstudio.synthesis.scene import Scene
-from sl_nerfstudio.synthesis.sdf import Field, capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
+from sl_nerfstudio.synthesis.sdf import Field, Triple, capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
 
 
 def frog(cell: float = 0.8) -> Scene:
@@ -55,6 +55,6 @@ def _fore_leg() -> Field:
     return union(2.0, upper, lower, *fingers)
 
 
-def _toes(start: tuple[float, float, float], tips: tuple[tuple[float, float, float], ...]) -> list[Field]:
+def _toes(start: Triple, tips: tuple[Triple, ...]) -> list[Field]:
     """Thin toes with round pads."""
     return [union(1.0, capsule(start, tip, 2.8, 1.9), ellipsoid(tip, (3.2, 3.2, 2.4))) for tip in tips]

@@ -118,4 +118,4 @@ def _slip(cell: int, cells: Cells, rng: np.random.Generator) -> Int64[ndarray, "
 
 def _stays_inside(cell: int, slip: Int64[ndarray, "2"], cells: Cells) -> bool:
     i, j = divmod(cell, cells.columns)
-    return 0 <= i + slip[1] < cells.rows and 0 <= j + slip[0] < cells.columns
+    return bool(0 <= i + slip[1] < cells.rows and 0 <= j + slip[0] < cells.columns)

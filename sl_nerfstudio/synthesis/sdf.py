@@ -9,17 +9,18 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from sl_nerfstudio.synthesis.scene import Scene
 
+Number = float | int
+Triple = tuple[Number, Number, Number]
 Field = Callable[[Float[ndarray, "n 3"]], Float[ndarray, "n"]]
 _NEWTON_STEPS = 2
 
 
-def ellipsoid(centre: ArrayLike, radii: ArrayLike, turn_deg: ArrayLike = (0.0, 0.0, 0.0)) -> Field:
+def ellipsoid(centre: Triple, radii: Triple, turn_deg: Triple = (0.0, 0.0, 0.0)) -> Field:
     """An ellipsoid, turned about its centre by angles about x, y and z in that order."""
     c, r = np.asarray(centre, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     R = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
@@ -27,12 +28,13 @@ def ellipsoid(centre: ArrayLike, radii: ArrayLike, turn_deg: ArrayLike = (0.0, 0
     def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         q = (p - c) @ R / r
         k0 = _length(q)
-        return k0 * (k0 - 1) / np.maximum(_length(q / r), 1e-9)
+        k1 = _length(q / r)
+        return np.where(k1 > 1e-9, k0 * (k0 - 1) / np.maximum(k1, 1e-9), -r.min())  # the centre has no gradient
 
     return field
 
 
-def capsule(a: ArrayLike, b: ArrayLike, radius_a: float, radius_b: float) -> Field:
+def capsule(a: Triple, b: Triple, radius_a: Number, radius_b: Number) -> Field:
     """A rod from `a` to `b` with round ends, whose radius changes linearly."""
     start, end = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     axis = end - start
@@ -49,7 +51,7 @@ def ridges(solid: Field, height: float, wave: Field) -> Field:
     return lambda p: solid(p) - height * np.sin(wave(p))
 
 
-def half_space(normal: ArrayLike, offset: float) -> Field:
+def half_space(normal: Triple, offset: float) -> Field:
     """Everything on the side of the plane `normal . p = offset` that the (unit) normal points away from."""
     n = np.asarray(normal, dtype=np.float64)
     return lambda p: p @ n - offset
@@ -93,8 +95,8 @@ def mirrored(field: Field, axis: int = 0) -> Field:
 def mesh_of(
     name: str,
     field: Field,
-    lower: ArrayLike,
-    upper: ArrayLike,
+    lower: Triple,
+    upper: Triple,
     cell: float,
     elevation_deg: tuple[float, float] = (25.0, 65.0),
 ) -> Scene:
@@ -102,7 +104,8 @@ def mesh_of(
 
     Coarse to fine: only cells near the level are looked at closely. Raises ValueError if the surface leaves the box.
     """
-    low = np.asarray(lower, dtype=np.float64)
+    # planes of the object must not be planes of the grid: marching cubes makes empty triangles of exact zeros
+    low = np.asarray(lower, dtype=np.float64) - np.array([0.31, 0.37, 0.41]) * cell
     count = np.ceil((np.asarray(upper) - low) / (4 * cell)).astype(int) * 4
     values = _sample_near_level(field, low, count, cell)
     rim = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])

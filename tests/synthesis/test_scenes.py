@@ -1,0 +1,126 @@
+"""Scenes: closed surfaces of the stated sizes, different from each other; mesh files; the builder of free forms."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.frog import frog
+from sl_nerfstudio.synthesis.head import head
+from sl_nerfstudio.synthesis.mesh_file import encode_ply
+from sl_nerfstudio.synthesis.scenes import make_scene
+from sl_nerfstudio.synthesis.sdf import capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
+
+
+def _mesh(scene):
+    return trimesh.Trimesh(scene.vertices, scene.faces, process=False)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return {"cone-and-cylinder": cone_and_cylinder(), "head": head(cell=4.0), "frog": frog(cell=1.5)}
+
+
+@pytest.mark.parametrize("name", ["cone-and-cylinder", "head", "frog"])
+def test_surfaces_are_closed_and_oriented_outwards(scenes, name):
+    mesh = _mesh(scenes[name])
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    assert mesh.euler_number == 2 and mesh.body_count == 1
+    assert mesh.area_faces.min() > 0
+
+
+def test_the_cone_and_the_cylinder_have_their_volume_and_size(scenes):
+    scene = scenes["cone-and-cylinder"]
+    expected = 80 * 56 * 6 + np.pi * 19**2 * 46 / 3 + np.pi * 14**2 * 34
+    assert _mesh(scene).volume == pytest.approx(expected, rel=1e-5)
+    np.testing.assert_allclose(np.ptp(scene.vertices, axis=0), (80, 56, 52), atol=1e-9)
+    assert scene.size == pytest.approx(80)
+
+
+@pytest.mark.parametrize(("name", "size"), [("head", (147, 195, 201)), ("frog", (120, 99, 68))])
+def test_free_forms_have_their_size_and_stand_on_the_ground(scenes, name, size):
+    scene = scenes[name]
+    np.testing.assert_allclose(np.ptp(scene.vertices, axis=0), size, atol=3)
+    assert abs(scene.vertices[:, 2].min()) < 0.5
+
+
+@pytest.mark.parametrize("name", ["head", "frog"])
+def test_normals_of_free_forms_point_outwards(scenes, name):
+    scene = scenes[name]
+    agree = (scene.vertex_normals[scene.faces].mean(1) * scene.face_normals).sum(1)
+    assert np.quantile(agree, 0.02) > 0.5 and np.median(agree) > 0.98
+    np.testing.assert_allclose(np.linalg.norm(scene.vertex_normals, axis=1), 1, atol=1e-9)
+
+
+def test_shapes_differ_truly(scenes):
+    """Brought to the same size, each surface leaves the others by several percent of it."""
+    points = {}
+    for name, scene in scenes.items():
+        sample = trimesh.sample.sample_surface(_mesh(scene), 600, seed=0)[0]
+        points[name] = (sample - scene.centre) / scene.size
+    for a in points:
+        for b in points:
+            if a < b:
+                near = np.linalg.norm(points[a][:, None] - points[b][None], axis=-1).min(1)
+                assert near.mean() > 0.03
+
+
+def test_a_sphere_from_its_field():
+    scene = mesh_of("ball", ellipsoid((1, 2, 3), (10, 10, 10)), (-12, -12, -12), (14, 14, 16), 1.0)
+    radius = np.linalg.norm(scene.vertices - (1, 2, 3), axis=1)
+    np.testing.assert_allclose(radius, 10, atol=1e-3)
+    np.testing.assert_allclose(scene.vertex_normals, (scene.vertices - (1, 2, 3)) / radius[:, None], atol=5e-3)
+    assert _mesh(scene).volume == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
+
+
+def test_a_form_that_leaves_its_box_is_refused():
+    with pytest.raises(ValueError, match="the surface of ball leaves its box"):
+        mesh_of("ball", ellipsoid((0, 0, 0), (10, 10, 10)), (-8, -12, -12), (12, 12, 12), 1.0)
+
+
+def test_joining_and_carving():
+    a, b = ellipsoid((0, 0, 0), (2, 2, 2)), ellipsoid((3, 0, 0), (2, 2, 2))
+    p = np.array([[0.0, 0, 0], [3, 0, 0], [1.5, 0, 0], [1.5, 1.5, 0], [9, 0, 0]])
+    assert (union(0.0, a, b)(p) < 0).tolist() == [True, True, True, False, False]
+    assert (union(2.0, a, b)(p) < 0).tolist() == [True, True, True, True, False], "the blend fills the groove"
+    assert (carve(0.0, a, b)(p) < 0).tolist() == [True, False, False, False, False]
+    assert (carve(0.0, a, half_space((0, 0, 1), 0.5))(p) < 0).tolist() == [False] * 5
+    far = capsule((0, 0, 0), (0, 0, 5), 1.0, 1.0)(np.array([[3.0, 0, 2], [0, 0, 8], [0, 4, -3]]))
+    np.testing.assert_allclose(far, [2, 2, 4])
+    assert mirrored(b)(np.array([[-3.0, 0, 0]]))[0] == pytest.approx(-2, abs=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".glb"])
+def test_mesh_files_in_their_unit(tmp_path, suffix):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    path = tmp_path / f"box{suffix}"
+    box.export(path)
+    scene = make_scene(str(path), file_unit=1000.0)
+    np.testing.assert_allclose(sorted(np.ptp(scene.vertices, axis=0)), (100, 200, 300), atol=1e-4)
+    assert scene.name == "box"
+
+
+def test_a_written_mesh_comes_back_exactly(tmp_path, scenes):
+    scene = scenes["frog"]
+    (tmp_path / "m.ply").write_bytes(encode_ply(scene.vertices, scene.faces))
+    back = make_scene(str(tmp_path / "m.ply"))
+    assert np.array_equal(back.vertices, scene.vertices) and np.array_equal(back.faces, scene.faces)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, frog. nor a mesh file"),
+        ("absent.ply", None, "there is no such file"),
+        ("text.ply", b"hello", "cannot be read as a mesh"),
+        ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+                       b"property float z\nend_header\n0 0 0\n", "points.ply"),
+    ],
+)  # fmt: skip
+def test_scenes_that_are_none(tmp_path, monkeypatch, name, content, message):
+    monkeypatch.chdir(tmp_path)
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        make_scene(name)
