@@ -31,6 +31,7 @@ from sl_nerfstudio.progress import track
 
 RefinePoses = Literal["free", "rigid-rig", "known-rig", "off"]
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
+_SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
 _SMALL_STEP = 1e-4  # of the scene's radius, or radian: the adjustment has converged
 _NOISE_FLOOR = 0.01  # projector pixels: residuals are not believed to be better than this
 
@@ -53,8 +54,10 @@ class AdjustmentSettings:
     """Decoded pixels of each frame that are looked for in other frames."""
     frames_per_anchor: int = 8
     """Other frames in which each of them is looked for, at most."""
-    max_iterations: int = 30
+    max_iterations: int = 40
     """Levenberg-Marquardt steps, at most."""
+    rigid_iterations: int = 12
+    """Steps, at most, in which frames move as a whole before projectors move against their cameras."""
     seed: int = 0
     """Seed of the choice of pixels."""
 
@@ -193,7 +196,8 @@ def adjust(
     generator = torch.Generator().manual_seed(settings.seed)
     rig = start
     anchors = place_anchors(rig, maps, settings.anchors_per_frame, generator)
-    B = free_directions(refine, rig.frames)
+    stages = ["known-rig", refine] if refine in ("free", "rigid-rig") else [refine]
+    B = free_directions(stages[0], rig.frames)
     everything = float("inf")
     observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
     r = residuals_of(rig, anchors, observations, maps)
@@ -217,7 +221,12 @@ def adjust(
         rig, anchors, damping, size = _step(
             rig, anchors, observations, maps, equations, B, H, g, r, width, damping
         )
-        if width == previous and size < _SMALL_STEP:
+        settled = width > _SETTLED * previous and size < _SMALL_STEP * 10 ** (len(stages) - 1)
+        if len(stages) > 1 and (settled or iteration + 1 >= settings.rigid_iterations):
+            # frames have found each other as they are: now what is wrong inside each of them
+            stages = stages[1:]
+            B = free_directions(stages[0], rig.frames)
+        elif settled and len(stages) == 1:
             break
     r = residuals_of(rig, anchors, observations, maps)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * width)

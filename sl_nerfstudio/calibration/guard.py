@@ -45,7 +45,7 @@ def compare(before: Rig, after: Rig, held_out: HeldOut, maps: CoordinateMaps, wi
     generator = torch.Generator().manual_seed(0)
     pairs = []
     for rig in (before, after):
-        seen = observe(rig, _anchors(rig, held_out), maps, _FRAMES_PER_ANCHOR, 4 * width_px, generator)
+        seen = observe(rig, _anchors(rig, held_out), maps, _FRAMES_PER_ANCHOR, 2 * width_px, generator)
         pairs.append(torch.stack([seen.anchor, seen.frame]))
     rows = torch.unique(torch.cat(pairs, 1), dim=1)
     observations = Observations(rows[0], rows[1])

@@ -262,21 +262,31 @@ class SLModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """The weighted losses of a training step."""
+        """The weighted losses of a training step; in evaluation the terms that rendered outputs have."""
         w = self.config.losses
         losses: dict[str, Tensor] = {}
+        if "origins" not in outputs:
+            coordinates = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
+            counts = batch["decoded"][:, 0] & (outputs["accumulation"][:, 0] > 0.5)
+            losses["coordinates"] = self._per_pixel * coordinate_loss(coordinates, batch["coords"], counts)
+            losses["pattern"] = w.pattern * pattern_loss(outputs["pattern"][:, 0], batch["pattern"][:, 0])
+            return losses
         if "rendered" in outputs:
             rendered: Rendered = outputs["rendered"]
             n = len(rendered.depth)
             counts = batch["decoded"][:n, 0] & (rendered.lit > 0.5)
             error = coordinate_loss(rendered.coordinates, batch["coords"][:n], counts)
-            per_pixel = w.coordinates / self.px_per_length if w.coordinates_per_pixel is None else w.coordinates_per_pixel
-            losses["coordinates"] = per_pixel * error
+            losses["coordinates"] = self._per_pixel * error
             losses["pattern"] = w.pattern * pattern_loss(rendered.pattern, batch["pattern"][:n, 0])
         losses |= direct_losses(self, outputs, batch)
         if int(self.step_now) % self.history_table.every == 0:
             self._remember(outputs, batch, losses)
         return losses
+
+    @property
+    def _per_pixel(self) -> Tensor | float:
+        w = self.config.losses
+        return w.coordinates / self.px_per_length if w.coordinates_per_pixel is None else w.coordinates_per_pixel
 
     @torch.no_grad()
     def _remember(self, outputs: dict[str, Any], batch: dict[str, Tensor], losses: dict[str, Tensor]) -> None:

@@ -25,7 +25,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
 _HELD_OUT_PER_FRAME = 300
-_GUARD_WIDTH_PX = 4.0
+_GUARD_WIDTH = 4.0  # times the decoding noise: beyond it a residual is a wrong decoding or something else hides the place
 
 
 @dataclass
@@ -115,7 +115,7 @@ def refine(
     found = adjust(start, maps, pose_prior(scan, S_scene_world, prior), mode, settings)
     known = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
     rig = restore(start, found.rig, known)
-    verdict = compare(start, rig, held_out, maps, _GUARD_WIDTH_PX)
+    verdict = compare(start, rig, held_out, maps, _GUARD_WIDTH * found.noise_px)
     kept = rig if verdict.better else start
     n = rig.frames
     sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, n, 6).transpose(0, 1).reshape(n, 12)
