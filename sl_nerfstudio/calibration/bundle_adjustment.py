@@ -84,7 +84,9 @@ def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: tor
         d_camera = unproject(rig.camera[frame], uv)
         T = rig.T_camera_projector[frame]
         d_projector = (T[:3, :3] @ unproject(rig.projector, seen.uv_projector)[..., None]).squeeze(-1)
-        depth, depth_projector = closest_approach(torch.zeros_like(d_camera), d_camera, T[:3, 3].expand_as(d_camera), d_projector)
+        depth, depth_projector = closest_approach(
+            torch.zeros_like(d_camera), d_camera, T[:3, 3].expand_as(d_camera), d_projector
+        )
         good = seen.valid & (depth > 0) & (depth_projector > 0)
         parts.append(Anchors(index, d_camera, seen.uv_projector, depth).chosen(good))
     return Anchors(*(torch.cat([getattr(p, f) for p in parts]) for f in ("frame", "d_camera", "uv_projector", "depth")))
@@ -134,9 +136,7 @@ def prior_equations(
     """Information matrix and gradient of the departure from the starting poses."""
     n = rig.frames
     delta = log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
-    weight = torch.cat(
-        [(1 / s**2)[:, None].expand(n, 3) for s in (prior.frame_translation, prior.frame_rotation)], 1
-    )
+    weight = torch.cat([(1 / s**2)[:, None].expand(n, 3) for s in (prior.frame_translation, prior.frame_rotation)], 1)
     # relative: position and rotation of the projector in camera axes
     t = rig.T_camera_projector[:, :3, 3]
     e = torch.cat(
@@ -218,9 +218,7 @@ def adjust(
         H_prior, g_prior = prior_equations(prior, start, rig)
         H = B.T @ (equations.H + noise**2 * H_prior) @ B
         g = B.T @ (equations.g + noise**2 * g_prior)
-        rig, anchors, damping, size = _step(
-            rig, anchors, observations, maps, equations, B, H, g, r, width, damping
-        )
+        rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
         settled = width > _SETTLED * previous and size < _SMALL_STEP * 10 ** (len(stages) - 1)
         if len(stages) > 1 and (settled or iteration + 1 >= settings.rigid_iterations):
             # frames have found each other as they are: now what is wrong inside each of them

@@ -54,9 +54,7 @@ class CoordinateMaps:
         """Number of frames."""
         return len(self.offsets)
 
-    def draw(
-        self, frame: int, count: int, generator: torch.Generator
-    ) -> Float[Tensor, "n 2"]:
+    def draw(self, frame: int, count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
         """Up to `count` random decoded pixel centres of a frame, one for each occupied square of a lattice."""
         w, h = int(self.widths[frame]), int(self.heights[frame])
         start = int(self.offsets[frame])
@@ -101,7 +99,7 @@ class CoordinateMaps:
 
 
 @compiled
-def _fit_planes(values, offsets, widths, heights, frame, uv, plane, valid):  # noqa: ANN001, ANN202
+def _fit_planes(values, offsets, widths, heights, frame, uv, plane, valid):
     """Least-squares planes `c0 + cx dx + cy dy` around each position, from its window's decoded pixels."""
     for k in numba.prange(len(frame)):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]

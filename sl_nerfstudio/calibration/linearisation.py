@@ -123,9 +123,7 @@ def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: Coor
     by_world = by_point @ T_camera_world[:, :3, :3]
     by_delta = torch.cat([by_world, -by_world @ hat(p_world)], -1)
     return Linearisation(
-        residuals=Residuals(
-            own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front
-        ),
+        residuals=Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front),
         own_rho=own_rho,
         own_depth=own_depth,
         cross_pose=torch.cat([by_delta, -by_delta, cross_rho], -1),
@@ -189,9 +187,10 @@ def normal_equations(
     i, j = anchors.frame[observations.anchor], observations.frame
     own_columns = 6 * n + 6 * anchors.frame[:, None] + columns
     cross_columns = torch.cat([6 * i[:, None] + columns, 6 * j[:, None] + columns, 6 * (n + j[:, None]) + columns], -1)
+    each, several, r_of = torch.arange(len(own_weight)), observations.anchor, linear.residuals
     groups = (
-        (linear.own_rho, linear.own_depth, linear.residuals.own, own_weight, own_columns, torch.arange(len(own_weight))),
-        (linear.cross_pose, linear.cross_depth, linear.residuals.cross, cross_weight, cross_columns, observations.anchor),
+        (linear.own_rho, linear.own_depth, r_of.own, own_weight, own_columns, each),
+        (linear.cross_pose, linear.cross_depth, r_of.cross, cross_weight, cross_columns, several),
     )
     for J, J_depth, r, w, cols, anchor in groups:
         wJ = w[:, None, None] * J
@@ -213,7 +212,7 @@ def normal_equations(
 
 
 @compiled
-def _accumulate(J, weight, columns, partial):  # noqa: ANN001, ANN202
+def _accumulate(J, weight, columns, partial):
     """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
     threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]
     for t in numba.prange(threads):

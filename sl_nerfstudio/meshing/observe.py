@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from scipy.ndimage import binary_dilation
-from scipy.ndimage import binary_dilation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_rays
@@ -134,10 +133,10 @@ def look(
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
         vertex, uv_camera, uv_projector, on_mask = vertex[free], uv_camera[free], uv_projector[free], on_mask[free]
-    slope = _slope(
+    jacobian = _jacobian(
         vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector
     )
-    least, most = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, slope)
+    least, most = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
     return View(vertex, ~on_mask, np.where(on_mask, least, np.nan), np.where(on_mask, most, np.nan))
 
 
@@ -166,7 +165,7 @@ def _pixels(
     return uv, in_front.numpy() & (uv >= 0).all(1) & (uv < (device.w, device.h)).all(1)
 
 
-def _slope(
+def _jacobian(
     points: Float[ndarray, "n 3"],
     normals: Float[ndarray, "n 3"],
     uv_camera: Float[ndarray, "n 2"],
@@ -174,34 +173,35 @@ def _slope(
     T_world_camera: Float[ndarray, "4 4"],
     projector: Device,
     T_world_projector: Float[ndarray, "4 4"],
-) -> Float[ndarray, "n"]:
-    """Pattern pixels by which the prediction moves for one camera pixel on the tangent plane, at most MOST_PX."""
+) -> Float[ndarray, "n 2 2"]:
+    """How the predicted coordinate moves, in its first index, with a camera pixel's x and y on the tangent plane."""
     here, _ = _pixels(points, projector, T_world_projector)
-    square = np.zeros(len(points))
+    columns = []
     for step in ((1.0, 0.0), (0.0, 1.0)):
         uv = torch.from_numpy(uv_camera + step)
         origin, direction = pixel_rays(Intrinsics.of(camera, torch.float64), torch.from_numpy(T_world_camera), uv)
         o, d = origin.numpy(), direction.numpy()
         towards = (d * normals).sum(1)
         distance = ((points - o) * normals).sum(1) / np.where(towards < 0, towards, -1e-12)
-        there, valid = _pixels(o + distance[:, None] * d, projector, T_world_projector)
-        square += np.where(valid, ((there - here) ** 2).sum(1), MOST_PX**2)
-    return np.sqrt(square).clip(max=MOST_PX)
+        there, _ = _pixels(o + distance[:, None] * d, projector, T_world_projector)
+        columns.append((there - here).clip(-MOST_PX, MOST_PX))
+    return np.stack(columns, -1)
 
 
 def _offset_from_decoded(
     coords: Float[ndarray, "h w 2"],
     uv_camera: Float[ndarray, "n 2"],
     uv_projector: Float[ndarray, "n 2"],
-    slope: Float[ndarray, "n"],
+    jacobian: Float[ndarray, "n 2 2"],
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
     """Least and greatest distance of predicted from decoded coordinates, NaN if nothing was decoded within a pixel.
 
-    Where four decoded neighbours vary as `slope` lets expect, their bilinear value is compared. Else (an edge, or
-    undecoded neighbours) it is the nearest of nine pixels, and the least distance leaves out what `slope` explains by a
-    pixel being off the vertex.
+    Where four decoded neighbours vary no more than `jacobian` lets expect, their bilinear value is compared. Else (an
+    edge, or undecoded neighbours) it is the best of nine pixels, each against the prediction on the tangent plane; how
+    far the surface may bend away from it, half of the plane's own change, makes the difference of the two distances.
     """
     height, width = coords.shape[:2]
+    slope = np.linalg.norm(jacobian, axis=(1, 2))
 
     def offset(row: Int64[ndarray, "n"], column: Int64[ndarray, "n"]) -> Float[ndarray, "n 2"]:
         return coords[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] - uv_projector
@@ -209,9 +209,11 @@ def _offset_from_decoded(
     column, row = np.floor(uv_camera).astype(np.int64).T
     least, most = np.full(len(row), np.nan), np.full(len(row), np.nan)
     for dy, dx in product((-1, 0, 1), repeat=2):
-        away = np.linalg.norm(np.stack([column + dx, row + dy], 1) + 0.5 - uv_camera, axis=1)
-        distance = np.linalg.norm(offset(row + dy, column + dx), axis=1)
-        least, most = np.fmin(least, (distance - slope * away).clip(min=0)), np.fmin(most, distance)
+        away = np.stack([column + dx, row + dy], 1) + 0.5 - uv_camera
+        plane = (jacobian * away[:, None]).sum(-1)
+        distance = np.linalg.norm(offset(row + dy, column + dx) - plane, axis=1)
+        bend = 0.5 * slope * np.linalg.norm(away, axis=1)
+        least, most = np.fmin(least, (distance - bend).clip(min=0)), np.fmin(most, distance)
     column, row = np.floor(uv_camera - 0.5).astype(np.int64).T
     corners = [offset(row + dy, column + dx) for dy, dx in product((0, 1), repeat=2)]
     spread = np.linalg.norm(np.max(corners, axis=0) - np.min(corners, axis=0), axis=1)

@@ -42,8 +42,12 @@ def measure(
         ok = pixels.decoded
         camera = Intrinsics.of(frame.camera, torch.float64)
         arguments = (
-            camera, T_scene_camera[number], pixels.uv[ok].double(),
-            projector, T_scene_projector[number], pixels.coords[ok].double(),
+            camera,
+            T_scene_camera[number],
+            pixels.uv[ok].double(),
+            projector,
+            T_scene_projector[number],
+            pixels.coords[ok].double(),
         )
         residuals.append(epipolar_residual(*arguments).abs())
         slopes.append(1 / triangulate(*arguments).sigma_depth)

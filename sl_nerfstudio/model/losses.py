@@ -1,4 +1,7 @@
-"""What training minimises. Lengths are in scene units (the object's radius is about one), so nothing depends on the scan's unit."""
+"""What training minimises.
+
+Lengths are in scene units (the object's radius is about one), so nothing depends on the scan's unit.
+"""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,7 +11,10 @@ from torch import Tensor
 def coordinate_loss(
     rendered: Float[Tensor, "rays 2"], measured: Float[Tensor, "rays 2"], counts: Bool[Tensor, "rays"]
 ) -> Float[Tensor, ""]:
-    """Mean L1 distance, in pattern pixels, over the rays that count (the paper, eq. 9: decoding errors are outliers)."""
+    """Mean L1 distance, in pattern pixels, over the rays that count; 0 if none does.
+
+    The paper, eq. 9: L1, because decoding errors are outliers.
+    """
     difference = (rendered - measured.nan_to_num()).abs().sum(-1)
     return (difference * counts).sum() / counts.sum().clamp_min(1)
 
@@ -23,9 +29,7 @@ def eikonal_loss(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     return ((gradient.norm(dim=-1) - 1) ** 2).mean()
 
 
-def surface_loss(
-    sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: float
-) -> Float[Tensor, ""]:
+def surface_loss(sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: float) -> Float[Tensor, ""]:
     """Robust mean of |f| at points that were measured to lie on the surface.
 
     Charbonnier, bent to `width * (1 - exp(-|f| / width))`: linear for errors well below `width`, deaf to

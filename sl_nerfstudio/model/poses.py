@@ -57,7 +57,10 @@ class Poses(nn.Module):
 
 
 class RigPoses(Poses):
-    """`T_scene_camera = exp(delta) base`, `T_camera_projector = exp(rho) base`; delta rotates about the scene's centre."""
+    """`T_scene_camera = exp(delta) base` and `T_camera_projector = exp(rho) base`.
+
+    delta rotates about the scene's centre.
+    """
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See Poses."""

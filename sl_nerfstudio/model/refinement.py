@@ -25,7 +25,9 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
 _HELD_OUT_PER_FRAME = 300
-_GUARD_WIDTH = 4.0  # times the decoding noise: beyond it a residual is a wrong decoding or something else hides the place
+_GUARD_WIDTH = (
+    4.0  # times the decoding noise: beyond it a residual is a wrong decoding or something else hides the place
+)
 
 
 @dataclass

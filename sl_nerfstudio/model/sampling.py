@@ -12,7 +12,8 @@ def sphere_interval(
 ) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"], Bool[Tensor, "rays"]]:
     """Distances at which unit rays enter and leave the scene's sphere, and whether they meet it in front.
 
-    A ray that misses gets the unit-length interval around its nearest point, so that everything stays finite.
+    A ray that misses, or grazes it on a chord shorter than the radius, gets an interval as long as the radius around
+    its point nearest to the centre (in front of the origin), so that everything stays finite.
     """
     b = (origins * directions).sum(-1)
     discriminant = b * b - (origins * origins).sum(-1) + radius * radius
