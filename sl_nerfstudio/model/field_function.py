@@ -96,7 +96,7 @@ def value(
 
     `backward()` adds the table's gradient to `buffer`, if there is one, which is or becomes its `.grad`.
     """
-    return _Value.apply(backend, buffer, p, state.level_weights, state.table, *state.mlp)  # pyright: ignore
+    return _apply(_Value, backend, buffer, state, p)
 
 
 def value_and_gradient(
@@ -106,4 +106,10 @@ def value_and_gradient(
     p: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
-    return _ValueAndGradient.apply(backend, buffer, p.detach(), state.level_weights, state.table, *state.mlp)  # pyright: ignore
+    return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
+
+
+def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
+    """Call an autograd function in the parameters' precision, also where mixed precision is switched on."""
+    with torch.autocast(p.device.type, enabled=False):
+        return function.apply(backend, buffer, p.to(state.table.dtype), state.level_weights, state.table, *state.mlp)

@@ -15,7 +15,7 @@ from nerfstudio.viewer.viewer_elements import ViewerSlider
 from numpy import ndarray
 from torch import Tensor, nn
 
-from sl_nerfstudio.geometry.devices import Intrinsics, project
+from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model import pictures
@@ -23,7 +23,7 @@ from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.direct import direct_losses, measure
 from sl_nerfstudio.model.field import SDFField
 from sl_nerfstudio.model.history import History
-from sl_nerfstudio.model.losses import coordinate_loss, eikonal_loss, pattern_loss
+from sl_nerfstudio.model.losses import coordinate_loss, pattern_loss
 from sl_nerfstudio.model.poses import IndependentPoses, RigPoses
 from sl_nerfstudio.model.refinement import refine, scene_rig, sigmas_in_scan_units
 from sl_nerfstudio.model.rendering import Rendered, render
@@ -43,6 +43,9 @@ class SLModel(Model):
     config: SLModelConfig
     step_now: Tensor
     noise_px: Tensor
+    px_per_length: Tensor
+    projector_params: Tensor
+    pattern: Tensor
 
     def __init__(
         self, config: SLModelConfig, scene_box: SceneBox, num_train_data: int, metadata: dict[str, Any], **kwargs: Any
@@ -57,6 +60,7 @@ class SLModel(Model):
         c = self.config
         self.field = SDFField(c.sdf)
         self.cache = SurfaceCache()
+        self._cache_is_old = False  # after a checkpoint was loaded to be looked at: as old as the last refresh
         rig = scene_rig(self.scan, self.S_scene_world)
         moves = c.train_poses and c.refine_poses != "off"
         make = RigPoses if c.pose_parameters == "rig" else IndependentPoses
@@ -68,7 +72,8 @@ class SLModel(Model):
             shared_projector=c.refine_poses == "rigid-rig",
         )
         projector = Intrinsics.of(self.scan.projector)
-        self._projector_kind, self._projector_distorted = projector.model, projector.distorted
+        self._projector_kind: DeviceKind = projector.model
+        self._projector_distorted = projector.distorted
         self.register_buffer("projector_params", projector.params, persistent=False)
         self.register_buffer("pattern", torch.from_numpy(self.scan.read_pattern()).float(), persistent=False)
         # what a checkpoint must know besides weights: the step, for annealing; the decoding noise, found once
@@ -153,14 +158,14 @@ class SLModel(Model):
         self.step_now.fill_(step)
         c = self.config
         self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
-        if self.training and c.sampling.strategy == "surface" and self._renders(step):
-            if not self.cache.filled or step % _REFRESH_EVERY == 0:
-                self.cache.refresh(self.field)
+        uses_cache = self.training and c.sampling.strategy == "surface" and self._renders(step)
+        if uses_cache and (not self.cache.filled or step % _REFRESH_EVERY == 0):
+            self.cache.refresh(self.field)
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: the levels must be those of that step."""
         self.anneal(step)
-        self.cache.filled = False
+        self._cache_is_old = True
 
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
@@ -220,9 +225,7 @@ class SLModel(Model):
         between = self.cache.look_up((start[:, None] + t[..., None] * to_projector[:, None]).reshape(-1, 3))
         return (between.reshape(t.shape).amin(-1) > 0) & ((normal * to_projector).sum(-1) > 0)
 
-    def measured_coordinates(
-        self, p: Float[Tensor, "n 3"], views: Int[Tensor, "n"]
-    ) -> Float[Tensor, "n 2"]:
+    def measured_coordinates(self, p: Float[Tensor, "n 3"], views: Int[Tensor, "n"]) -> Float[Tensor, "n 2"]:
         """What was decoded at the pixels where frames `views` see scene points; NaN where nothing was."""
         result = torch.full_like(p[:, :2], float("nan"))
         T_camera_scene = inverse(self.poses_scene()[0]).float()
@@ -236,9 +239,7 @@ class SLModel(Model):
             result[mine] = torch.where(inside[:, None], decoded, float("nan"))
         return result
 
-    def render_rays(
-        self, origins: Tensor, directions: Tensor, T_projector_scene: Tensor, jitter: bool
-    ) -> Rendered:
+    def render_rays(self, origins: Tensor, directions: Tensor, T_projector_scene: Tensor, jitter: bool) -> Rendered:
         """Volume render rays as projector coordinates and pattern."""
         t = self._sample(origins, directions, jitter)
         p = origins[:, None] + t[..., None] * directions[:, None]
@@ -252,8 +253,9 @@ class SLModel(Model):
         count = s.samples if jitter else max(s.samples, _EVAL_SAMPLES)
         if s.strategy == "uniform":
             return uniform_samples(near, far, count, jitter)
-        if not self.cache.filled:
+        if not self.training and (self._cache_is_old or not self.cache.filled):
             self.cache.refresh(self.field)
+            self._cache_is_old = False
         t, found = first_crossing(self.cache.look_up, origins, directions, near, far)
         half = s.half_width / self.kappa + self.cache.cell
         low, high = torch.where(found, t - half, near), torch.where(found, t + half, far)
@@ -327,10 +329,14 @@ def paper_model() -> SLModelConfig:
     """The paper's: sphere start, independent poses trained by Adam, all levels, uniform samples, no direct terms."""
     c = SLModelConfig(adjust_poses=False, train_poses=True, pose_parameters="independent", warm_start=0.0)
     losses = replace(
-        c.losses, coordinates=0.0, coordinates_per_pixel=1000 / 65535, pattern=0.05, eikonal=0.01, surface=0.0, free_space=0.0
+        c.losses,
+        coordinates=0.0,
+        coordinates_per_pixel=1000 / 65535,
+        pattern=0.05,
+        eikonal=0.01,
+        surface=0.0,
+        free_space=0.0,
     )
     sampling = replace(c.sampling, strategy="uniform", samples=64, render_rays=2024, eikonal_points=4096)
-    annealing = replace(
-        c.annealing, kappa_start=32.0, kappa_end=200.0, kappa_growth="linear", coarse_to_fine=False
-    )
+    annealing = replace(c.annealing, kappa_start=32.0, kappa_end=200.0, kappa_growth="linear", coarse_to_fine=False)
     return replace(c, losses=losses, sampling=sampling, annealing=annealing)

@@ -42,8 +42,8 @@ class SLPipeline(VanillaPipeline):
 
     datamanager: SLDataManager
 
-    def __init__(self, config: SLPipelineConfig, device: str, **kwargs: Any) -> None:
-        super().__init__(config, device, **kwargs)
+    def __init__(self, config: SLPipelineConfig, device: str | torch.device, **kwargs: Any) -> None:
+        super().__init__(config, str(device), **kwargs)
         self._seed = torch.initial_seed()
         loaded = self.datamanager.dataparser.loaded
         self.scene_view = SceneView(loaded.scan, loaded.S_scene_world, lambda: self._sl_model.poses_scene())
@@ -75,19 +75,6 @@ class SLPipeline(VanillaPipeline):
         super().load_pipeline(loaded_state, step)
         if self.test_mode != "val":
             self.datamanager.stand_at(self._sl_model.poses_scene()[0])
-
-    @torch.no_grad()
-    def get_eval_loss_dict(self, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs, losses and metrics of held-out pixels; the losses are what the metrics lack of a perfect fit."""
-        self.eval()
-        rays, batch = self.datamanager.next_eval(step)
-        outputs = self._outputs(rays)
-        metrics = self.model.get_metrics_dict(outputs, batch)
-        losses = {"pattern": 1 - metrics["pattern_cosine"]}
-        if "coordinate_px" in metrics:  # at least one of the pixels is decoded
-            losses["coordinate_px"] = metrics["coordinate_px"]
-        self.train()
-        return outputs, losses, metrics
 
     @torch.no_grad()
     def get_average_eval_image_metrics(

@@ -12,15 +12,16 @@ _AT_ONCE = 131072
 
 
 class SurfaceCache(nn.Module):
-    """Values of a field on a grid of [-1, 1]^3. Not part of a checkpoint: it is rebuilt from the field."""
+    """Values of a field on a grid of [-1, 1]^3. Part of a checkpoint: a resumed run samples as it would have."""
 
     values: Tensor
+    filled: Tensor
 
     def __init__(self, resolution: int = 96) -> None:
         super().__init__()
         self.resolution = resolution
-        self.register_buffer("values", torch.zeros(resolution, resolution, resolution), persistent=False)
-        self.filled = False
+        self.register_buffer("values", torch.zeros(resolution, resolution, resolution))
+        self.register_buffer("filled", torch.tensor(False))
 
     @property
     def cell(self) -> float:
@@ -39,7 +40,7 @@ class SurfaceCache(nn.Module):
         for part in index.split(_AT_ONCE):
             xyz = torch.stack([part % n, part // n % n, part // (n * n)], -1)
             flat[part] = field.sdf(xyz * self.cell - 1.0)
-        self.filled = True
+        self.filled.fill_(True)
 
     def look_up(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Trilinear values at points; the border's value outside."""

@@ -26,26 +26,26 @@ def pack_grid(layout: GridLayout, state: FieldState) -> Grid:
 
 def pack_network(layout: GridLayout, state: FieldState, knee: float) -> Network:
     """Copies of the MLP's weights, padded to multiples of 16, in both orders."""
-    matrices, biases = [w.detach() for w in state.mlp[0::2]], [b.detach() for b in state.mlp[1::2]]
+    matrices, biases = [w.detach().numpy() for w in state.mlp[0::2]], [b.detach().numpy() for b in state.mlp[1::2]]
     width, layers = matrices[0].shape[0], len(matrices) - 1
     depth, hidden = _padded(FIRST + layout.width), _padded(width)
-    first = torch.zeros(depth, hidden)
-    first[:3, :width] = matrices[0][:, :3].T
-    first[3, :width] = biases[0]
-    first[FIRST : FIRST + layout.width, :width] = matrices[0][:, 3:].T
-    middle = torch.zeros(layers - 1, hidden, hidden)
-    bias = torch.zeros(layers - 1, hidden)
+    first = np.zeros((hidden, depth), np.float32)  # (output, input), as torch has it
+    first[:width, :3] = matrices[0][:, :3]
+    first[:width, 3] = biases[0]
+    first[:width, FIRST : FIRST + layout.width] = matrices[0][:, 3:]
+    middle = np.zeros((layers - 1, hidden, hidden), np.float32)
+    bias = np.zeros((layers - 1, hidden), np.float32)
     for i in range(1, layers):
-        middle[i - 1, :width, :width] = matrices[i].T
+        middle[i - 1, :width, :width] = matrices[i]
         bias[i - 1, :width] = biases[i]
-    last = torch.zeros(hidden + 1)
+    last = np.zeros(hidden + 1, np.float32)
     last[:width] = matrices[-1][0]
     last[hidden] = biases[-1][0]
     on = np.flatnonzero(state.level_weights.numpy())
     return Network(
-        weights=Weights(*(t.numpy().reshape(-1) for t in (first, middle, bias, last))),
-        first_transposed=first.T.contiguous().numpy().reshape(-1),
-        middle_transposed=middle.mT.contiguous().numpy().reshape(-1),
+        weights=Weights(first.T.ravel(), middle.swapaxes(1, 2).ravel(), bias.ravel(), last),
+        first_transposed=first.ravel(),
+        middle_transposed=middle.ravel(),
         depth=depth,
         hidden=hidden,
         layers=layers,
@@ -64,14 +64,15 @@ def unpack_gradients(
 ) -> tuple[Tensor, ...]:
     """Sum of the MLP's gradients, in the shapes and the order of the parameters."""
     width, depth, hidden = state.mlp[0].shape[0], network.depth, network.hidden
-    first, middle, bias, last = (torch.from_numpy(np.sum(part, axis=0)) for part in zip(*parts, strict=True))
-    first = first.view(depth, hidden)[:, :width]
-    middle = middle.view(-1, hidden, hidden)[:, :width, :width]
-    bias = bias.view(-1, hidden)[:, :width]
-    result = [torch.cat([first[:3], first[FIRST : FIRST + layout.width]]).T.contiguous(), first[3].clone()]
+    sums = Weights(*(parts[0] if len(parts) == 1 else sum(parts[1:], parts[0]) for parts in zip(*parts, strict=True)))
+    first = sums.first.reshape(depth, hidden)[:, :width].T
+    middle = sums.middle.reshape(-1, hidden, hidden)[:, :width, :width].swapaxes(1, 2)
+    bias = sums.bias.reshape(-1, hidden)[:, :width]
+    result = [np.concatenate([first[:, :3], first[:, FIRST : FIRST + layout.width]], 1), first[:, 3]]
     for i in range(network.layers - 1):
-        result += [middle[i].T.contiguous(), bias[i].clone()]
-    return (*result, last[None, :width].clone(), last[hidden:].clone())
+        result += [middle[i], bias[i]]
+    result += [sums.last[None, :width], sums.last[hidden:]]
+    return tuple(torch.from_numpy(np.ascontiguousarray(x)) for x in result)
 
 
 def _padded(n: int) -> int:
