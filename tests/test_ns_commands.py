@@ -354,6 +354,13 @@ def test_export_cameras_gives_the_refined_poses(
         np.testing.assert_allclose([f["transform"] for f in frames], refined[:, :3].numpy(), atol=1e-5)
 
 
+def test_export_marching_cubes_finds_what_it_asks_for(pipeline: SLPipeline) -> None:
+    """The command itself needs CUDA, whatever the machine; these are the two things it takes from a model."""
+    assert hasattr(pipeline.model.config, "sdf_field")
+    p = torch.rand(100, 3) * 2 - 1
+    torch.testing.assert_close(pipeline._sl_model.field.forward_geonetwork(p)[:, 0], pipeline._sl_model.sdf(p))
+
+
 def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     call(
         ns_render.entrypoint,

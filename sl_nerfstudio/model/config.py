@@ -80,6 +80,11 @@ class SLModelConfig(ModelConfig):
     adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
     """Size of the joint adjustment."""
 
+    @property
+    def sdf_field(self) -> FieldConfig:
+        """`sdf` under the name that `ns-export marching-cubes` looks for."""
+        return self.sdf
+
 
 def _model_class() -> type:
     from sl_nerfstudio.model.model import SLModel

@@ -96,7 +96,7 @@ class SDFField(nn.Module):
     @property
     def hidden(self) -> list[nn.Linear]:
         """The MLP's hidden layers."""
-        return [layer for layer in self.mlp[:-1] if isinstance(layer, nn.Linear)]
+        return [layer for layer in list(self.mlp)[:-1] if isinstance(layer, nn.Linear)]
 
     @property
     def last(self) -> nn.Linear:
@@ -118,6 +118,10 @@ class SDFField(nn.Module):
         """Signed distance; differentiable (once) with respect to the parameters and `p`."""
         state = self._state()
         return value(self._backend(state), self._buffer(state), state, p)
+
+    def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+        """`sdf` as a column, under the name by which `ns-export marching-cubes` asks for it."""
+        return self.sdf(p)[:, None]
 
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
