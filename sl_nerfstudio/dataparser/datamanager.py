@@ -122,7 +122,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
 
         nerfstudio's exporters and viewer take poses from the data sets' cameras and know no corrections.
         """
-        T_scene_camera = T_scene_camera.detach().to(self.device)
+        T_scene_camera = T_scene_camera.detach().to(self.device, torch.float32)
         outputs = (self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs)
         loaders = [getattr(self, name, None) for name in ("fixed_indices_eval_dataloader", "eval_dataloader")]
         for holder in (*outputs, self.train_dataset, self.eval_dataset, *filter(None, loaders)):

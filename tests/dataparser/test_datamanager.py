@@ -178,8 +178,7 @@ def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
     T = torch.eye(4).repeat(3, 1, 1)
     T[:, :3] = m.train_dataset.cameras.camera_to_worlds
     T[:, 0, 3] += 0.125
-    m.stand_at(T.requires_grad_())
-    T = T.detach()
+    m.stand_at(T.double().requires_grad_())
     rays, batch = m.next_train(0)
     frame = batch["indices"][:, 0]
     assert rays.metadata["sl_refined"].all()
