@@ -1,0 +1,82 @@
+"""The same scan in other units, or in a turned and shifted world, gives the same surface."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.scene_box import SceneBox
+from scipy.spatial import KDTree
+
+from sl_nerfstudio.dataparser.dataparser import load_scan
+from sl_nerfstudio.dataparser.scene_rays import SceneRays
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.trim import trim_to_observed
+from sl_nerfstudio.model.config import SLModelConfig
+from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.scan import read_ground_truth
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+STEPS = 60
+
+
+def small_scan(folder: Path, **options) -> Path:
+    synthesise(SynthConfig(frames=6, resolution=100, seed=3, **options), folder)
+    return folder
+
+
+def surface(folder: Path) -> np.ndarray:
+    """Vertices of the observed surface after a short run, in world units."""
+    loaded = load_scan(folder)
+    config = SLModelConfig(schedule_iterations=STEPS)
+    config.adjustment.anchors_per_frame = 100
+    config.sdf.levels, config.sdf.max_resolution, config.sdf.hidden = 3, 64, 32
+    torch.manual_seed(0)
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    metadata = {"sl_scan": loaded.scan, "sl_S_scene_world": loaded.S_scene_world}
+    model = SLModel(config, box, len(loaded.scan.frames), metadata=metadata)
+    model.train()
+    model.start(loaded.samples)
+    rays = SceneRays(loaded.scan, torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.T_world_camera)).float())
+    optimizer = torch.optim.Adam([p for group in model.get_param_groups().values() for p in group], lr=2e-3)
+    for step in range(STEPS):
+        torch.manual_seed(step)
+        model.anneal(step)
+        pixels = loaded.samples.at(loaded.samples.draw(512))
+        decoded, pattern = pixels.decoded[:, None], pixels.pattern[:, None]
+        batch = {"coords": pixels.coords, "decoded": decoded, "pattern": pattern}
+        losses = model.get_loss_dict(model(rays(pixels.frame, pixels.uv)), batch)
+        optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(losses.values())).sum().backward()
+        optimizer.step()
+    mesh = extract_mesh(model.sdf, 64)
+    world = Mesh(loaded.S_scene_world.inverse().points(mesh.vertices), mesh.faces)
+    return trim_to_observed(world, loaded.scan, *model.poses()).mesh.vertices
+
+
+@pytest.fixture(scope="module")
+def in_mm(tmp_path_factory) -> np.ndarray:
+    return surface(small_scan(tmp_path_factory.mktemp("units") / "mm"))
+
+
+def share_apart(a: np.ndarray, b: np.ndarray) -> float:
+    """99 % quantile of the distances between two vertex sets, in shares of the first one's size."""
+    size = np.linalg.norm(np.ptp(a, axis=0))
+    both = np.concatenate([KDTree(a).query(b)[0], KDTree(b).query(a)[0]])
+    return float(np.quantile(both, 0.99) / size)
+
+
+@pytest.mark.parametrize(("units", "mm"), [("cm", 10.0), ("m", 1000.0)])
+def test_units_do_not_matter(in_mm, tmp_path, units, mm):
+    other = surface(small_scan(tmp_path / units, units=units)) * mm
+    assert share_apart(in_mm, other) < 0.01
+
+
+def test_a_turned_and_shifted_world_does_not_matter(in_mm, tmp_path):
+    folder = small_scan(tmp_path / "turned", world_turn=5)
+    turned = surface(folder)
+    truth, start = (read_ground_truth(load_scan(f).scan) for f in (folder, small_scan(tmp_path / "plain")))
+    back = start.T_world_camera[0] @ np.linalg.inv(truth.T_world_camera[0])
+    assert share_apart(in_mm, turned @ back[:3, :3].T + back[:3, 3]) < 0.01
