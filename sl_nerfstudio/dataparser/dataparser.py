@@ -48,7 +48,7 @@ class SLDataParser(DataParser):
     def __init__(self, config: SLDataParserConfig) -> None:
         super().__init__(config=config)
         # An attribute, because nerfstudio overwrites it where it wants no images resized.
-        self.downscale_factor: float | None = config.downscale_factor
+        self.downscale_factor: float | int | None = config.downscale_factor
 
     @property
     def loaded(self) -> LoadedScan:
@@ -67,7 +67,7 @@ class SLDataParser(DataParser):
         )
 
 
-def scene_cameras(scan: Scan, S_scene_world: Similarity, downscale_factor: float | None = None) -> Cameras:
+def scene_cameras(scan: Scan, S_scene_world: Similarity, downscale_factor: float | int | None = None) -> Cameras:
     """The scan's cameras in the normalised scene; `metadata["sl_view"]` is the number of the frame."""
     poses = torch.from_numpy(S_scene_world.poses(scan.T_world_camera)[:, :3]).float()
     devices = [frame.camera for frame in scan.frames]

@@ -310,7 +310,7 @@ class SLModel(Model):
         return torch.cat([outputs[output_name], outputs["accumulation"]], -1)
 
     def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Rendered beside captured, for one whole frame."""
         return pictures.image_metrics_and_images(outputs, batch)

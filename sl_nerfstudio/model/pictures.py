@@ -78,7 +78,7 @@ def fit_metrics(outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, 
 
 @torch.no_grad()
 def image_metrics_and_images(
-    outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    outputs: dict[str, Tensor], batch: dict[str, Any]
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
     """Captured beside rendered, [H, 2 W, 3], and the images of the other outputs."""
     captured = batch["image"].to(outputs["rgb"].device)[..., :3]
