@@ -264,3 +264,14 @@ def test_numba_that_cannot_serve_is_refused_by_name_and_replaced_by_auto() -> No
 def test_auto_takes_the_compiled_kernels_on_a_cpu() -> None:
     p = points_around(10).float()
     assert torch.equal(make_field("auto").sdf(p), make_field("numba").sdf(p))
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_mixed_precision_does_not_reach_the_field(backend: str) -> None:
+    field, p = make_field(backend), points_around(50).float()
+    exact = field.sdf(p)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed, gradient = field.sdf_and_gradient(p)
+    torch.testing.assert_close(mixed, exact)
+    gradient.square().sum().backward()
+    assert field.encoding.table.grad is not None and field.encoding.table.grad.dtype == torch.float32

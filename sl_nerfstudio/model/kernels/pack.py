@@ -1,5 +1,7 @@
 """From torch's parameters to the kernels' layout, and gradients back."""
 
+from functools import reduce
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -64,7 +66,7 @@ def unpack_gradients(
 ) -> tuple[Tensor, ...]:
     """Sum of the MLP's gradients, in the shapes and the order of the parameters."""
     width, depth, hidden = state.mlp[0].shape[0], network.depth, network.hidden
-    sums = Weights(*(parts[0] if len(parts) == 1 else sum(parts[1:], parts[0]) for parts in zip(*parts, strict=True)))
+    sums = Weights(*(reduce(np.add, part) for part in zip(*parts, strict=True)))
     first = sums.first.reshape(depth, hidden)[:, :width].T
     middle = sums.middle.reshape(-1, hidden, hidden)[:, :width, :width].swapaxes(1, 2)
     bias = sums.bias.reshape(-1, hidden)[:, :width]

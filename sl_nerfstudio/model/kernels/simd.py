@@ -29,6 +29,7 @@ WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 """Shape of a tile: up to 3 vectors of WIDTH numbers times ROWS rows (24 of 32 registers, or 12 of 16)."""
 
 
+_njit: Any = njit  # its overloads do not know of options in a dictionary
 _OPTIONS = {"nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
 
 
@@ -37,12 +38,12 @@ def part(function: Callable[..., Any]) -> Any:
 
     Run-time type checkers wrap functions before this decorator sees them; numba wants the bare one.
     """
-    return njit(inspect.unwrap(function), no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+    return _njit(inspect.unwrap(function), no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile with numba: no GIL, fused multiply-add allowed, kept on disk for the next start."""
-    dispatcher: Any = njit(inspect.unwrap(function), no_cfunc_wrapper=True, **_OPTIONS)
+    dispatcher = _njit(inspect.unwrap(function), no_cfunc_wrapper=True, **_OPTIONS)
     try:
         dispatcher.enable_caching()
     except RuntimeError:  # no folder to write to: compile at every start
