@@ -16,7 +16,6 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
 
-MASK_MARGIN = 1  # pixels around the mask that still count: a border pixel is only partly covered
 LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
 LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""

@@ -14,8 +14,9 @@ from sl_nerfstudio.meshing.observe import Occluder, Votes, collect_votes
 from sl_nerfstudio.scan.types import Scan
 
 HOLE_SHARE, SILENT_SHARE, SPECK_SHARE = 2e-3, 2e-2, 1e-4
-"""Of the kept area: smaller gaps inside the observed surface stay closed (larger ones where the pattern was seen but not
-decoded), smaller pieces apart from it are dropped."""
+"""Of the kept area: smaller gaps inside the observed surface stay closed (larger ones where the pattern was seen but
+not decoded), smaller pieces apart from it are dropped."""
+TINY = 3  # vertices: so small a gap is closed whatever frames say, wrong decodings meet by chance
 BADLY_DECODED = 0.25  # share of undecoded sightings above which a mask counts as evidence
 _LEAST_SHARE = 0.1  # observed vertices, of those seen: with fewer, the agreement is chance
 _SECOND_LOOK_SHARE = 1e-3  # denied vertices, of all, that are removed from the occluders before looking again
@@ -28,7 +29,7 @@ class Trimmed:
     mesh: Mesh
     total: int
     unseen: int  # no frame saw them
-    denied: int  # frames saw something else there
+    denied: int  # frames saw something else there, or nothing
     closed: int  # kept although not observed: small gaps inside the observed surface
     specks: int  # pieces (not vertices) that were too small, or that no frame confirmed
     residual_px: float  # between predicted and decoded coordinates, median over frames; NaN if nothing was decoded
@@ -42,9 +43,9 @@ def trim_to_observed(
 ) -> Trimmed:
     """Keep the triangles of a mesh in world units whose corners at least one frame observed.
 
-    A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask
-    (within a pixel) and inside the pattern, and whose predicted pattern coordinate is the decoded one, or where nothing
-    was decoded.
+    A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask and
+    inside the pattern, and whose predicted pattern coordinate is the decoded one. Frames that decoded another one, or
+    where the pattern should fall on the vertex and does not, speak against it: the majority counts.
     Poses default to the scan's own; give the refined ones, in the order of the frames, if the mesh was made with them.
     Raises UserError if nothing was observed.
     """
@@ -111,7 +112,7 @@ def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarra
 
 
 def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[ndarray, "v"]:
-    """Vertices of small unobserved patches inside the observed surface, unless several frames deny them."""
+    """Vertices of small unobserved patches inside the observed surface: tiny, or not denied by several frames."""
     edges = _edges(mesh)
     gap = ~observed
     count, label = _components(len(gap), edges[gap[edges].all(1)])
@@ -127,7 +128,8 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[
     several = np.bincount(label[gap], (votes.denied[gap] > 1).astype(float), count)
     silent = np.bincount(label[gap], (votes.silent[gap] > 0).astype(float), count)
     share = np.where(silent > 0.5 * members, SILENT_SHARE, HOLE_SHARE)
-    good = beside & (area < share * areas[~touched].sum()) & (several <= 0.5 * members)
+    allowed = (several <= 0.5 * members) | (members <= TINY)
+    good = beside & (area < share * areas[~touched].sum()) & allowed
     return gap & good[label]
 
 
