@@ -72,7 +72,7 @@ def icp(
         bounded = float(np.clip(np.log(proposed.scale / start.scale), -_MAX_LOG_SCALE, _MAX_LOG_SCALE))
         S = Similarity(start.scale * float(np.exp(bounded)), proposed.R, proposed.t)
         change = np.abs(S.points(points) - moved).max()
-        if change < 1e-6 * target.diagonal:
+        if change < 1e-5 * target.diagonal:
             converged = True
             break
     final = np.sort(target.distance(S.points(points)))

@@ -72,7 +72,7 @@ def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, 
         return _svg(figure, title)
 
 
-def curve(title: str, step: Sequence[float], values: Sequence[float]) -> str:
+def curve(title: str, step: Sequence[float | int | None], values: Sequence[float | int | None]) -> str:
     """A convergence curve; logarithmic where positive values span more than a factor of 20."""
     import matplotlib
 

@@ -103,13 +103,23 @@ def score_alignments(
         S = Similarity.identity()
         if name != "none":
             with_scale = name == "similarity"
-            starts = [Similarity.identity()]
-            if poses is not None and true_poses is not None:
-                starts.append(align_poses(poses.stacked(), true_poses.stacked(), with_scale))
+            starts = _starts(poses, true_poses, with_scale, points, 1e-6 * surface.diagonal)
             ends = [reference.align(surface, points, start, with_scale) for start in starts]
             S = min(ends, key=lambda end: end.residual).S_target_source
         scores[name] = score_surface(surface, points, reference, S, distances)
     return scores
+
+
+def _starts(
+    poses: Poses | None, true_poses: Poses | None, with_scale: bool, points: Float[ndarray, "n 3"], tolerance: float
+) -> list[Similarity]:
+    """Where ICP starts from; one start only if the poses say that the result lies where it should."""
+    identity = Similarity.identity()
+    if poses is None or true_poses is None:
+        return [identity]
+    by_poses = align_poses(poses.stacked(), true_poses.stacked(), with_scale)
+    apart = np.abs(by_poses.points(points) - points).max() > tolerance
+    return [identity, by_poses] if apart else [identity]
 
 
 def mesh_reference(mesh: Mesh, scan: Scan, poses: Poses, samples: int = 100_000, seed: int = 0) -> MeshReference:

@@ -63,7 +63,7 @@ def judge(evaluation: Evaluation) -> Verdict:
             "look at the pictures below: blur, ambient light or a wrong pattern file lower it",
         ),
         _check(
-            "Coverage", 100 * fit.hit_share, "{:.1f} %", 97, 85, "≥ {} %",
+            "Coverage", 100 * fit.hit_share, "{:.1f} %", 97.0, 85.0, "≥ {} %",
             "Share of the pixels with pattern on the object for which the mesh has surface.",
             "export with --keep-unobserved to see whether surface was cut away; else add frames that see the missing "
             "parts",
@@ -113,7 +113,7 @@ def _worst_frame(evaluation: Evaluation) -> Check:
     worst, name = max(known, default=(math.nan, ""))
     ratio = worst / evaluation.fit.coordinate_px_median if known else math.nan
     return _check(
-        "Worst frame", ratio, f"{{:.1f}} times the median ({name})", 2, 4, "≤ {} times",
+        "Worst frame", ratio, f"{{:.1f}} times the median ({name})", 2.0, 4.0, "≤ {} times",
         "Coordinate residual of the worst frame against the whole scan: one frame must not contradict the others.",
         f"look at {name or 'it'} below; if its pose or decoding is wrong, leave the frame out and train again",
     )  # fmt: skip
@@ -122,7 +122,7 @@ def _worst_frame(evaluation: Evaluation) -> Check:
 def _geometry(evaluation: Evaluation) -> Check:
     fit = evaluation.fit
     return _check(
-        "Ray angle", fit.ray_angle_deg, "{:.1f}°", 8, 4, "≥ {}°",
+        "Ray angle", fit.ray_angle_deg, "{:.1f}°", 8.0, 4.0, "≥ {}°",
         f"Angle between camera ray and projector ray on the surface (median). Here one pattern pixel is worth "
         f"{fit.depth_per_px:.3g} {evaluation.units} of depth: a low residual proves little where that is much.",
         "hold the projector further from the camera in the next scan, or trust the calibrated relative pose "

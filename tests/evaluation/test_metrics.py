@@ -5,6 +5,7 @@ from sl_nerfstudio.evaluation.metrics import DistanceStats, default_f_distances,
 from sl_nerfstudio.evaluation.reference import MeshReference, PointReference
 from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
+
 from .shapes import blob, known_similarity, sphere
 
 
@@ -86,7 +87,12 @@ def test_signed_distance_is_negative_inside() -> None:
 
 @pytest.mark.parametrize(
     ("size", "expected"),
-    [(110.0, (0.1, 0.2, 0.5, 1.0)), (0.11, (1e-4, 2e-4, 5e-4, 1e-3)), (60.0, (0.05, 0.1, 0.25, 0.5)), (1.0, (1e-3, 2e-3, 5e-3, 1e-2))],
+    [
+        (110.0, (0.1, 0.2, 0.5, 1.0)),
+        (0.11, (1e-4, 2e-4, 5e-4, 1e-3)),
+        (60.0, (0.05, 0.1, 0.25, 0.5)),
+        (1.0, (1e-3, 2e-3, 5e-3, 1e-2)),
+    ],
 )
 def test_default_distances_are_round_and_follow_the_unit(size: float, expected: tuple[float, ...]) -> None:
     assert default_f_distances(size) == expected

@@ -3,6 +3,7 @@ import pytest
 
 from sl_nerfstudio.evaluation.poses import compare_poses
 from sl_nerfstudio.geometry.similarity import Similarity
+
 from .shapes import turn
 from .test_alignment import random_poses
 

@@ -3,6 +3,7 @@ import pytest
 
 from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.meshing.mesh import Mesh
+
 from .shapes import blob, sphere
 
 
@@ -23,7 +24,9 @@ def test_distance_is_to_the_triangles_not_to_their_corners_in_any_unit_and_anywh
 def test_samples_are_spread_evenly_by_area_and_repeat_with_the_seed() -> None:
     small = square(0.0, 1.0)
     large = square(5.0, 3.0)  # nine times the area, the same number of triangles
-    surface = Surface(Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4])))
+    surface = Surface(
+        Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4]))
+    )
     points, normals = surface.sample(20_000, seed=3)
     assert surface.area == pytest.approx(4 + 36)
     assert (points[:, 2] == 0).sum() == pytest.approx(2000, abs=2)  # stratified: exact up to a point at each end

@@ -1,0 +1,210 @@
+import json
+import re
+from datetime import datetime
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.evaluation.charts import nice_limit
+from sl_nerfstudio.evaluation.evaluate import Poses, evaluate, mesh_reference
+from sl_nerfstudio.evaluation.pictures import ColourScale, View, pixel_map, render, views_of
+from sl_nerfstudio.evaluation.plot3d import decimated
+from sl_nerfstudio.evaluation.reference import PointReference
+from sl_nerfstudio.evaluation.report import ReportInput, render_report
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.thumbnails import ThumbnailCollector
+from sl_nerfstudio.scan import PoseSigma, read_scan
+
+from .faceted_scan import FacetedScan
+from .shapes import blob, sphere
+
+TRAINING = {
+    "settings": {"method": "sl-neus", "model": {"refine_poses": "free", "note": "<script>alert(1)</script>"}},
+    "versions": {"torch": "2.11"},
+    "curves": {"step": [0, 100, 200], "loss": [5.0, 0.5, 0.1], "coordinate_px": [20.0, None, 0.4]},
+}
+
+
+class Page(HTMLParser):
+    """Collects what a browser would load, ids, and pictures without a text for those who do not see them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.ids: list[str] = []
+        self.anchors: list[str] = []
+        self.silent: list[str] = []
+        self.text: list[str] = []
+        self._skip = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {key: value or "" for key, value in attrs}
+        self._skip = tag in ("script", "style")
+        self.loaded += [given[key] for key in ("src", "srcset", "data", "poster", "action") if key in given]
+        link = given.get("href", given.get("xlink:href", ""))
+        if link.startswith("#"):
+            self.anchors.append(link[1:])
+        elif link:
+            self.loaded.append(link)
+        if "id" in given:
+            self.ids.append(given["id"])
+        if (tag == "img" and not given.get("alt")) or (tag == "svg" and not given.get("aria-label")):
+            self.silent.append(str(attrs)[:80])
+
+    def handle_endtag(self, tag: str) -> None:
+        self._skip = False
+
+    def handle_data(self, data: str) -> None:
+        if not self._skip:
+            self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def full_report(clean_scan: Path) -> str:
+    """A report with every section filled."""
+    scan, made = read_scan(clean_scan), FacetedScan()
+    true = Poses(*made.true_poses())
+    moved = Poses(true.T_world_camera.copy(), true.T_world_projector)
+    moved.T_world_camera[1, :3, 3] += 0.5
+    thumbnails = ThumbnailCollector()
+    evaluation = evaluate(
+        made.truth(),
+        scan,
+        moved,
+        mesh_reference(made.truth(), scan, true, 5000),
+        true,
+        samples=5000,
+        on_frame=thumbnails,
+    )
+    sigma = PoseSigma(0.11, 0.022, 0.033, 0.044)
+    return render_report(
+        ReportInput(
+            evaluation, scan, made.truth(), moved, thumbnails.frames, "<mesh & co>.ply", "refined/transforms.json",
+            [sigma, None, sigma], TRAINING, datetime(2026, 1, 2, 3, 4),
+        )
+    )  # fmt: skip
+
+
+def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) -> None:
+    page = Page(full_report)
+    assert page.loaded and all(address.startswith("data:image/") for address in page.loaded)
+    style = "".join(re.findall(r"<style>(.*?)</style>", full_report, flags=re.S))
+    assert "@import" not in style and "url(" not in style
+    addresses = set(re.findall(r"(?:https?:)?//[a-z0-9-]+(?:\.[a-z0-9-]+)+[^\s\"'<>]*", full_report))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, not addresses
+    assert "default-src 'none'" in full_report  # and the browser enforces it
+    assert len(full_report) < 10e6
+
+
+def test_report_is_accessible_and_its_links_lead_somewhere(full_report: str) -> None:
+    page = Page(full_report)
+    assert page.silent == []
+    assert len(page.ids) == len(set(page.ids))
+    assert set(page.anchors) <= set(page.ids)
+    assert '<html lang="en">' in full_report
+
+
+def test_report_tells_everything(full_report: str) -> None:
+    text = " ".join(" ".join(Page(full_report).text).split())
+    for what in (
+        "Scan report: scan", "<mesh & co>.ply", "refined/transforms.json", "2026-01-02 03:04", "What it means",
+        "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
+        "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
+        "known (by construction)", "σ frame",
+    ):  # fmt: skip
+        assert what in text, what
+    assert "<script>alert(1)" not in full_report  # only escaped
+    assert full_report.count('class="maps"') == 3
+
+
+def test_interactive_surface_is_complete(full_report: str) -> None:
+    found = re.search(r'<script type="application/json" id="figure">(.*?)</script>', full_report, flags=re.S)
+    assert found
+    figure = json.loads(found.group(1))
+    assert [trace["type"] for trace in figure["data"]] == ["mesh3d", "scatter3d", "scatter3d"]
+    assert "intensity" in figure["data"][0]
+
+
+def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:
+    scan, made = read_scan(clean_scan), FacetedScan()
+    poses = Poses(scan.T_world_camera, scan.T_world_projector)
+    thumbnails = ThumbnailCollector()
+    evaluation = evaluate(made.truth(), scan, poses, on_frame=thumbnails)
+    page = render_report(ReportInput(evaluation, scan, made.truth(), poses, thumbnails.frames, "mesh.ply", ""))
+    text = " ".join(" ".join(Page(page).text).split())
+    assert "No truth or reference is known for this scan" in text
+    assert "The scan's own poses were evaluated" in text
+    assert "No training.json lies beside the poses file" in text
+    assert "Accuracy" not in text
+
+
+def test_report_with_reference_points_shows_signed_offsets(clean_scan: Path) -> None:
+    scan, made = read_scan(clean_scan), FacetedScan()
+    points = Surface(made.truth()).sample(5000, 0)[0]
+    poses = Poses(scan.T_world_camera, scan.T_world_projector)
+    thumbnails = ThumbnailCollector()
+    evaluation = evaluate(
+        made.truth(), scan, poses, PointReference(points, "some points"), samples=5000, on_frame=thumbnails
+    )
+    page = render_report(ReportInput(evaluation, scan, made.truth(), poses, thumbnails.frames, "mesh.ply", ""))
+    text = " ".join(" ".join(Page(page).text).split())
+    assert "Distance from reference" in text and "some points" in text
+
+
+def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
+    truth, result = Surface(sphere(10.0, 100)), Surface(sphere(10.25, 100))
+    reference = PointReference(truth.sample(3000, 0)[0], "")
+    from sl_nerfstudio.geometry.similarity import Similarity
+
+    errors = reference.surface_errors(result, Similarity.identity(), result.sample(500, 1)[0])
+    np.testing.assert_allclose(errors, 0.25, atol=0.02)
+
+
+def test_picture_shows_the_near_side_upright_and_in_colour() -> None:
+    surface = Surface(sphere(10.0, 40))
+    red_top = np.where(surface.vertices[:, 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    picture = render(surface, View(np.array([0.0, -1, 0]), np.array([0.0, 0, 1])), red_top, height=60, width=80)
+    assert picture.shape == (60, 80, 3)
+    np.testing.assert_array_equal(picture[0, 0], 1.0)  # white outside
+    assert picture[15, 40, 0] > 0.3 and picture[15, 40, 2] < 0.05
+    assert picture[45, 40, 2] > 0.15 and picture[45, 40, 0] < 0.05
+    inside = (picture != 1).any(2)
+    assert inside.sum() == pytest.approx(np.pi * (0.47 * 60) ** 2, rel=0.05)
+
+
+def test_views_are_the_most_different_cameras() -> None:
+    poses = FacetedScan(frames=9).true_poses()[0]
+    views = views_of(poses, np.zeros(3))
+    towards = np.array([v.towards_viewer for v in views])
+    assert len(views) == 3 and (towards @ towards.T - np.eye(3)).max() < 0.5
+
+
+def test_maps_are_cropped_to_their_pixels() -> None:
+    row, column = np.array([10, 12, 14]), np.array([30, 32, 30])
+    picture = pixel_map(row, column, 2, np.zeros((3, 3)))
+    assert picture.shape == (3, 2, 3)
+    np.testing.assert_array_equal(picture[..., 0], [[0, 1], [1, 0], [0, 1]])
+
+
+def test_colour_scale_ends_and_css() -> None:
+    scale = ColourScale("RdYlBu_r", -1.0, 1.0)
+    np.testing.assert_array_equal(scale(np.array([-5.0, 5.0])), scale(np.array([-1.0, 1.0])))
+    assert re.fullmatch(r"linear-gradient\(to right(, #[0-9a-f]{6}){9}\)", scale.css_gradient())
+
+
+def test_decimation_keeps_the_shape() -> None:
+    mesh = blob(120)
+    small, nearest = decimated(mesh, 2000)
+    assert len(small.faces) <= 2000 and len(nearest) == len(small.vertices)
+    assert Surface(mesh).distance(small.vertices).max() < 0.01
+    assert np.linalg.norm(mesh.vertices[nearest] - small.vertices, axis=1).max() < 0.1
+    same, index = decimated(blob(8), 2000)
+    assert same.faces.shape == blob(8).faces.shape and index[-1] == len(blob(8).vertices) - 1
+
+
+@pytest.mark.parametrize(("value", "limit"), [(0.07, 0.1), (0.1, 0.1), (0.11, 0.2), (3.0, 5.0), (0.0, 1.0)])
+def test_limits_are_round(value: float, limit: float) -> None:
+    assert nice_limit(value) == pytest.approx(limit)

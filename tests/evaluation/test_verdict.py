@@ -1,0 +1,47 @@
+from dataclasses import replace
+
+import pytest
+
+from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.fit import Fit, FrameFit
+from sl_nerfstudio.evaluation.verdict import judge
+
+FRAME = FrameFit("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
+FIT = Fit(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
+GOOD = Evaluation("mm", FIT, None, {}, None, None, starting_poses=True)
+
+
+def test_a_good_fit_is_good_and_asks_for_nothing() -> None:
+    verdict = judge(GOOD)
+    assert verdict.band == "good"
+    assert {check.band for check in verdict.checks} == {"good"}
+    assert verdict.next_steps == []
+    assert "no truth is known" in verdict.sentence  # and does not pretend to know more
+
+
+@pytest.mark.parametrize(
+    ("change", "check", "band"),
+    [
+        ({"coordinate_px_median": 1.0}, "Coordinate residual", "acceptable"),
+        ({"coordinate_px_median": 3.0}, "Coordinate residual", "poor"),
+        ({"coordinate_px_median": float("nan")}, "Coordinate residual", "unknown"),
+        ({"epipolar_px_median": 2.0}, "Epipolar residual", "poor"),
+        ({"pattern_cosine": 0.8}, "Pattern agreement", "acceptable"),
+        ({"pattern_cosine": 0.3}, "Pattern agreement", "poor"),
+        ({"hit_share": 0.5}, "Coverage", "poor"),
+        ({"ray_angle_deg": 2.0}, "Ray angle", "poor"),
+        ({"frames": (FRAME, replace(FRAME, name="frame_00007", coordinate_px_median=3.5))}, "Worst frame", "poor"),
+    ],
+)
+def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, band: str) -> None:
+    verdict = judge(replace(GOOD, fit=replace(FIT, **change)))
+    judged = {c.name: c for c in verdict.checks}
+    assert judged[check].band == band
+    if band == "unknown":
+        assert judged[check].text == "none"
+    else:
+        assert verdict.band == band
+        assert verdict.next_steps[0].startswith("These figures are for the scan's starting poses")
+        assert verdict.next_steps[1].startswith(check)
+    if check == "Worst frame":
+        assert "frame_00007" in judged[check].text and "frame_00007" in judged[check].advice
