@@ -52,6 +52,8 @@ class AdjustmentSettings:
 
     anchors_per_frame: int = 600
     """Decoded pixels of each frame that are looked for in other frames."""
+    max_anchors: int = 12000
+    """The same over all frames, at most: time grows with this number, accuracy with its square root."""
     frames_per_anchor: int = 8
     """Other frames in which each of them is looked for, at most."""
     max_iterations: int = 40
@@ -191,19 +193,23 @@ def adjust(
 ) -> Adjustment:
     """Refine all poses jointly. The scene must be normalised: origin at the object's centre, radius about one.
 
-    The gauge is left where the prior puts it; see `gauge.restore` for pinning the scale.
+    The gauge is left where the prior puts it; see `gauge.restore` for pinning the scale. Frames that share nothing
+    with others stay where they are.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     rig = start
-    anchors = place_anchors(rig, maps, settings.anchors_per_frame, generator)
-    stages = ["known-rig", refine] if refine in ("free", "rigid-rig") else [refine]
+    per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // rig.frames))
+    anchors = place_anchors(rig, maps, per_frame, generator)
+    stages: list[RefinePoses] = ["known-rig", refine] if refine in ("free", "rigid-rig") else [refine]
     B = free_directions(stages[0], rig.frames)
     everything = float("inf")
     observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
     r = residuals_of(rig, anchors, observations, maps)
+    if settings.max_iterations < 1 or not r.cross_valid.any():
+        return _unmoved(start, prior, B)
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
-    width = 2 * before
-    damping, noise = 1e-4, before
+    noise = max(before, _NOISE_FLOOR)
+    width, damping = 2 * noise, 1e-4
     iteration = 0
     for iteration in track(range(settings.max_iterations), "Adjusting poses"):
         if iteration % _OBSERVE_EVERY == 0 and iteration < settings.max_iterations // 2:
@@ -220,7 +226,8 @@ def adjust(
         g = B.T @ (equations.g + noise**2 * g_prior)
         rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
         settled = width > _SETTLED * previous and size < _SMALL_STEP * 10 ** (len(stages) - 1)
-        if len(stages) > 1 and (settled or iteration + 1 >= settings.rigid_iterations):
+        last = iteration + 1 == settings.max_iterations  # H and B must be of one stage below
+        if len(stages) > 1 and not last and (settled or iteration + 1 >= settings.rigid_iterations):
             # frames have found each other as they are: now what is wrong inside each of them
             stages = stages[1:]
             B = free_directions(stages[0], rig.frames)
@@ -236,6 +243,13 @@ def adjust(
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
     )
+
+
+def _unmoved(start: Rig, prior: PosePrior, B: Tensor) -> Adjustment:
+    """The starting poses, where no step is asked for or no frame sees what another decoded; known as the prior says."""
+    H = B.T @ prior_equations(prior, start, start)[0] @ B
+    nan = float("nan")
+    return Adjustment(start, _covariance(start, B, H, 1.0), _NOISE_FLOOR, 0, nan, nan)
 
 
 def _noise(r: Residuals, width: float) -> float:
