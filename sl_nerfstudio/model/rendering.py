@@ -43,7 +43,7 @@ def interval_weights(
     log_phi = F.logsigmoid(kappa * sdf)
     log_transparency = (log_phi[:, 1:] - log_phi[:, :-1]).clamp_max(0.0)
     alpha = -torch.expm1(log_transparency)
-    before = torch.cumsum(log_transparency, -1) - log_transparency
+    before = F.pad(torch.cumsum(log_transparency[:, :-1], -1), (1, 0))  # never above 0, whatever the rounding
     return alpha * before.exp()
 
 

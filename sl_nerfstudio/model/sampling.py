@@ -19,7 +19,7 @@ def sphere_interval(
     discriminant = b * b - (origins * origins).sum(-1) + radius * radius
     half = discriminant.clamp_min(0.25 * radius * radius).sqrt()
     near, far = (-b - half).clamp_min(0.0), (-b + half).clamp_min(1e-3)
-    return near, far, (discriminant > 0) & (-b + half > 0)
+    return near, far, (discriminant > 0) & (discriminant.clamp_min(0.0).sqrt() > b)
 
 
 def uniform_samples(
