@@ -33,6 +33,7 @@ RefinePoses = Literal["free", "rigid-rig", "known-rig", "off"]
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
 _SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
 _SMALL_STEP = 1e-4  # of the scene's radius, or radian: the adjustment has converged
+_DAMPING = 1e-4  # of the diagonal, at the start of each stage
 _NOISE_FLOOR = 0.01  # projector pixels: residuals are not believed to be better than this
 
 
@@ -209,7 +210,7 @@ def adjust(
         return _unmoved(start, prior, B)
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
     noise = max(before, _NOISE_FLOOR)
-    width, damping = 2 * noise, 1e-4
+    width, damping = 2 * noise, _DAMPING
     iteration = 0
     for iteration in track(range(settings.max_iterations), "Adjusting poses"):
         if iteration % _OBSERVE_EVERY == 0 and iteration < settings.max_iterations // 2:
@@ -225,11 +226,12 @@ def adjust(
         H = B.T @ (equations.H + noise**2 * H_prior) @ B
         g = B.T @ (equations.g + noise**2 * g_prior)
         rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
-        settled = width > _SETTLED * previous and size < _SMALL_STEP * 10 ** (len(stages) - 1)
+        small = size < _SMALL_STEP * 10 ** (len(stages) - 1) and (damping < 1 or size == 0)  # or damped to be small
+        settled = width > _SETTLED * previous and small
         last = iteration + 1 == settings.max_iterations  # H and B must be of one stage below
         if len(stages) > 1 and not last and (settled or iteration + 1 >= settings.rigid_iterations):
             # frames have found each other as they are: now what is wrong inside each of them
-            stages = stages[1:]
+            stages, damping = stages[1:], _DAMPING
             B = free_directions(stages[0], rig.frames)
         elif settled and len(stages) == 1:
             break

@@ -39,8 +39,8 @@ class CoordinateMaps:
     heights: Int[Tensor, "frames"]
 
     @staticmethod
-    def of(images: Sequence[Float[Tensor, "h w 2"]]) -> "CoordinateMaps":
-        """From one image per frame."""
+    def of(images: Sequence[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
+        """From one image per frame; sizes may differ."""
         sizes = torch.tensor([i.shape[0] * i.shape[1] for i in images])
         return CoordinateMaps(
             values=torch.cat([i.reshape(-1, 2) for i in images]).float(),

@@ -32,9 +32,8 @@ def restore(start: Rig, rig: Rig, known_frame: int | None) -> Rig:
     log_ratio = torch.log(baselines(start) / baselines(rig))
     scale = torch.exp(log_ratio.mean() if known_frame is None else log_ratio[known_frame])
     scaled = _scaled(rig, scale)
-    centres_start = _axes_points(start)
-    centres = _axes_points(scaled)
-    S = fit_similarity(centres.numpy(), centres_start.numpy(), with_scale=False)
+    ahead = start.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
+    S = fit_similarity(_axes_points(scaled, ahead).numpy(), _axes_points(start, ahead).numpy(), with_scale=False)
     T = pose(torch.from_numpy(S.R), torch.from_numpy(S.t))
     return Rig(rig.camera, rig.projector, T @ scaled.T_world_camera, scaled.T_camera_projector)
 
@@ -46,12 +45,12 @@ def _scaled(rig: Rig, scale: Tensor) -> Rig:
     return Rig(rig.camera, rig.projector, camera, relative)
 
 
-def _axes_points(rig: Rig) -> Float[Tensor, "n 3"]:
-    """Camera centres, and for each the point that many units ahead of it at which it sees the scene's centre.
+def _axes_points(rig: Rig, distance: Float[Tensor, "frames 1"]) -> Float[Tensor, "n 3"]:
+    """Camera centres, and for each the point `distance` ahead of it, about where it sees the scene's centre.
 
     Points near the scene count as much as the far-away cameras: turning one camera moves its point, too.
     """
     T = rig.T_world_camera
     centre = T[:, :3, 3]
-    ahead = rotate(T, torch.tensor([0.0, 0.0, -1.0], dtype=T.dtype).expand(len(T), 3))
-    return torch.cat([centre, centre + ahead * centre.norm(dim=-1, keepdim=True)])
+    axis = rotate(T, torch.tensor([0.0, 0.0, -1.0], dtype=T.dtype).expand(len(T), 3))
+    return torch.cat([centre, centre + distance * axis])

@@ -13,6 +13,7 @@ from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
 
 _FRAMES_PER_ANCHOR = 8
+_ROUNDING = 1e-6  # a smaller gain is none
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Verdict:
     @property
     def better(self) -> bool:
         """Whether the refined poses are to be kept."""
-        return self.after_px < self.before_px
+        return self.after_px < (1 - _ROUNDING) * self.before_px
 
 
 def compare(before: Rig, after: Rig, held_out: HeldOut, maps: CoordinateMaps, width_px: float) -> Verdict:

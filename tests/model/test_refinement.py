@@ -1,0 +1,127 @@
+"""From a scan on disk to refined poses: right ones in, right ones out; useless ones refused."""
+
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
+from sl_nerfstudio.calibration.guard import Verdict
+from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.dataparser.samples import build_samples
+from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.model.refinement import (
+    PriorConfig,
+    Refinement,
+    pose_prior,
+    refine,
+    scene_rig,
+    sigmas_in_scan_units,
+)
+from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, read_scan
+
+from ..calibration.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
+
+FRAMES, SIZE, MM = 6, 80, 50.0
+S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
+QUICK = AdjustmentSettings(anchors_per_frame=80, frames_per_anchor=3, max_iterations=14)
+
+
+def in_mm(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    world = S_SCENE_WORLD.inverse()
+    return world.poses(rig.T_world_camera.numpy()), world.poses(rig.T_world_projector.numpy())
+
+
+def with_poses(scan: Scan, rig: Rig) -> Scan:
+    """The same files, other starting poses."""
+    poses = zip(scan.frames, *in_mm(rig), strict=True)
+    return replace(scan, frames=tuple(replace(f, T_world_camera=c, T_world_projector=p) for f, c, p in poses))
+
+
+@pytest.fixture(scope="module")
+def true() -> Rig:
+    return rig_of(FRAMES, SIZE)
+
+
+@pytest.fixture(scope="module")
+def scan(true, tmp_path_factory) -> Scan:
+    root: Path = tmp_path_factory.mktemp("refine") / "scan"
+    blank = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    blank[::2] = 200
+    with ScanWriter(
+        root,
+        units="mm",
+        scale=Scale(True, "baseline of frame 1"),
+        projector=PROJECTORS["pinhole"],
+        pattern=np.zeros((400, 400), dtype=np.uint8),
+        camera=camera_of(SIZE),
+    ) as writer:
+        for k, (coords, c, p) in enumerate(zip(images_of(true, SIZE), *in_mm(true), strict=True)):
+            mask = coords.isfinite().all(-1).numpy()
+            name = f"frame_{k:05d}"
+            writer.add_frame(name, image=blank, coords=coords.numpy(), mask=mask, T_world_camera=c, T_world_projector=p)
+    return read_scan(root)
+
+
+def test_a_rig_in_the_scene_is_the_scan_in_other_units(scan, true):
+    rig = scene_rig(scan, S_SCENE_WORLD)
+    assert torch.allclose(rig.T_world_camera, true.T_world_camera, atol=1e-9)
+    assert torch.allclose(rig.T_camera_projector, true.T_camera_projector, atol=1e-9)
+    assert rig.camera.params.shape == (FRAMES, 8) and rig.camera.params.dtype == torch.float64
+
+
+def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
+    start = disturbed(true, 1)
+    found = refine(with_poses(scan, start), S_SCENE_WORLD, build_samples(scan), "known-rig", PriorConfig(), QUICK)
+    assert found.verdict.better and found.verdict.after_px < 0.8 * found.verdict.before_px
+    assert found.message().startswith("Poses adjusted: held-out pixels agree to ")
+    relative = inverse(found.T_scene_camera) @ found.T_scene_projector
+    assert torch.allclose(relative, true.T_camera_projector, atol=1e-9)
+    assert (found.sigma[:, :6] > 0).all() and found.sigma.isfinite().all()
+    centres = (found.T_scene_camera[:, :3, 3], true.T_world_camera[:, :3, 3], start.T_world_camera[:, :3, 3])
+    apart = [torch.cdist(c, c) for c in centres]
+    assert (apart[0] - apart[1]).abs().max() < 0.5 * (apart[2] - apart[1]).abs().max()
+
+
+def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
+    """`off` changes nothing, so nothing is better."""
+    found = refine(scan, S_SCENE_WORLD, build_samples(scan), "off", PriorConfig(), replace(QUICK, max_iterations=1))
+    rig = scene_rig(scan, S_SCENE_WORLD)
+    assert not found.verdict.better and torch.equal(found.T_scene_camera, rig.T_world_camera)
+    assert torch.equal(found.T_scene_projector, rig.T_world_projector)
+    assert found.message().startswith("Poses NOT changed") and found.message().endswith("starting poses are kept.")
+
+
+def test_the_message_tells_both_figures():
+    verdict = Verdict(before_px=3.0, after_px=0.25)
+    poses = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    text = Refinement(poses, poses, torch.zeros(2, 12), verdict, 0.1).message()
+    assert text == "Poses adjusted: held-out pixels agree to 0.25 px, before 3 px."
+
+
+def test_the_prior_is_what_the_scan_states_else_the_defaults(scan, true):
+    stated = PoseSigma(
+        camera_translation=2.0, camera_rotation_deg=1.5, relative_translation=0.0, relative_rotation_deg=0.1
+    )
+    frames = (replace(scan.frames[0], pose_sigma=stated), *scan.frames[1:])
+    prior = pose_prior(replace(scan, frames=frames), S_SCENE_WORLD, PriorConfig())
+    first = [float(s[0]) for s in (prior.frame_translation, prior.frame_rotation)]
+    assert first == pytest.approx([2.0 / MM, radians(1.5)])
+    assert float(prior.relative_rotation[0]) == pytest.approx(radians(0.1))
+    assert 0 < float(prior.relative_translation[0]) < 1e-6  # known exactly, but not infinitely so
+    assert float(prior.frame_translation[1]) == 0.1 and float(prior.frame_rotation[1]) == pytest.approx(radians(2))
+    baseline = float(true.T_camera_projector[1, :3, 3].norm())
+    assert float(prior.relative_translation[1]) == pytest.approx(0.05 * baseline)
+
+
+def test_sigmas_in_units_for_people():
+    sigma = torch.tensor([[3.0, 4.0, 0.0, 0.1, 0.1, 0.1, 0.0, 0.0, 6.0, 0.0, 0.2, 0.0]]) / 100
+    found = sigmas_in_scan_units(sigma, S_SCENE_WORLD)[0]
+    degree = 180 / np.pi / 100
+    assert found == pytest.approx(
+        [MM * 0.05 / 3**0.5, 0.1 * degree, MM * 0.06 / 3**0.5, 0.2 * degree / 3**0.5], rel=1e-5
+    )
