@@ -31,6 +31,7 @@ from sl_nerfstudio.progress import track
 
 RefinePoses = Literal["free", "rigid-rig", "known-rig", "off"]
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
+_INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
 _SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
 _SMALL_STEP = 1e-4  # of the scene's radius, or radian: the adjustment has converged
 _DAMPING = 1e-4  # of the diagonal, at the start of each stage
@@ -59,7 +60,7 @@ class AdjustmentSettings:
     """Other frames in which each of them is looked for, at most."""
     max_iterations: int = 40
     """Levenberg-Marquardt steps, at most."""
-    rigid_iterations: int = 12
+    rigid_iterations: int = 5
     """Steps, at most, in which frames move as a whole before projectors move against their cameras."""
     seed: int = 0
     """Seed of the choice of pixels."""
@@ -75,6 +76,28 @@ class Adjustment:
     iterations: int
     median_before_px: float
     median_after_px: float
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A part of the adjustment."""
+
+    refine: RefinePoses
+    rough: bool  # residuals are still made by wrong poses: those of one frame err together, and count as few
+    iterations: int  # at most
+
+
+def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
+    """Frames find each other as wholes; then everything moves; then everything moves, trusting every residual.
+
+    As long as poses are wrong, the thousands of residuals of a frame are a handful of independent measurements.
+    Counted as thousands they overrule the prior along directions they hardly know, and the scene drifts away.
+    """
+    rough = max(settings.max_iterations // 2 - settings.rigid_iterations, 1)
+    found = [_Stage(refine, True, rough), _Stage(refine, False, settings.max_iterations)]
+    if refine in ("free", "rigid-rig"):
+        found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
+    return found
 
 
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
@@ -201,8 +224,8 @@ def adjust(
     rig = start
     per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // rig.frames))
     anchors = place_anchors(rig, maps, per_frame, generator)
-    stages: list[RefinePoses] = ["known-rig", refine] if refine in ("free", "rigid-rig") else [refine]
-    B = free_directions(stages[0], rig.frames)
+    stages, stage_start = _stages(refine, settings), 0
+    B = free_directions(stages[0].refine, rig.frames)
     everything = float("inf")
     observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
     r = residuals_of(rig, anchors, observations, maps)
@@ -223,16 +246,18 @@ def adjust(
         own_weight, cross_weight = _weights(r, width)
         equations = normal_equations(linear, anchors, observations, own_weight, cross_weight, rig.frames)
         H_prior, g_prior = prior_equations(prior, start, rig)
-        H = B.T @ (equations.H + noise**2 * H_prior) @ B
-        g = B.T @ (equations.g + noise**2 * g_prior)
+        independent = _INDEPENDENT_ROWS * rig.frames / max(int(r.cross_valid.sum()), 1)
+        trust = noise**2 / min(independent, 1.0) if stages[0].rough else noise**2
+        H = B.T @ (equations.H + trust * H_prior) @ B
+        g = B.T @ (equations.g + trust * g_prior)
         rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
-        small = size < _SMALL_STEP * 10 ** (len(stages) - 1) and (damping < 1 or size == 0)  # or damped to be small
+        small = size < _SMALL_STEP and (damping < 1 or size == 0)  # or damped to be small
         settled = width > _SETTLED * previous and small
         last = iteration + 1 == settings.max_iterations  # H and B must be of one stage below
-        if len(stages) > 1 and not last and (settled or iteration + 1 >= settings.rigid_iterations):
-            # frames have found each other as they are: now what is wrong inside each of them
-            stages, damping = stages[1:], _DAMPING
-            B = free_directions(stages[0], rig.frames)
+        over = settled or iteration + 1 - stage_start >= stages[0].iterations
+        if len(stages) > 1 and not last and over:
+            stages, stage_start, damping = stages[1:], iteration + 1, _DAMPING
+            B = free_directions(stages[0].refine, rig.frames)
         elif settled and len(stages) == 1:
             break
     r = residuals_of(rig, anchors, observations, maps)
