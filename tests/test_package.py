@@ -18,7 +18,7 @@ import sl_nerfstudio
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib  # constraints.txt pins it; pytest needs it there too
+    import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sl_nerfstudio"

@@ -10,6 +10,8 @@ from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
 
 _MAX_LOG_SCALE = np.log(1.5)  # ICP with scale may not go further from its start: it could collapse onto a patch
+_TRUSTED = 0.7  # share of the points that are taken to be surface of the target
+_TRUSTED_SIGMA = 1.0364  # quantile of |x| at _TRUSTED, x standard normal
 _TUKEY = 4.685  # of the robust sigma: 95 % efficiency on normal residuals (Tukey's biweight)
 
 
@@ -57,8 +59,9 @@ def icp(
     """Robust point-to-plane ICP of `points` onto `target`, from `start`.
 
     Each round matches every point with the nearest point of the target's triangles and takes one
-    Gauss-Newton step on the point-to-plane distances, weighted by Tukey's biweight with the sigma of the
-    current residuals (1.48 times their median): surface that the target does not have ends with weight zero.
+    Gauss-Newton step on the point-to-plane distances, weighted by Tukey's biweight with the sigma of the best
+    70 % of the current distances: surface that the target does not have ends with weight zero. (Not of the best
+    half: a plate that fits perfectly would then silence everything that stands on it.)
     Directions the data do not determine (a sphere's rotations) stay as started.
     """
     S = start
@@ -81,7 +84,7 @@ def icp(
 
 
 def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:
-    cut = max(_TUKEY * 1.4826 * float(np.median(distance)), floor)
+    cut = max(_TUKEY * float(np.percentile(distance, 100 * _TRUSTED)) / _TRUSTED_SIGMA, floor)
     return np.clip(1 - (distance / cut) ** 2, 0, None) ** 2
 
 

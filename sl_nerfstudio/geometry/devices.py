@@ -85,22 +85,23 @@ class Intrinsics:
 def project(
     intrinsics: Intrinsics, p: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """Pixels of points given in device axes, and whether each lies in front of the device.
+    """Pixels of points given in device axes, and whether each has one: it lies in front of the device.
 
     A point behind the device (or in its plane) has no pixel: its value is finite but meaningless,
-    its gradient is finite, and its flag is False.
+    its gradient is finite, and its flag is False. So has a point so far off the axis that the distortion
+    polynomial has turned back there: it would appear a second time, inside the image.
     """
     x, y, z = p.unbind(-1)
     norm2 = (p * p).sum(-1)
     norm = norm2.clamp_min(1e-30).sqrt()
     in_front = -z > _MIN_DEPTH * norm
-    if intrinsics.model == "DOE":
-        q = 1 / norm
-    else:
-        q = 1 / torch.where(in_front, -z, norm.detach().clamp_min(1e-15))
+    pinhole = intrinsics.model == "OPENCV"
+    q = 1 / (torch.where(in_front, -z, norm.detach().clamp_min(1e-15)) if pinhole else norm)
     fx, fy, cx, cy, k1, k2, p1, p2 = intrinsics.params.unbind(-1)
     xn, yn = x * q, -y * q
     if intrinsics.distorted:
+        a, b, d = _distortion_jacobian(xn.detach(), yn.detach(), k1, k2, p1, p2)
+        in_front = in_front & (a * d > b * b) & (a > 0)
         xn, yn = _distort(xn, yn, k1, k2, p1, p2)
     return torch.stack([fx * xn + cx, fy * yn + cy], -1), in_front
 

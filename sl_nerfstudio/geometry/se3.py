@@ -5,11 +5,19 @@ Tangent vectors are ordered `(v, w)`: three of translation, then three of rotati
 Every function takes any leading batch shape.
 """
 
+from collections.abc import Sequence
+from math import factorial
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_SERIES_BELOW = 1e-2  # angle below which Taylor series replace the quotients
+# Below these angles Taylor series replace quotients that would lose digits there, and lose more in derivatives.
+# Each row holds the coefficients of one power of t^2.
+_SERIES_BELOW = 0.3
+_SERIES = [[(-1) ** k / factorial(2 * k + first) for first in (1, 2, 3)] for k in range(6)]
+_LOG_SERIES_BELOW = 0.3
+_LOG_SERIES = [[1 / 12], [1 / 720], [1 / 30240], [1 / 1209600], [1 / 47900160], [691 / 1307674368000]]
 
 
 def hat(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -22,16 +30,25 @@ def hat(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def _so3_coefficients(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin(t)/t, (1 - cos(t))/t^2 and (t - sin(t))/t^3 of t = sqrt(theta2), smooth at 0."""
     small = theta2 < _SERIES_BELOW**2
-    t2 = torch.where(small, torch.ones_like(theta2), theta2)
+    x = theta2.where(small, torch.zeros_like(theta2))
+    t2 = theta2.where(~small, torch.ones_like(theta2))
     t = t2.sqrt()
-    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), t.sin() / t)
-    b = torch.where(
-        small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), (1 - t.cos()) / t2
+    half = (t / 2).sin() / t
+    a, b, c = _polynomials(x, _SERIES).unbind(-1)
+    return (
+        torch.where(small, a, t.sin() / t),
+        torch.where(small, b, 2 * half * half),
+        torch.where(small, c, (t - t.sin()) / (t2 * t)),
     )
-    c = torch.where(
-        small, 1 / 6 - theta2 / 120 * (1 - theta2 / 42 * (1 - theta2 / 72)), (t - t.sin()) / (t2 * t)
-    )
-    return a, b, c
+
+
+def _polynomials(x: Tensor, coefficients: Sequence[Sequence[float]]) -> Tensor:
+    """The sums over k of coefficients[k][j] x^k in the last dimension j, by Horner's scheme."""
+    rows = x.new_tensor(coefficients)
+    out = rows[-1].expand(*x.shape, -1)
+    for row in rows[:-1].flip(0):
+        out = out * x[..., None] + row
+    return out
 
 
 def exp_so3(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -48,19 +65,39 @@ def log_so3(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     candidates = torch.stack(  # each row is 4 q_i * q for one i: the one with the largest q_i is stable
         [
             torch.stack(
-                [1 + m00 + m11 + m22, R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+                [
+                    1 + m00 + m11 + m22,
+                    R[..., 2, 1] - R[..., 1, 2],
+                    R[..., 0, 2] - R[..., 2, 0],
+                    R[..., 1, 0] - R[..., 0, 1],
+                ],
                 -1,
             ),
             torch.stack(
-                [R[..., 2, 1] - R[..., 1, 2], 1 + m00 - m11 - m22, R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0]],
+                [
+                    R[..., 2, 1] - R[..., 1, 2],
+                    1 + m00 - m11 - m22,
+                    R[..., 1, 0] + R[..., 0, 1],
+                    R[..., 0, 2] + R[..., 2, 0],
+                ],
                 -1,
             ),
             torch.stack(
-                [R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] + R[..., 0, 1], 1 - m00 + m11 - m22, R[..., 2, 1] + R[..., 1, 2]],
+                [
+                    R[..., 0, 2] - R[..., 2, 0],
+                    R[..., 1, 0] + R[..., 0, 1],
+                    1 - m00 + m11 - m22,
+                    R[..., 2, 1] + R[..., 1, 2],
+                ],
                 -1,
             ),
             torch.stack(
-                [R[..., 1, 0] - R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2], 1 - m00 - m11 + m22],
+                [
+                    R[..., 1, 0] - R[..., 0, 1],
+                    R[..., 0, 2] + R[..., 2, 0],
+                    R[..., 2, 1] + R[..., 1, 2],
+                    1 - m00 - m11 + m22,
+                ],
                 -1,
             ),
         ],
@@ -98,11 +135,10 @@ def log_se3(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     w = log_so3(T[..., :3, :3])
     theta2 = (w * w).sum(-1)
     a, b, _ = _so3_coefficients(theta2)
-    small = theta2 < _SERIES_BELOW**2
-    safe = torch.where(small, torch.ones_like(theta2), theta2)
-    coefficient = torch.where(
-        small, 1 / 12 + theta2 / 720 * (1 + theta2 / 42), (1 - a / (2 * b)) / safe
-    )
+    small = theta2 < _LOG_SERIES_BELOW**2
+    x = theta2.where(small, torch.zeros_like(theta2))
+    safe = theta2.where(~small, torch.ones_like(theta2))
+    coefficient = torch.where(small, _polynomials(x, _LOG_SERIES)[..., 0], (1 - a / (2 * b)) / safe)
     W = hat(w)
     eye = torch.eye(3, dtype=T.dtype, device=T.device)
     V_inverse = eye - 0.5 * W + coefficient[..., None, None] * (W @ W)
@@ -122,11 +158,13 @@ def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     return pose(R_t, -(R_t @ T[..., :3, 3:]).squeeze(-1))
 
 
-def transform(T: Float[Tensor, "*batch 4 4"], p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def transform(T: Float[Tensor, "*#batch 4 4"], p: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
     """`p_a` of `p_b` under `T_a_b`; batch shapes broadcast."""
     return rotate(T, p) + T[..., :3, 3]
 
 
-def rotate(T: Float[Tensor, "*batch 4 4"], d: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def rotate(T: Float[Tensor, "*#batch 4 4"], d: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
     """Direction `d` turned by the rotation of `T`; batch shapes broadcast."""
-    return (T[..., :3, :3] * d[..., None, :]).sum(-1)
+    R = T[..., :3, :3]
+    # three products of columns: several times faster on long batches than a batched 3x3 product
+    return R[..., 0] * d[..., :1] + R[..., 1] * d[..., 1:2] + R[..., 2] * d[..., 2:]

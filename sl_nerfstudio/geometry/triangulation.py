@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -34,11 +35,11 @@ def closest_approach(
     Lines closer to parallel than 1e-6 rad give NaN.
     """
     between = o2 - o1
-    c = (d1 * d2).sum(-1)
-    b1, b2 = (between * d1).sum(-1), (between * d2).sum(-1)
-    denominator = 1 - c * c
-    denominator = denominator.where(denominator > _PARALLEL, denominator.new_tensor(float("nan")))
-    return (b1 - c * b2) / denominator, (c * b1 - b2) / denominator
+    # By cross products: 1 - cos^2 of the angle between the lines would lose all digits of float32 at small baselines.
+    normal = torch.linalg.cross(d1, d2)
+    sin2 = (normal * normal).sum(-1)
+    scaled = normal / sin2.where(sin2 > _PARALLEL, sin2.new_tensor(float("nan")))[..., None]
+    return (torch.linalg.cross(between, d2) * scaled).sum(-1), (torch.linalg.cross(between, d1) * scaled).sum(-1)
 
 
 def triangulate(

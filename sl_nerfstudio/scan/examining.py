@@ -1,7 +1,7 @@
 """The full check of a scan folder: everything `read_scan` sees, every pixel, and how all of it fits together."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from sl_nerfstudio.scan.conventions import convention_problems
 from sl_nerfstudio.scan.draft import TRANSFORMS, Draft, read_draft
 from sl_nerfstudio.scan.headers import check_headers
 from sl_nerfstudio.scan.pattern_shift import shift_problems
-from sl_nerfstudio.scan.pose_files import read_ground_truth
+from sl_nerfstudio.scan.pose_files import GROUND_TRUTH, read_ground_truth
 from sl_nerfstudio.scan.problem import Faults
 from sl_nerfstudio.scan.readings import Fit, fit_frames
 from sl_nerfstudio.scan.types import UNITS, Scan
@@ -48,7 +48,8 @@ def examine(root: Path) -> Examination:
     try:
         read_ground_truth(scan)
     except ScanError as error:
-        return Examination(tuple(error.faults), None, None, tuple(contents))
+        found = tuple(replace(fault, file=f"{GROUND_TRUTH}/{fault.file}") for fault in error.faults)
+        return Examination(found, None, None, tuple(contents))
     usable = [c.correspondences for c in contents if c.correspondences is not None]
     return Examination((), scan, fit_frames(usable, scan.projector), tuple(contents))
 

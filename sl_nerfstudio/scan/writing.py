@@ -49,6 +49,8 @@ class ScanWriter:
         require_empty(root)
         if units not in UNITS:
             raise ValueError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
+        if camera is not None and camera.model != "OPENCV":
+            raise ValueError("a camera cannot be a DOE")
         if pattern.shape != (projector.h, projector.w):
             raise ValueError(f"the pattern is {pattern.shape}, the projector {(projector.h, projector.w)}")
         self.root = root
@@ -109,7 +111,7 @@ class ScanWriter:
         device = camera or self._camera
         if device is None:
             raise ValueError("a frame without common intrinsics needs a camera of its own")
-        if any(f["file_path"] == f"images/{name}.png" for f in self._frames) or Path(name).name != name:
+        if any(f["file_path"] == f"images/{name}.png" for f in self._frames) or not name or Path(name).name != name:
             raise ValueError(f"frame name {name!r} was given before or is no file name")
         for what, array in (("image", image), ("coords", coords), ("pattern", pattern), ("mask", mask)):
             if array is not None and array.shape[:2] != (device.h, device.w):

@@ -1,11 +1,12 @@
 """The joint adjustment finds true poses again, keeps what its mode says, and is not led astray."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import degrees, radians
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from sl_nerfstudio.calibration.bundle_adjustment import (
     Adjustment,
@@ -15,7 +16,7 @@ from sl_nerfstudio.calibration.bundle_adjustment import (
     free_directions,
     prior_equations,
 )
-from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
@@ -102,17 +103,28 @@ def test_exact_starts_stay_where_they_are(true):
     assert (found.rig.T_camera_projector - true.T_camera_projector).abs().max() < 1e-5
 
 
+@dataclass(frozen=True)
+class SpoiltMaps(ExactMaps):
+    """Exact but for some pixels, which show coordinates from elsewhere."""
+
+    wrong: Tensor  # bool (frames, h, w)
+
+    def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
+        found = super().look_up(frame, uv_camera)
+        pixel = uv_camera.long().clamp(0, SIZE - 1)
+        offset = self.wrong[frame, pixel[:, 1], pixel[:, 0]][:, None] * found.uv_projector.new_tensor([70.0, -45.0])
+        return replace(found, uv_projector=found.uv_projector + offset)
+
+
 def test_wrong_cells_do_not_spoil_it(true):
-    """3 % of the cells of 5 x 5 pixels show coordinates from elsewhere."""
-    rng = torch.Generator().manual_seed(0)
-    images = []
-    for image in images_of(true, SIZE):
-        wrong = (torch.rand(SIZE // 5, SIZE // 5, generator=rng) < 0.03).repeat_interleave(5, 0).repeat_interleave(5, 1)
-        images.append(image + wrong[..., None] * torch.tensor([70.0, -45.0]))
-    found = adjust(disturbed(true), CoordinateMaps.of(images), prior_of(FRAMES), "known-rig", QUICK)
-    turn, shift = errors(found.rig, true)
-    before = errors(disturbed(true), true)
-    assert turn < 0.05 * before[0] and shift < 0.1 * before[1]  # windows of so coarse images cut curvature off
+    """3 % of the cells of 5 x 5 pixels."""
+    cells = torch.rand(FRAMES, SIZE // 5, SIZE // 5, generator=torch.Generator().manual_seed(0)) < 0.03
+    m = ExactMaps.around(true, SIZE)
+    maps = SpoiltMaps(
+        m.values, m.offsets, m.widths, m.heights, true, cells.repeat_interleave(5, 1).repeat_interleave(5, 2)
+    )
+    turn, shift = errors(adjust(disturbed(true), maps, prior_of(FRAMES), "known-rig", replace(QUICK, max_iterations=30)).rig, true)
+    assert turn < 1e-2 and shift < 1e-3
 
 
 def test_one_seed_one_result(true, maps):
@@ -162,11 +174,11 @@ def test_free_directions_of_each_mode(mode, columns):
         assert torch.equal(rho, torch.zeros_like(rho))
 
 
-def test_prior_equations_are_derivatives_of_the_weighted_departure(true):
+def test_prior_equations_are_derivatives_of_the_weighted_departure():
     """First order in the departure, which is what a Gauss-Newton step asks of them."""
-    sigmas = [
-        torch.rand(FRAMES, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) + 0.1 for s in range(4)
-    ]
+    n = 2
+    true = rig_of(n, SIZE)
+    sigmas = [torch.rand(n, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) + 0.1 for s in range(4)]
     prior = PosePrior(*sigmas)
     rig = disturbed(true, 7, degrees=0.05, shift=0.001, relative=1.0)
 
@@ -180,9 +192,9 @@ def test_prior_equations_are_derivatives_of_the_weighted_departure(true):
     H, g = prior_equations(prior, true, rig)
     step, expected = 1e-5, torch.zeros_like(g)
     for k in range(len(g)):
-        x = torch.zeros(12 * FRAMES, dtype=torch.float64)
+        x = torch.zeros(12 * n, dtype=torch.float64)
         x[k] = step
-        plus, minus = (rig.moved(*(s * x).reshape(2, FRAMES, 6)) for s in (1, -1))
+        plus, minus = (rig.moved(*(s * x).reshape(2, n, 6)) for s in (1, -1))
         expected[k] = (cost(plus) - cost(minus)) / (2 * step)
     assert (g - expected).abs().max() < 5e-3 * expected.abs().max()
     assert torch.allclose(H, H.T) and torch.linalg.eigvalsh(H).min() > 0

@@ -37,7 +37,7 @@ def test_a_disturbed_rig_is_worse_than_the_true_one(true, maps, held_out, kind, 
     rig = disturbed(true, seed, **small) if kind == "frames" else disturbed(true, seed, **small, relative=1.0)
     better, worse = compare(rig, true, held_out, maps, WIDTH), compare(true, rig, held_out, maps, WIDTH)
     assert better.better and not worse.better
-    assert better.after_px < 0.7 * better.before_px
+    assert better.after_px < 0.9 * better.before_px  # what is hidden in another frame costs the same in both
     assert (better.before_px, better.after_px) == pytest.approx((worse.after_px, worse.before_px))
     assert better.before_px <= WIDTH
 

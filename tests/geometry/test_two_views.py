@@ -1,0 +1,214 @@
+"""Triangulation and epipolar residuals of a camera and a projector."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from random_geometry import BATCHES, DEVICES, batches, directions, generator, motions, seeds
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from sl_nerfstudio.geometry.devices import Intrinsics, project
+from sl_nerfstudio.geometry.epipolar import epipolar_residual, essential_matrix
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
+from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
+
+names = st.sampled_from(sorted(DEVICES))
+
+
+def rig(source: torch.Generator, baseline: float = 0.4) -> tuple[Tensor, Tensor]:
+    """A camera somewhere in the world, and a projector beside it with about the same view."""
+    T_world_camera = motions((), source, 1.7)
+    xi = torch.tensor([baseline, 0.1 * baseline, 0.05, 0.02, 0.12, -0.05], dtype=torch.float64)
+    return T_world_camera, T_world_camera @ exp_se3(xi)
+
+
+def points(T_world_camera: Tensor, batch: tuple[int, ...], source: torch.Generator) -> Tensor:
+    """World points in the view of both."""
+    p = torch.rand(*batch, 3, generator=source, dtype=torch.float64) * 0.8 - 0.4
+    return transform(T_world_camera, p + torch.tensor([0.15, 0, -3.0], dtype=torch.float64))
+
+
+def pixels(name: str, T_world_device: Tensor, p_world: Tensor) -> tuple[Intrinsics, Tensor]:
+    intrinsics = Intrinsics.of(DEVICES[name], torch.float64)
+    uv, in_front = project(intrinsics, transform(inverse(T_world_device), p_world))
+    assert bool(in_front.all())
+    return intrinsics, uv
+
+
+@given(seeds, batches, names, names)
+def test_exact_correspondences_give_exact_points(
+    seed: int, batch: tuple[int, ...], camera: str, projector: str
+) -> None:
+    source = generator(seed)
+    T_c, T_p = rig(source)
+    p = points(T_c, batch, source)
+    (c, uv_c), (q, uv_p) = pixels(camera, T_c, p), pixels(projector, T_p, p)
+    found = triangulate(c, T_c, uv_c, q, T_p, uv_p)
+    assert found.p_world.shape == (*batch, 3)
+    assert float((found.p_world - p).abs().max()) < 1e-10
+    assert float((found.depth_camera - (p - T_c[:3, 3]).norm(dim=-1)).abs().max()) < 1e-10
+    assert float((found.depth_projector - (p - T_p[:3, 3]).norm(dim=-1)).abs().max()) < 1e-10
+    assert float(found.gap.max()) < 1e-10
+    assert float(epipolar_residual(c, T_c, uv_c, q, T_p, uv_p).abs().max()) < 1e-8
+
+
+@given(seeds, batches)
+def test_closest_approach_is_the_least_squares_solution(seed: int, batch: tuple[int, ...]) -> None:
+    source = generator(seed)
+    o1, o2 = (torch.randn(*batch, 3, generator=source, dtype=torch.float64) for _ in range(2))
+    d1, d2 = directions(batch, source), directions(batch, source)
+    s, t = closest_approach(o1, d1, o2, d2)
+    assert s.shape == t.shape == batch
+    rows = [x.reshape(-1, 3).numpy() for x in (o1, d1, o2, d2)]
+    for a1, e1, a2, e2, found_s, found_t in zip(*rows, s.reshape(-1), t.reshape(-1), strict=True):
+        best = np.linalg.lstsq(np.stack([e1, -e2], 1), a2 - a1, rcond=None)[0]
+        assert np.abs(best - [found_s, found_t]).max() < 1e-8 * (1 + np.abs(best).max())
+
+
+def test_skew_lines_by_hand() -> None:
+    o1, d1 = torch.tensor([0.0, 0, 0]), torch.tensor([1.0, 0, 0])
+    o2, d2 = torch.tensor([3.0, 4, 5]), torch.tensor([0.0, 1, 0])
+    s, t = closest_approach(o1, d1, o2, d2)
+    assert (float(s), float(t)) == (3, -4)
+
+
+def test_parallel_rays_have_no_meeting_point() -> None:
+    d = torch.tensor([0.0, 0, -1], dtype=torch.float64)
+    turned = torch.tensor([1e-7, 0, -1], dtype=torch.float64)
+    for other, is_nan in ((d, True), (-d, True), (turned, True), (turned + torch.tensor([1e-5, 0, 0]), False)):
+        s, t = closest_approach(torch.zeros(3, dtype=torch.float64), d, torch.ones(3, dtype=torch.float64), other)
+        assert (bool(s.isnan()), bool(t.isnan())) == (is_nan, is_nan)
+
+
+@pytest.mark.parametrize("degrees", [30.0, 5.0, 1.0, 0.2])
+def test_small_vergence_in_float32(degrees: float) -> None:
+    """Depth keeps the digits that the directions hold: an error of about one part in 10^7 over the vergence."""
+    source = generator(0)
+    vergence = np.radians(degrees)
+    d1 = directions((1000,), source)
+    side = torch.linalg.cross(d1, directions((1000,), source))
+    side = side / side.norm(dim=-1, keepdim=True)
+    d2 = d1 * np.cos(vergence) + side * np.sin(vergence)
+    o2 = 3.0 * d1 - 3.0 * d2
+    zero = torch.zeros_like(d1)
+    s, t = closest_approach(zero.float(), d1.float(), o2.float(), d2.float())
+    assert float((s.double() - 3).abs().max()) < 3 * 4e-7 / vergence
+    assert float((t.double() - 3).abs().max()) < 3 * 4e-7 / vergence
+
+
+@pytest.mark.parametrize("projector", sorted(DEVICES))
+def test_sigma_depth_is_the_depth_that_moves_the_point_by_a_pixel(projector: str) -> None:
+    source = generator(2)
+    T_c, T_p = rig(source)
+    p = points(T_c, (20,), source)
+    (c, uv_c), (q, uv_p) = pixels("lens", T_c, p), pixels(projector, T_p, p)
+    found = triangulate(c, T_c, uv_c, q, T_p, uv_p)
+    ray = (p - T_c[:3, 3]) / found.depth_camera[:, None]
+    step = 1e-5
+    _, moved = pixels(projector, T_p, p + step * ray)
+    expected = step / (moved - uv_p).norm(dim=-1)
+    assert float((found.sigma_depth / expected - 1).abs().max()) < 1e-4
+
+
+def test_sigma_depth_is_the_scatter_of_the_depth() -> None:
+    source = generator(3)
+    T_c, T_p = rig(source)
+    p = points(T_c, (), source).expand(4000, 3)
+    (c, uv_c), (q, uv_p) = pixels("pinhole", T_c, p), pixels("pinhole", T_p, p)
+    direction = (pixels("pinhole", T_p, p + 1e-4 * (p - T_c[:3, 3]))[1] - uv_p)[0]
+    along = direction / direction.norm()
+    noise = 0.3 * torch.randn(4000, 1, generator=source, dtype=torch.float64) * along
+    found = triangulate(c, T_c, uv_c, q, T_p, uv_p + noise)
+    assert float(found.depth_camera.std()) == pytest.approx(0.3 * float(found.sigma_depth[0]), rel=0.05)
+
+
+@pytest.mark.parametrize("projector", sorted(DEVICES))
+def test_gradients_to_both_poses(projector: str) -> None:
+    source = generator(4)
+    T_c, T_p = rig(source)
+    p = points(T_c, (3,), source)
+    (c, uv_c), (q, uv_p) = pixels("lens", T_c, p), pixels(projector, T_p, p)
+    uv_p = uv_p + torch.randn(3, 2, generator=source, dtype=torch.float64)
+
+    def everything(xi_c: Tensor, xi_p: Tensor) -> Tensor:
+        poses = exp_se3(xi_c) @ T_c, exp_se3(xi_p) @ T_p
+        found = triangulate(c, poses[0], uv_c, q, poses[1], uv_p)
+        residual = epipolar_residual(c, poses[0], uv_c, q, poses[1], uv_p)
+        return torch.cat([found.p_world.flatten(), found.gap, found.sigma_depth, residual])
+
+    zeros = [torch.zeros(6, dtype=torch.float64, requires_grad=True) for _ in range(2)]
+    assert torch.autograd.gradcheck(everything, zeros, eps=1e-6, atol=1e-4, rtol=1e-5)
+
+
+@given(seeds, names)
+def test_epipolar_residual_is_the_distance_to_the_curve(seed: int, projector: str) -> None:
+    source = generator(seed)
+    T_c, T_p = rig(source)
+    p = points(T_c, (), source)
+    (c, uv_c), (q, uv_p) = pixels("lens", T_c, p), pixels(projector, T_p, p)
+    ray = rotate(inverse(T_c), (p - T_c[:3, 3]) / (p - T_c[:3, 3]).norm())
+    shift = 2.0 * directions((), source)[:2]
+
+    def distance(depth: float) -> float:
+        on_ray = transform(T_c, depth * ray)
+        return float((project(q, transform(inverse(T_p), on_ray))[0] - uv_p - shift).norm())
+
+    best = minimize_scalar(distance, bounds=(1.5, 8.0), method="bounded", options={"xatol": 1e-9})
+    found = float(epipolar_residual(c, T_c, uv_c, q, T_p, uv_p + shift))
+    # exact for a pinhole; elsewhere the curve is bent by less than this within two pixels
+    assert abs(found) == pytest.approx(best.fun, abs=1e-5 if projector == "pinhole" else 2e-3)
+
+
+def test_epipolar_residual_has_a_sign() -> None:
+    source = generator(6)
+    T_c, T_p = rig(source)
+    p = points(T_c, (), source)
+    (c, uv_c), (q, uv_p) = pixels("pinhole", T_c, p), pixels("pinhole", T_p, p)
+    one, other = (
+        float(epipolar_residual(c, T_c, uv_c, q, T_p, uv_p + torch.tensor([0, y], dtype=torch.float64)))
+        for y in (1.0, -1.0)
+    )
+    assert one == pytest.approx(-other, rel=1e-6)
+    assert 0.5 < abs(one) <= 1
+
+
+def test_points_behind_a_device_have_no_residual() -> None:
+    source = generator(7)
+    T_c, T_p = rig(source)
+    p = points(T_c, (5,), source)
+    (c, uv_c), (q, uv_p) = pixels("pinhole", T_c, p), pixels("pinhole", T_p, p)
+    half_turn = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    assert bool(epipolar_residual(c, T_c @ half_turn, uv_c, q, T_p, uv_p).isnan().all())
+    assert bool(epipolar_residual(c, T_c, uv_c, q, T_p @ half_turn, uv_p).isnan().all())
+    behind = triangulate(c, T_p, uv_c, q, T_c, uv_p)  # the two devices exchanged: rays part
+    assert bool((behind.depth_camera < 0).all())
+
+
+@given(seeds, batches)
+def test_essential_matrix(seed: int, batch: tuple[int, ...]) -> None:
+    source = generator(seed)
+    T_projector_camera = motions(batch, source)
+    p_camera = torch.randn(*batch, 3, generator=source, dtype=torch.float64)
+    p_projector = transform(T_projector_camera, p_camera)
+    E = essential_matrix(T_projector_camera)
+    assert float((p_projector[..., None, :] @ E @ p_camera[..., None]).abs().max()) < 1e-12
+    singular = torch.linalg.svdvals(E)
+    length = T_projector_camera[..., :3, 3].norm(dim=-1)
+    expected = torch.stack([length, length, torch.zeros_like(length)], -1)
+    assert float((singular - expected).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_batches_of_poses_against_batches_of_pixels(batch: tuple[int, ...]) -> None:
+    source = generator(8)
+    rigs = [rig(source) for _ in range(2)]
+    T_c, T_p = (torch.stack([r[k] for r in rigs]).reshape(2, *[1] * len(batch), 4, 4) for k in (0, 1))
+    p = torch.stack([points(r[0], batch, source) for r in rigs])
+    (c, uv_c), (q, uv_p) = pixels("lens", T_c, p), pixels("DOE", T_p, p)
+    together = epipolar_residual(c, T_c, uv_c, q, T_p, uv_p + 1.0)
+    assert together.shape == (2, *batch)
+    for i, (one_c, one_p) in enumerate(rigs):
+        alone = epipolar_residual(c, one_c, uv_c[i], q, one_p, uv_p[i] + 1.0)
+        assert torch.allclose(together[i], alone, atol=1e-10)

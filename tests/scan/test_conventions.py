@@ -1,0 +1,217 @@
+"""Mixed-up conventions are found and named; honest rough scans are left alone."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
+
+from sl_nerfstudio.scan import check_scan
+from sl_nerfstudio.scan.conventions import convention_problems
+from sl_nerfstudio.scan.correspondences import Correspondences, sample_pixels
+from sl_nerfstudio.scan.readings import Reading, apply_reading, fit_frames, other_readings
+
+OPENCV = np.diag([1.0, -1, -1, 1])
+KEYS = ("transform_matrix", "projector_transform_matrix")
+
+
+def frames_of(pairs: list[tuple[ndarray, ndarray]]) -> list[Correspondences]:
+    """Correspondences of the sphere under these poses, with noise and 5 % wrong decodings."""
+    random = np.random.default_rng(3)
+    out = []
+    for index, (T_world_camera, T_world_projector) in enumerate(pairs):
+        coords = correspondences(T_world_camera, T_world_projector)
+        uv_camera, uv_projector = sample_pixels(coords, np.isfinite(coords[..., 0]))
+        uv_projector += random.normal(scale=0.3, size=uv_projector.shape)
+        uv_projector[::20] += random.normal(scale=15, size=uv_projector[::20].shape)
+        out.append(Correspondences(f"f{index}", CAMERA, T_world_camera, T_world_projector, uv_camera, uv_projector))
+    return out
+
+
+def rigid_rig(count: int = 6) -> list[tuple[ndarray, ndarray]]:
+    """A projector beside the camera, parallel to it: the case in which rays meet in OpenCV axes too."""
+    out = []
+    for index in range(count):
+        angle = 2 * np.pi * index / count
+        T = look_at(250 * np.array([np.cos(angle), np.sin(angle), 0.4]), np.zeros(3), 0.3 * index)
+        beside = T.copy()
+        beside[:3, 3] += T[:3, :3] @ np.array([30.0, 0, 0])
+        out.append((T, beside))
+    return out
+
+
+def disturbed(
+    frames: list[Correspondences], degrees: float, mm: float, relative: float, seed: int
+) -> list[Correspondences]:
+    """Frames as registration and auto-calibration leave them: RMS errors about the camera or the object."""
+    random = np.random.default_rng(seed)
+
+    def motion(degrees: float, mm: float) -> ndarray:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(random.normal(size=3) * np.radians(degrees) / 3**0.5).as_matrix()
+        T[:3, 3] = random.normal(size=3) * mm / 3**0.5
+        return T
+
+    out = []
+    for frame in frames:
+        pivot = np.eye(4)
+        pivot[:3, 3] = frame.T_world_camera[:3, 3] if random.random() < 0.5 else 0
+        error = pivot @ motion(degrees, mm) @ np.linalg.inv(pivot)
+        out.append(
+            replace(
+                frame,
+                T_world_camera=error @ frame.T_world_camera,
+                T_world_projector=error @ frame.T_world_projector @ motion(relative, 0),
+            )
+        )
+    return out
+
+
+def undo(reading: Reading, frame: Correspondences) -> Correspondences:
+    """The frame as a user with that mix-up would have written it."""
+    mixed = {
+        "as given": lambda T: T,
+        "inverted": np.linalg.inv,
+        "OpenCV axes": lambda T: T @ OPENCV,
+        "inverted, OpenCV axes": lambda T: np.linalg.inv(T @ OPENCV),
+    }
+    T_world_projector = frame.T_world_projector.copy()
+    T_world_projector[:3, 3] /= reading.projector_unit
+    x, y = frame.uv_projector.T
+    x, y = (PROJECTOR.w - x if reading.mirrored_x else x), (PROJECTOR.h - y if reading.mirrored_y else y)
+    return replace(
+        frame,
+        T_world_camera=mixed[reading.camera](frame.T_world_camera),
+        T_world_projector=mixed[reading.projector](T_world_projector),
+        uv_projector=np.stack([y, x] if reading.exchanged else [x, y], -1),
+    )
+
+
+def test_readings_undo_what_users_do() -> None:
+    frame = frames_of(poses())[1]
+    readings = list(other_readings())
+    assert len(readings) == len(set(readings)) == 15 + 7 + 2
+    for reading in readings:
+        back = apply_reading(reading, undo(reading, frame), PROJECTOR)
+        assert np.allclose(back.T_world_camera, frame.T_world_camera, atol=1e-9)
+        assert np.allclose(back.T_world_projector, frame.T_world_projector, atol=1e-9)
+        assert np.allclose(back.uv_projector, frame.uv_projector)
+
+
+@pytest.mark.parametrize("scene", [poses, rigid_rig])
+@pytest.mark.parametrize(("degrees", "mm", "relative"), [(0, 0, 0), (10, 30, 0.3)])
+def test_every_mix_up_is_named(scene: Any, degrees: float, mm: float, relative: float) -> None:
+    honest = disturbed(frames_of(scene()), degrees, mm, relative, seed=1)
+    assert list(convention_problems(honest, PROJECTOR, 1e-3)) == []
+    for reading in other_readings():
+        found = list(convention_problems([undo(reading, frame) for frame in honest], PROJECTOR, None))
+        assert len(found) == 1, reading
+        frame, key, problem = found[0]
+        assert frame is None
+        coords = reading.exchanged or reading.mirrored_x or reading.mirrored_y
+        assert key in (("sl_coords_path",) if coords else KEYS)
+        words = problem.cause
+        for how, text in (
+            ("inverted", "map world to device instead of device to world"),
+            ("OpenCV axes", "have OpenCV's device axes (y down, looking along +z)"),
+            ("inverted, OpenCV axes", "are OpenCV extrinsics (world to device, y down, looking along +z)"),
+        ):
+            assert (text in words) == (how in (reading.camera, reading.projector))
+        assert ("x and y exchanged" in words) == reading.exchanged
+        assert ("x counted from the right" in words) == reading.mirrored_x
+        assert ("y counted from below" in words) == reading.mirrored_y
+        assert ("in another unit" in words) == (reading.projector_unit != 1)
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+@pytest.mark.parametrize("relative", [0.3, 2.0])
+def test_honest_rough_scans_are_left_alone(count: int, relative: float) -> None:
+    for seed in range(8):
+        scene = rigid_rig(count) if seed % 2 else poses(count)
+        rough = disturbed(frames_of(scene), 10, 30, relative, seed)
+        assert list(convention_problems(rough, PROJECTOR, 1e-3)) == []
+
+
+@pytest.mark.parametrize("how", [np.linalg.inv, lambda T: T @ OPENCV])
+def test_one_frame_with_other_conventions_than_the_rest(how: Any) -> None:
+    frames = frames_of(rigid_rig())
+    one = frames[2]
+    frames[2] = replace(one, T_world_camera=how(one.T_world_camera), T_world_projector=how(one.T_world_projector))
+    found = list(convention_problems(frames, PROJECTOR, 1e-3))
+    assert [(frame, key) for frame, key, _ in found] == [("f2", "transform_matrix")]
+    assert "does not fit the coordinates in this frame" in found[0][2].problem
+
+
+def test_poses_that_no_mix_up_explains() -> None:
+    frames = frames_of(poses())
+    random = Rotation.random(len(frames), random_state=np.random.RandomState(4)).as_matrix()
+    lost = []
+    for frame, R in zip(frames, random, strict=True):
+        T = frame.T_world_projector.copy()
+        T[:3, :3] = R
+        lost.append(replace(frame, T_world_projector=T))
+    found = list(convention_problems(lost, PROJECTOR, 1e-3))
+    assert [(frame, key) for frame, key, _ in found] == [(None, "transform_matrix")]
+    assert "does not fit the coordinates in 4 of 4 frames" in found[0][2].problem
+    assert "no single mix-up explains it" in found[0][2].cause
+
+
+@pytest.mark.parametrize(
+    ("metres", "words"), [(1.0, "would put the object 2"), (1e-6, "would put the object 0.0002"), (None, "")]
+)
+def test_units_that_cannot_be(metres: float | None, words: str) -> None:
+    found = list(convention_problems(frames_of(poses()), PROJECTOR, metres))
+    assert [key for _, key, _ in found] == (["units"] if words else [])
+    assert all(words in problem.problem and "m and mm exchanged" in problem.cause for _, _, problem in found)
+
+
+def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
+    frames = frames_of(poses())
+    fit = fit_frames(frames, PROJECTOR)
+    assert fit.typical_px < 0.5
+    assert np.allclose(np.linalg.norm(np.median(fit.clouds[0], axis=0)), 40, atol=6)
+    apart = [
+        replace(f, T_world_camera=f.T_world_camera.copy(), T_world_projector=f.T_world_projector.copy()) for f in frames
+    ]
+    for index, frame in enumerate(apart):
+        frame.T_world_camera[0, 3] += 1e4 * index
+        frame.T_world_projector[0, 3] += 1e4 * index
+    assert np.allclose(fit_frames(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
+
+
+def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:
+    def invert(document: dict[str, Any]) -> None:
+        for record in document["frames"]:
+            for key in KEYS:
+                record[key] = np.linalg.inv(record[key]).tolist()
+
+    edit(sphere, invert)
+    fault = only_fault(sphere)
+    assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "transform_matrix")
+    assert fault.problem.startswith("does not fit the coordinates in all frames: ")
+    assert fault.cause == (
+        "camera and projector matrices map world to device instead of device to world: read that way they fit"
+    )
+    assert fault.remedy == "store device to world in OpenGL axes (camera and projector matrices: invert them)"
+
+
+def test_metres_in_a_folder_of_millimetres(sphere: Path) -> None:
+    edit(sphere, lambda document: document.update(units="m"))
+    fault = only_fault(sphere)
+    assert (fault.field, fault.problem) == ("units", "would put the object 241 m from the camera")
+    edit(sphere, lambda document: document.update(units="arbitrary"))
+    assert check_scan(sphere) == []
+
+
+def test_coordinates_upside_down_in_a_folder(sphere: Path) -> None:
+    for name in NAMES:
+        path = sphere / "coords" / f"{name}.npz"
+        coords = np.load(path)["coords"]
+        np.savez(path, coords=np.stack([coords[..., 0], PROJECTOR.h - coords[..., 1]], -1))
+    faults = check_scan(sphere)
+    assert [fault.field for fault in faults] == ["sl_coords_path"]
+    assert faults[0].remedy.endswith("y := projector h - y")

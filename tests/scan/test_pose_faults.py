@@ -1,0 +1,218 @@
+"""Poses and intrinsics, one by one; how they fit together is in test_conventions.py."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, only_fault, poses, write_sphere
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan import PoseSigma, check_scan, read_scan
+from sl_nerfstudio.scan.intrinsics import device_problems
+
+
+def change_pose(
+    root: Path, change: Callable[[ndarray], ndarray], key: str = "transform_matrix", frame: int = 1
+) -> None:
+    def apply(document: dict[str, Any]) -> None:
+        record = document["frames"][frame]
+        record[key] = change(np.array(record[key])).tolist()
+
+    edit(root, apply)
+
+
+def sheared(T: ndarray) -> ndarray:
+    T[0, 1] += 0.01
+    return T
+
+
+def last_row(*row: float) -> Callable[[ndarray], ndarray]:
+    def change(T: ndarray) -> ndarray:
+        T[3] = row
+        return T
+
+    return change
+
+
+@pytest.mark.parametrize("key", ["transform_matrix", "projector_transform_matrix"])
+@pytest.mark.parametrize(
+    ("change", "problem", "words"),
+    [
+        (lambda T: T @ np.diag([-1.0, 1, 1, 1]), "mirrors (the determinant of its rotation is -1)", "left-handed"),
+        (lambda T: T @ np.diag([2.0, 2, 2, 1]), "is scaled: its rotation is 2 times a rotation", "similarity"),
+        (lambda T: T @ np.diag([1e-3, 1e-3, 1e-3, 1]), "is scaled: its rotation is 0.001 times a rotation", "unit"),
+        (lambda T: T @ np.diag([-2.0, -2, -2, 1]), "is scaled: its rotation is 2 times a mirroring", "divide"),
+        (lambda T: T @ np.diag([1.0, 1, 0, 1]), "has no rotation in its upper left 3 x 3 block", "six digits"),
+        (sheared, "has no rotation in its upper left 3 x 3 block", "sheared"),
+        (lambda T: T * 0, "has the last row 0, 0, 0, 0 instead of 0, 0, 0, 1", "rigid motion"),
+        (lambda T: T * 2, "has the last row 0, 0, 0, 2 instead of 0, 0, 0, 1", "rigid motion"),
+        (last_row(0, 0, 1, 0), "has the last row 0, 0, 1, 0 instead of 0, 0, 0, 1", "projective"),
+        (lambda T: T.T, "and the last column 0, 0, 0, 1", "transposed"),
+        (lambda T: T[:3], "is 3 x 4", "add the row 0, 0, 0, 1"),
+        (lambda T: T[:3, :3], "is 3 x 3 instead of 4 x 4", "4 x 4"),
+        (lambda T: T.reshape(2, 8), "is 2 x 8 instead of 4 x 4", "4 x 4"),
+        (lambda T: T * 1e200, "has the last row", "rigid motion"),
+    ],
+)
+def test_matrices_that_are_no_poses(
+    sphere: Path, key: str, change: Callable[[ndarray], ndarray], problem: str, words: str
+) -> None:
+    change_pose(sphere, change, key)
+    fault = only_fault(sphere)
+    assert (fault.file, fault.frame, fault.field) == ("transforms.json", NAMES[1], key)
+    assert problem in fault.problem
+    assert words in fault.cause + fault.remedy
+
+
+def test_five_digits_are_enough(sphere: Path) -> None:
+    for frame in range(len(NAMES)):
+        for key in ("transform_matrix", "projector_transform_matrix"):
+            change_pose(sphere, lambda T: np.round(T, 5), key, frame)
+    assert check_scan(sphere) == []
+
+
+def test_projector_in_the_camera_s_place(sphere: Path) -> None:
+    def copy(document: dict[str, Any]) -> None:
+        record = document["frames"][1]
+        for row in range(3):
+            record["projector_transform_matrix"][row][3] = record["transform_matrix"][row][3]
+
+    edit(sphere, copy)
+    faults = check_scan(sphere)
+    assert faults[0].field == "projector_transform_matrix"
+    assert faults[0].problem == "stands in the very place of the camera"
+
+
+def test_all_poses_equal(sphere: Path) -> None:
+    def equal(document: dict[str, Any]) -> None:
+        for record in document["frames"]:
+            for key in ("transform_matrix", "projector_transform_matrix"):
+                record[key] = document["frames"][0][key]
+
+    edit(sphere, equal)
+    faults = [f for f in check_scan(sphere) if f.frame is None and f.field == "transform_matrix"]
+    assert faults[0].problem == "is the same in all frames, for camera and projector"
+    assert "never filled in" in faults[0].cause
+
+
+@pytest.mark.parametrize(
+    ("device", "key", "words"),
+    [
+        (Device(72, 60, 0.0, 150.0, 36.0, 30.0), "fl_x", "is 0"),
+        (Device(72, 60, 150.0, -150.0, 36.0, 30.0), "fl_y", "is -150"),
+        (Device(72, 60, 4.2, 150.0, 36.0, 30.0), "fl_x", "is 4.2 pixels, which no lens has"),
+        (Device(72, 60, 150.0, 15000.0, 36.0, 30.0), "fl_y", "is 15000 pixels, which no lens has"),
+        (Device(72, 60, 150.0, 150.0, 960.0, 30.0), "cx", "is 960, far outside an image of 72 pixels"),
+        (Device(72, 60, 150.0, 150.0, 36.0, -540.0), "cy", "is -540, far outside an image of 60 pixels"),
+        (Device(72, 60, 60.0, 60.0, 36.0, 30.0, k1=-1.5), "k1", "fold the image over itself"),
+        (Device(72, 60, 60.0, 60.0, 36.0, 30.0, p1=3.0), "k1", "fold the image over itself"),
+        (Device(100_000, 60_000, 60.0, 60.0, 36.0, 30.0), "w", "is 6000000000 pixels"),
+    ],
+)
+def test_devices_that_cannot_be(device: Device, key: str, words: str) -> None:
+    problems = list(device_problems(device))
+    assert [k for k, _ in problems] == [key]
+    assert words in "times h " + problems[0][1].problem
+    assert problems[0][1].cause and problems[0][1].remedy
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        CAMERA,
+        PROJECTOR,
+        Device(1920, 1080, 3350.9, 3350.9, 971.0, 1251.0),  # lens shift: principal point below the image
+        Device(960, 540, 480.0, 480.0, 480.0, 270.0, k1=-0.25, k2=0.05, p1=1e-3, p2=-1e-3),
+        Device(800, 800, 700.0, 700.0, 400.0, 400.0, model="DOE"),
+        Device(800, 800, 300.0, 300.0, 400.0, 400.0, model="DOE"),  # corners beyond 90 degrees: unused
+    ],
+)
+def test_devices_that_can(device: Device) -> None:
+    assert list(device_problems(device)) == []
+
+
+@pytest.mark.parametrize(("key", "value"), [("fl_x", 0), ("cx", 1e6), ("projector.fl_y", -1), ("projector.cy", -1e9)])
+def test_faulty_intrinsics_have_a_place(sphere: Path, key: str, value: float) -> None:
+    def change(document: dict[str, Any]) -> None:
+        place = document["projector"] if key.startswith("projector.") else document
+        place[key.removeprefix("projector.")] = value
+
+    edit(sphere, change)
+    fault = only_fault(sphere)
+    assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, key)
+
+
+def test_intrinsics_of_another_resolution(sphere: Path) -> None:
+    edit(sphere, lambda document: document.update(w=144, h=120))
+    faults = check_scan(sphere)
+    assert len(faults) == 4 * len(NAMES)  # image, pattern image, mask and coordinates of each frame
+    assert all(fault.problem == "is 72 x 60 pixels, but the camera has 144 x 120" for fault in faults)
+    assert all("resized, or the intrinsics are those of another resolution" in fault.cause for fault in faults)
+
+
+def test_each_frame_with_a_camera_of_its_own(tmp_path: Path) -> None:
+    root = write_sphere(tmp_path / "scan")
+
+    def own(document: dict[str, Any]) -> None:
+        keys = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+        common = {key: document.pop(key) for key in keys}
+        for record in document["frames"]:
+            record.update(common)
+        document["frames"][2]["fl_x"] = 151.0
+
+    edit(root, own)
+    scan = read_scan(root)
+    assert [frame.camera.fl_x for frame in scan.frames] == [150, 150, 151, 150]
+    assert scan.frames[0].camera == CAMERA
+    edit(root, lambda document: document["frames"][1].pop("cy"))
+    fault = only_fault(root)
+    assert (fault.frame, fault.field, fault.problem) == (NAMES[1], "cy", "is missing")
+
+
+def test_part_common_part_own(sphere: Path) -> None:
+    edit(sphere, lambda document: [r.update(fl_x=150.0 + i) for i, r in enumerate(document["frames"])])
+    faults = check_scan(sphere)
+    assert {(fault.frame, fault.field) for fault in faults} == {(name, "fl_x") for name in NAMES[1:]}
+    assert faults[0].problem == "is 151.0 here but 150.0 for all frames"
+    edit(sphere, lambda document: document.pop("fl_x"))
+    assert [frame.camera.fl_x for frame in read_scan(sphere).frames] == [150, 151, 152, 153]
+
+
+def test_distortion_may_be_left_out(sphere: Path) -> None:
+    edit(sphere, lambda document: [document.pop(key) for key in ("k1", "k2", "p1", "p2")])
+    assert read_scan(sphere).frames[0].camera == CAMERA
+
+
+SIGMA = {
+    "camera_translation": 3.0,
+    "camera_rotation_deg": 1.0,
+    "relative_translation": 2.0,
+    "relative_rotation_deg": 0.25,
+}
+
+
+def test_stated_uncertainty_of_poses(sphere: Path) -> None:
+    assert read_scan(sphere).frames[0].pose_sigma is None
+    edit(sphere, lambda document: document.update(sl_pose_sigma=SIGMA))
+    edit(sphere, lambda document: document["frames"][2].update(sl_pose_sigma={**SIGMA, "camera_translation": 9}))
+    assert check_scan(sphere) == []
+    scan = read_scan(sphere)
+    assert scan.frames[0].pose_sigma == PoseSigma(3.0, 1.0, 2.0, 0.25)
+    assert scan.frames[2].pose_sigma == PoseSigma(9.0, 1.0, 2.0, 0.25)
+
+
+@pytest.mark.parametrize("value", [0, -1])
+def test_an_uncertainty_is_above_zero(sphere: Path, value: float) -> None:
+    edit(sphere, lambda document: document["frames"][2].update(sl_pose_sigma={**SIGMA, "relative_rotation_deg": value}))
+    fault = only_fault(sphere)
+    assert (fault.frame, fault.field) == (NAMES[2], "sl_pose_sigma.relative_rotation_deg")
+    assert fault.problem == f"is {value}"
+
+
+def test_poses_arrive_as_they_are_written(sphere: Path) -> None:
+    scan = read_scan(sphere)
+    assert np.array_equal(scan.T_world_camera, [camera for camera, _ in poses()])
+    assert np.array_equal(scan.T_world_projector, [projector for _, projector in poses()])

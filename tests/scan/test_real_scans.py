@@ -1,0 +1,97 @@
+"""Real captures pass; so they do with honest errors in their poses; and mixed-up ones are named."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sphere_scan import edit
+from test_conventions import disturbed, undo
+
+from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan.conventions import convention_problems
+from sl_nerfstudio.scan.examining import Examination, examine
+from sl_nerfstudio.scan.readings import Reading
+
+DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
+
+
+def folder(name: str) -> Path:
+    if not (DATA / name / "transforms.json").exists():
+        pytest.skip(f"real captures not found: {DATA / name} (set SL_REAL_DATA to their folder)")
+    return DATA / name
+
+
+@pytest.fixture(scope="module", params=["elephant", "house"])
+def examined(request: pytest.FixtureRequest) -> Examination:
+    return examine(folder(request.param))
+
+
+def test_real_captures_are_clean(examined: Examination) -> None:
+    assert examined.faults == ()
+    assert examined.fit is not None and examined.scan is not None
+    assert examined.fit.typical_px < 0.3
+    assert examined.fit.typical_spread < 0.05
+
+
+def test_real_captures_with_rough_poses_are_clean(examined: Examination) -> None:
+    assert examined.scan is not None
+    frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
+    size = 30.0 if examined.scan.units == "mm" else 0.3
+    for seed in range(3):
+        rough = disturbed(frames, 10, size, 0.5, seed)
+        assert list(convention_problems(rough, examined.scan.projector, None)) == []
+
+
+@pytest.mark.parametrize("how", ["inverted", "OpenCV axes", "inverted, OpenCV axes"])
+def test_mixed_up_real_captures_are_named(examined: Examination, how: str) -> None:
+    assert examined.scan is not None
+    frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
+    reading = Reading(camera=how, projector=how)  # type: ignore[arg-type]
+    projector = examined.scan.projector
+    for relative in (0.0, 0.5):
+        rough = disturbed(frames, 5, 10 if examined.scan.units == "mm" else 0.1, relative, 1)
+        mixed = [replace(undo(reading, frame)) for frame in rough]
+        found = list(convention_problems(mixed, projector, None))
+        assert [(frame, key) for frame, key, _ in found] == [(None, "transform_matrix")]
+        assert found[0][2].cause.startswith("camera and projector matrices ")
+
+
+def test_faults_planted_in_real_captures(tmp_path: Path) -> None:
+    root = Path(shutil.copytree(folder("elephant"), tmp_path / "scan"))
+    (root / "images" / "frame_00003.png").write_bytes((root / "images" / "frame_00003.png").read_bytes()[:5000])
+    (root / "coords" / "frame_00004.npz").unlink()
+    with np.load(root / "coords" / "frame_00006.npz") as archive:
+        coords = archive["coords"]
+    np.savez_compressed(root / "coords" / "frame_00006.npz", coords=np.nan_to_num(coords, nan=-1))
+    edit(root, lambda document: document["frames"][5]["transform_matrix"][0].__setitem__(0, float("nan")))
+    edit(root, lambda document: document["frames"].append({**document["frames"][7]}))
+    found = {(fault.file, fault.frame, fault.field) for fault in examine(root).faults}
+    assert found == {
+        ("images/frame_00003.png", "frame_00003", None),
+        ("coords/frame_00004.npz", "frame_00004", None),
+        ("coords/frame_00006.npz", "frame_00006", None),
+        ("transforms.json", "frame_00005", "transform_matrix"),
+        ("transforms.json", "frame_00007", "file_path"),
+    }
+
+
+def test_reading_takes_little_memory(tmp_path: Path) -> None:
+    """The check holds one frame at a time: its peak does not grow with the number of frames."""
+    import tracemalloc
+
+    scan = read_scan(folder("elephant"))
+    peaks = []
+    for count in (3, 12):
+        root = tmp_path / str(count)
+        shutil.copytree(scan.root, root)
+        edit(root, lambda document, count=count: document.update(frames=document["frames"][:count]))
+        tracemalloc.start()
+        assert examine(root).faults == ()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    one_frame = 960 * 540 * (8 + 3)
+    assert peaks[1] < peaks[0] + one_frame / 2
+    assert peaks[1] < 12 * one_frame

@@ -1,0 +1,332 @@
+"""Writing scans: what is written comes back, and nothing half-written stays."""
+
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, pattern_image, poses, write_sphere
+
+from sl_nerfstudio.errors import ScanError, UserError
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan import PoseSigma, Scale, ScanWriter, check_scan, read_ground_truth, read_poses, read_scan
+from sl_nerfstudio.scan.atomic import write_atomic
+from sl_nerfstudio.scan.pose_files import write_transforms
+
+
+def files(root: Path) -> set[str]:
+    return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+
+
+def settings(**changes: Any) -> dict[str, Any]:
+    return {
+        "units": "mm",
+        "scale": Scale(True, "baseline of frame 0"),
+        "projector": PROJECTOR,
+        "pattern": pattern_image(),
+        "camera": CAMERA,
+        **changes,
+    }
+
+
+def frame(index: int = 0, **changes: Any) -> dict[str, Any]:
+    T_world_camera, T_world_projector = poses()[index]
+    return {
+        "image": np.zeros((CAMERA.h, CAMERA.w), np.uint8),
+        "coords": np.zeros((CAMERA.h, CAMERA.w, 2), np.float32),
+        "T_world_camera": T_world_camera,
+        "T_world_projector": T_world_projector,
+        **changes,
+    }
+
+
+def test_everything_comes_back_as_it_was(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    shape = (CAMERA.h, CAMERA.w)
+    image = random.integers(0, 65536, (*shape, 3), dtype=np.uint16)
+    pattern = random.integers(0, 65536, shape, dtype=np.uint16)
+    coords = random.normal(size=(*shape, 2)).astype(np.float32)
+    coords[:5] = np.nan
+    mask = random.random(shape) < 0.5
+    own = Device(72, 60, 140.0, 141.0, 33.0, 29.0, k1=0.1, k2=-0.01, p1=1e-3, p2=2e-3)
+    projector = Device(128, 96, 260.0, 255.0, 66.0, 45.0, k1=-0.1, model="DOE")
+    sigma = PoseSigma(1.0, 2.0, 3.0, 4.0)
+    with ScanWriter(tmp_path / "ä" / "scan", **settings(projector=projector, extra={"comment": "é"})) as writer:
+        writer.add_frame("eins", **frame(0, image=image, pattern=pattern, coords=coords, mask=mask, pose_sigma=sigma))
+        writer.add_frame("zwei", **frame(1, camera=own, extra={"exposure": 0.1}))
+        writer.add_file("ground_truth/mesh.ply", b"ply")
+    scan = read_scan(tmp_path / "ä" / "scan")
+    assert (scan.units, scan.scale, scan.projector) == ("mm", Scale(True, "baseline of frame 0"), projector)
+    assert np.array_equal(scan.read_pattern(), pattern_image().astype(np.float32) / np.float32(255))
+    one, two = scan.frames
+    assert (one.name, two.name, one.camera, two.camera) == ("eins", "zwei", CAMERA, own)
+    assert np.array_equal(one.read_image(), image)
+    assert one.read_image().dtype == np.uint16
+    assert np.array_equal(one.read_pattern(), pattern.astype(np.float32) / np.float32(65535))
+    assert np.array_equal(one.read_coords(), coords, equal_nan=True)
+    assert np.array_equal(one.read_mask(), mask)
+    assert (one.pose_sigma, two.pose_sigma) == (sigma, None)
+    assert np.array_equal(one.T_world_camera, poses()[0][0])
+    assert np.array_equal(two.T_world_projector, poses()[1][1])
+    assert (two.pattern_path, two.mask_path) == (None, None)
+    assert two.read_mask().all()
+    document = json.loads((tmp_path / "ä/scan/transforms.json").read_text(encoding="utf-8"))
+    assert document["comment"] == "é"
+    assert document["frames"][1]["exposure"] == 0.1
+    assert read_ground_truth(scan).mesh_path == tmp_path / "ä" / "scan" / "ground_truth" / "mesh.ply"
+
+
+def test_what_lies_in_a_folder(sphere: Path) -> None:
+    kinds = {"images": "png", "patterns": "png", "coords": "npz", "masks": "png"}
+    expected = {f"{folder}/{name}.{suffix}" for folder, suffix in kinds.items() for name in NAMES}
+    assert files(sphere) == expected | {"transforms.json", "pattern.png"}
+
+
+def test_the_same_scan_is_written_as_the_same_bytes(tmp_path: Path) -> None:
+    a, b = write_sphere(tmp_path / "a", frames=2), write_sphere(tmp_path / "b", frames=2)
+    assert all((a / name).read_bytes() == (b / name).read_bytes() for name in files(a))
+
+
+def test_captures_without_coordinates(tmp_path: Path) -> None:
+    with ScanWriter(tmp_path / "scan", **settings()) as writer:
+        for index in range(2):
+            writer.add_frame(f"f{index}", **frame(index, coords=None))
+    assert all(fault.field == "sl_coords_path" for fault in check_scan(tmp_path / "scan"))
+    with pytest.raises(ScanError, match="sl_coords_path: is missing"):
+        read_scan(tmp_path / "scan")
+    scan = read_scan(tmp_path / "scan", need_coords=False)
+    assert scan.frames[0].coords_path is None
+    assert np.isnan(scan.frames[0].read_coords()).all()
+    assert not scan.frames[0].read_mask().any()
+
+
+def test_true_poses_go_to_ground_truth(tmp_path: Path) -> None:
+    true = [(camera + 0.0, projector + 0.0) for camera, projector in poses()]
+    for camera, _ in true:
+        camera[0, 3] += 1
+    with ScanWriter(tmp_path / "scan", **settings(extra={"sl_pose_sigma": 3})) as writer:
+        for index in range(3):
+            sigma = PoseSigma(1.0, 1.0, 1.0, 1.0)
+            writer.add_frame(f"f{index}", **frame(index, pose_sigma=sigma, true_poses=true[index]))
+    edit(tmp_path / "scan", lambda document: document.pop("sl_pose_sigma"))
+    truth = read_ground_truth(read_scan(tmp_path / "scan"))
+    assert truth.mesh_path is None
+    assert truth.T_world_camera is not None and truth.T_world_projector is not None
+    assert np.array_equal(truth.T_world_camera, [camera for camera, _ in true[:3]])
+    assert np.array_equal(truth.T_world_projector, [projector for _, projector in true[:3]])
+    assert "sl_pose_sigma" not in (tmp_path / "scan/ground_truth/transforms.json").read_text()
+
+
+def test_nothing_stays_of_a_scan_that_failed(tmp_path: Path) -> None:
+    root = tmp_path / "new" / "scan"
+    with pytest.raises(ZeroDivisionError), ScanWriter(root, **settings()) as writer:
+        writer.add_frame("f0", **frame())
+        assert files(root) == {"pattern.png", "images/f0.png", "coords/f0.npz"}  # no transforms.json yet
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_folder_that_was_there_stays(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), ScanWriter(tmp_path, **settings()) as writer:
+        writer.add_frame("f0", **frame())
+        raise KeyboardInterrupt
+    assert tmp_path.is_dir()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_others_stay(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), ScanWriter(tmp_path / "scan", **settings()) as writer:
+        writer.add_frame("f0", **frame())
+        (tmp_path / "scan" / "images" / "mine.txt").write_text("keep")
+        raise ZeroDivisionError
+    assert files(tmp_path) == {"scan/images/mine.txt"}
+
+
+def test_a_scan_without_frames_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no frame was written"), ScanWriter(tmp_path / "scan", **settings()):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_something_in_it_is_never_overwritten(sphere: Path) -> None:
+    before = {name: (sphere / name).read_bytes() for name in files(sphere)}
+    with pytest.raises(UserError, match="is not empty") as error:
+        ScanWriter(sphere, **settings())
+    assert "remedy: choose another output" in str(error.value)
+    with pytest.raises(UserError, match="is a file"):
+        ScanWriter(sphere / "pattern.png", **settings())
+    assert before == {name: (sphere / name).read_bytes() for name in files(sphere)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"units": "inch"}, "units must be one of m, cm, mm, um, arbitrary, got 'inch'"),
+        ({"pattern": np.zeros((3, 3), np.uint8)}, "the pattern is (3, 3), the projector (96, 128)"),
+        ({"camera": Device(72, 60, 1.0, 1.0, 1.0, 1.0, model="DOE")}, "a camera cannot be a DOE"),
+    ],
+)
+def test_faulty_settings(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError) as error:
+        ScanWriter(tmp_path / "scan", **settings(**changes))
+    assert str(error.value) == message
+    assert not (tmp_path / "scan").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("f0", {}, "was given before"),
+        ("a/b", {}, "is no file name"),
+        ("..", {}, "is no file name"),
+        ("", {}, "is no file name"),
+        ("f1", {"image": np.zeros((5, 5), np.uint8)}, "image of f1 is (5, 5), the camera (60, 72)"),
+        ("f1", {"coords": np.zeros((5, 5, 2), np.float32)}, "coords of f1 is (5, 5)"),
+        ("f1", {"T_world_camera": np.diag([2.0, 2, 2, 1])}, "transform_matrix is scaled"),
+        ("f1", {"T_world_projector": np.full((4, 4), np.nan)}, "projector_transform_matrix holds NaN or infinity"),
+        ("f1", {"extra": {"quality": float("nan")}}, "not JSON compliant"),
+    ],
+)
+def test_faulty_frames(tmp_path: Path, name: str, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError) as error, ScanWriter(tmp_path / "scan", **settings()) as writer:
+        writer.add_frame("f0", **frame())
+        writer.add_frame(name, **frame(1, **changes))
+    assert message in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_may_not_leave_the_folder(tmp_path: Path) -> None:
+    for path in ("../x", "/tmp/x", "a/../../x"):
+        with (
+            pytest.raises(ValueError, match="leaves the scan folder"),
+            ScanWriter(tmp_path / "s", **settings()) as writer,
+        ):
+            writer.add_file(path, b"")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_frame_needs_intrinsics(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="needs a camera of its own"):  # noqa: SIM117
+        with ScanWriter(tmp_path / "scan", **settings(camera=None)) as writer:
+            writer.add_frame("f0", **frame())
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.json"
+    path.write_text("old")
+
+    def full(self: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(UserError) as error:
+        write_atomic(path, b"new")
+    assert str(error.value) == (
+        f"{path}: cannot be written (No space left on device)\n"
+        "    cause:  the disk is full, the folder is read-only, or a file stands where a folder is needed\n"
+        "    remedy: make room, or choose another output"
+    )
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_where_a_folder_is_needed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("x")
+    with pytest.raises(UserError, match="cannot be written"):
+        write_atomic(tmp_path / "a" / "b" / "c.json", b"")
+
+
+def test_write_atomic_replaces_and_makes_folders(tmp_path: Path) -> None:
+    write_atomic(tmp_path / "a" / "b.txt", b"1")
+    write_atomic(tmp_path / "a" / "b.txt", b"2")
+    assert files(tmp_path) == {"a/b.txt"}
+    assert (tmp_path / "a" / "b.txt").read_bytes() == b"2"
+
+
+def moved(T: np.ndarray) -> np.ndarray:
+    out = T.copy()
+    out[:, :3, 3] += [1.0, 2.0, 3.0]
+    return out
+
+
+def test_refined_poses_keep_everything_else(sphere: Path) -> None:
+    edit(sphere, lambda document: document.update(applied_scale=2.0, sl_pose_sigma={"camera_translation": 1.0}))
+    edit(sphere, lambda document: document["frames"][1].update(exposure=7))
+    edit(sphere, lambda document: document["sl_pose_sigma"].update(
+        camera_rotation_deg=1.0, relative_translation=1.0, relative_rotation_deg=1.0))  # fmt: skip
+    scan = read_scan(sphere)
+    T_c, T_p = moved(scan.T_world_camera), moved(scan.T_world_projector)
+    target = sphere.parent / "refined" / "transforms.json"
+    write_transforms(target, scan, T_c, T_p, [{"sl_sigma": i} for i in range(4)], {"sl_note": "refined"})
+    before, after = (json.loads((folder / "transforms.json").read_text()) for folder in (sphere, target.parent))
+    assert after.pop("sl_note") == "refined"
+    assert before.pop("sl_pose_sigma")["camera_translation"] == 1
+    assert [record.pop("sl_sigma") for record in after["frames"]] == [0, 1, 2, 3]
+    for old, new, camera, projector in zip(before["frames"], after["frames"], T_c, T_p, strict=True):
+        assert new.pop("transform_matrix") == camera.tolist() != old.pop("transform_matrix")
+        assert new.pop("projector_transform_matrix") == projector.tolist() != old.pop("projector_transform_matrix")
+    assert before == after
+    assert list(target.parent.iterdir()) == [target]
+    found = read_poses(target, scan)
+    assert np.array_equal(found[0], T_c) and np.array_equal(found[1], T_p)
+    target.replace(sphere / "transforms.json")
+    assert check_scan(sphere) == []
+    assert np.array_equal(read_scan(sphere).T_world_camera, T_c)
+
+
+def test_wrong_numbers_of_poses_are_refused(sphere: Path) -> None:
+    scan = read_scan(sphere)
+    with pytest.raises(ValueError, match="4 frames, but 3 camera poses, 4 projector poses, 4 sets of fields"):
+        write_transforms(sphere / "x.json", scan, scan.T_world_camera[:3], scan.T_world_projector)
+    with pytest.raises(ValueError, match="transform_matrix is scaled"):
+        write_transforms(
+            sphere / "x.json", scan, scan.T_world_camera * 1.0 @ np.diag([2.0, 2, 2, 1]), scan.T_world_projector
+        )
+    edit(sphere, lambda document: document["frames"].reverse())
+    with pytest.raises(ScanError, match="lists other frames than before"):
+        write_transforms(sphere / "x.json", scan, scan.T_world_camera, scan.T_world_projector)
+    assert not (sphere / "x.json").exists()
+
+
+def test_poses_of_another_file_are_matched_by_name(sphere: Path, tmp_path: Path) -> None:
+    scan = read_scan(sphere)
+    document = json.loads((sphere / "transforms.json").read_text())
+    document["frames"].reverse()
+    document["frames"].append({"file_path": "images/other.png"})
+    for record in document["frames"]:
+        record.pop("projector_transform_matrix", None)
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps(document))
+    cameras, projectors = read_poses(path, scan)
+    assert np.array_equal(cameras, scan.T_world_camera)
+    assert projectors is None
+    del document["frames"][1]
+    document["frames"][0]["transform_matrix"][0][0] = 5
+    del document["frames"][2]["transform_matrix"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(ScanError) as error:
+        read_poses(path, scan)
+    assert [(f.file, f.frame, f.field) for f in error.value.faults] == [
+        ("other.json", NAMES[0], "transform_matrix"),
+        ("other.json", NAMES[2], "frames"),
+        ("other.json", NAMES[3], "transform_matrix"),
+    ]
+    path.write_text("[]")
+    with pytest.raises(ScanError, match="holds a list instead of an object"):
+        read_poses(path, scan)
+    path.write_text('{"frames": 3}')
+    with pytest.raises(ScanError, match="is missing or is no list of objects"):
+        read_poses(path, scan)
+
+
+def test_faulty_truth_is_a_fault_of_the_scan(sphere: Path) -> None:
+    (sphere / "ground_truth").mkdir()
+    document = json.loads((sphere / "transforms.json").read_text())
+    document["frames"][2]["transform_matrix"][3][3] = 0
+    (sphere / "ground_truth" / "transforms.json").write_text(json.dumps(document))
+    faults = check_scan(sphere)
+    assert [(f.file, f.frame, f.field) for f in faults] == [
+        ("ground_truth/transforms.json", NAMES[2], "transform_matrix")
+    ]

@@ -1,0 +1,65 @@
+import io
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from sl_nerfstudio import progress
+from sl_nerfstudio.progress import track
+
+
+class Terminal(io.StringIO):
+    """What rich takes for a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    return stream
+
+
+def test_quiet_without_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+    assert list(track(range(5), "Working")) == [0, 1, 2, 3, 4]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_quiet_for_short_work(terminal: Terminal) -> None:
+    assert list(track(iter(range(5)), "Working")) == [0, 1, 2, 3, 4]
+    assert terminal.getvalue() == ""
+
+
+def test_a_bar_for_long_work(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+    assert list(track(["a", "b", "c"], "Working")) == ["a", "b", "c"]
+    assert "Working" in terminal.getvalue()
+    assert "/3" in terminal.getvalue()
+
+
+def test_one_bar_at_a_time_and_errors_pass_through(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+    pairs = [(i, j) for i in track(range(3), "Outer") for j in track(range(3), "Inner")]
+    assert pairs == [(i, j) for i in range(3) for j in range(3)]
+    assert "Outer" in terminal.getvalue()
+
+    def failing() -> Iterator[int]:
+        yield 1
+        yield 2
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        list(track(failing(), "Failing", total=4))
+    assert progress._shown is False
+
+
+def test_leaving_early_frees_the_bar(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+    for item in track(range(10), "Working"):
+        if item == 4:
+            break
+    assert progress._shown is False
