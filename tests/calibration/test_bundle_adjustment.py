@@ -37,9 +37,11 @@ def errors(found: Rig, true: Rig) -> tuple[float, float]:
     """Largest error of relative rotations between cameras (degree) and of aligned positions (scene units)."""
     R, Q = found.T_world_camera[:, :3, :3], true.T_world_camera[:, :3, :3]
     turns = (R.transpose(1, 2)[:, None] @ R[None]) @ (Q.transpose(1, 2)[:, None] @ Q[None]).transpose(-1, -2)
-    positions = [torch.cat([r.T_world_camera[:, :3, 3], r.T_world_projector[:, :3, 3]]).numpy() for r in (found, true)]
-    aligned = fit_similarity(*positions).points(positions[0])
-    return degrees(float(log_so3(turns).norm(dim=-1).max())), float(np.abs(aligned - positions[1]).max())
+    at, expected = (
+        torch.cat([r.T_world_camera[:, :3, 3], r.T_world_projector[:, :3, 3]]).numpy() for r in (found, true)
+    )
+    aligned = fit_similarity(at, expected).points(at)
+    return degrees(float(log_so3(turns).norm(dim=-1).max())), float(np.abs(aligned - expected).max())
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +125,9 @@ def test_wrong_cells_do_not_spoil_it(true):
     maps = SpoiltMaps(
         m.values, m.offsets, m.widths, m.heights, true, cells.repeat_interleave(5, 1).repeat_interleave(5, 2)
     )
-    turn, shift = errors(adjust(disturbed(true), maps, prior_of(FRAMES), "known-rig", replace(QUICK, max_iterations=30)).rig, true)
+    turn, shift = errors(
+        adjust(disturbed(true), maps, prior_of(FRAMES), "known-rig", replace(QUICK, max_iterations=30)).rig, true
+    )
     assert turn < 1e-2 and shift < 1e-3
 
 

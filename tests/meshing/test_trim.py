@@ -193,7 +193,7 @@ def box(bottom: float, top: float, half: float = 30.0) -> Mesh:
         q = (p - p.new_tensor(centre)).abs() - p.new_tensor(size)
         return q.clamp_min(0).norm(dim=-1) + q.max(-1).values.clamp_max(0)
 
-    return extract_mesh(sdf, 41, (-41.0,) * 3, (41.0,) * 3)
+    return extract_mesh(sdf, 41, (-41.0, -41.0, -41.0), (41.0, 41.0, 41.0))
 
 
 def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
