@@ -9,6 +9,8 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 matplotlib.use("Agg")
 
@@ -64,7 +66,7 @@ def main(demo: Path) -> None:
         axis.set_title(title, fontsize=11)
         axis.axis("off")
     bar = figure.colorbar(
-        matplotlib.cm.ScalarMappable(matplotlib.colors.Normalize(-limit, limit), "RdBu_r"),
+        ScalarMappable(Normalize(-limit, limit), "RdBu_r"),
         ax=axes,
         fraction=0.012,
         pad=0.01,

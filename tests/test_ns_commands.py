@@ -17,6 +17,7 @@ import torch
 import trimesh
 import yaml
 from PIL import Image
+
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 
 with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
@@ -36,11 +37,20 @@ from sl_nerfstudio.model.pipeline import SLPipeline
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
-SMALL = (
-    "--pipeline.model.sdf.log2-table-size 12 --pipeline.model.sdf.max-resolution 64 "
-    "--pipeline.model.sdf.hidden 32 --pipeline.datamanager.train-num-rays-per-batch 256 "
-    "--logging.steps-per-log 20 --steps-per-eval-batch 20 "
-).split()
+SMALL = [
+    "--pipeline.model.sdf.log2-table-size",
+    "12",
+    "--pipeline.model.sdf.max-resolution",
+    "64",
+    "--pipeline.model.sdf.hidden",
+    "32",
+    "--pipeline.datamanager.train-num-rays-per-batch",
+    "256",
+    "--logging.steps-per-log",
+    "20",
+    "--steps-per-eval-batch",
+    "20",
+]
 STEPS = 40
 
 

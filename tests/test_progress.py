@@ -15,11 +15,12 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+def use_terminal(monkeypatch: pytest.MonkeyPatch, show_after: float = -1.0) -> Terminal:
+    """From here on stderr is a terminal (in a fixture pytest would put its own stream back)."""
     stream = Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", show_after)
     return stream
 
 
@@ -29,20 +30,21 @@ def test_quiet_without_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert capsys.readouterr() == ("", "")
 
 
-def test_quiet_for_short_work(terminal: Terminal) -> None:
+def test_quiet_for_short_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = use_terminal(monkeypatch, show_after=1e9)
     assert list(track(iter(range(5)), "Working")) == [0, 1, 2, 3, 4]
     assert terminal.getvalue() == ""
 
 
-def test_a_bar_for_long_work(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+def test_a_bar_for_long_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = use_terminal(monkeypatch)
     assert list(track(["a", "b", "c"], "Working")) == ["a", "b", "c"]
     assert "Working" in terminal.getvalue()
     assert "/3" in terminal.getvalue()
 
 
-def test_one_bar_at_a_time_and_errors_pass_through(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+def test_one_bar_at_a_time_and_errors_pass_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = use_terminal(monkeypatch)
     pairs = [(i, j) for i in track(range(3), "Outer") for j in track(range(3), "Inner")]
     assert pairs == [(i, j) for i in range(3) for j in range(3)]
     assert "Outer" in terminal.getvalue()
@@ -57,8 +59,8 @@ def test_one_bar_at_a_time_and_errors_pass_through(terminal: Terminal, monkeypat
     assert progress._shown is False
 
 
-def test_leaving_early_frees_the_bar(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+def test_leaving_early_frees_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_terminal(monkeypatch)
     for item in track(range(10), "Working"):
         if item == 4:
             break

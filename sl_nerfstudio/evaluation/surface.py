@@ -10,6 +10,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.meshing.mesh import Mesh
 
+_LONGEST = 1 / 100  # of the size: edges of thin triangles, for nearest points
+
 
 @dataclass(frozen=True)
 class Closest:
@@ -29,6 +31,31 @@ class RayHits:
     face: Int[ndarray, "n"]  # -1 where nothing is hit
 
 
+def split_long(corners: Float[ndarray, "f 3 3"], longest: float) -> tuple[Float[ndarray, "g 3 3"], Int[ndarray, "g"]]:
+    """Bisect long thin triangles until no edge exceeds `longest` or the pieces are thin no more.
+
+    Returns the pieces' corners and the triangle each belongs to. Thin: ten times longer than high.
+    """
+    origin = np.arange(len(corners))
+    done: list[ndarray] = []
+    done_origin: list[ndarray] = []
+    while len(corners):
+        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        edge = edges.argmax(1)
+        length = edges.max(1)
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        split = (length > longest) & (area < 0.1 * length**2)
+        done.append(corners[~split])
+        done_origin.append(origin[~split])
+        # Turned so that the longest edge is the first one: a - b, with c opposite.
+        turned = np.take_along_axis(corners[split], ((edge[split, None] + np.arange(3)) % 3)[..., None], 1)
+        a, b, c = turned.transpose(1, 0, 2)
+        middle = (a + b) / 2
+        corners = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+        origin = np.concatenate([origin[split]] * 2)
+    return np.concatenate(done), np.concatenate(done_origin)
+
+
 class Surface:
     """A mesh with at least one triangle, in any unit and anywhere in space.
 
@@ -44,13 +71,26 @@ class Surface:
         self.centre = (self.lower + self.upper) / 2
         self.diagonal = float(np.linalg.norm(self.upper - self.lower))
         self._scale = 1 / max(self.diagonal, 1e-300)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            o3d.core.Tensor(self._inside(self.vertices)), o3d.core.Tensor(self.faces.astype(np.uint32))
-        )
+        self._scene = self._build(self.vertices, self.faces)
 
     def _inside(self, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
         return ((p - self.centre) * self._scale).astype(np.float32)
+
+    def _build(self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> o3d.t.geometry.RaycastingScene:
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(o3d.core.Tensor(self._inside(vertices)), o3d.core.Tensor(faces.astype(np.uint32)))
+        return scene
+
+    @cached_property
+    def _compact(self) -> tuple[o3d.t.geometry.RaycastingScene, Int[ndarray, "n"] | None]:
+        """Scene for nearest points, and the face that each of its triangles is a piece of (None: the same faces).
+
+        In float32 the nearest point of a long thin triangle (a CAD cylinder's) can be wrong by its width.
+        """
+        pieces, origin = split_long(self.vertices[self.faces], _LONGEST * self.diagonal)
+        if len(pieces) == len(self.faces):
+            return self._scene, None
+        return self._build(pieces.reshape(-1, 3), np.arange(3 * len(pieces)).reshape(-1, 3)), origin
 
     @cached_property
     def face_cross(self) -> Float[ndarray, "f 3"]:
@@ -80,11 +120,13 @@ class Surface:
 
     def closest(self, points: Float[ndarray, "n 3"]) -> Closest:
         """Nearest point of the surface (on its triangles, not its vertices) for each point."""
-        answer = self._scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
+        scene, origin = self._compact
+        answer = scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
         on_surface = answer["points"].numpy().astype(np.float64) / self._scale + self.centre
         normal = answer["primitive_normals"].numpy().astype(np.float64)
         # The plane of the triangle in float64: the float32 foot point is only good to 1e-7 of the size.
         face = answer["primitive_ids"].numpy().astype(np.int64)
+        face = face if origin is None else origin[face]
         corner = self.vertices[self.faces[face, 0]]
         cross = self.face_cross[face]
         length = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -63,11 +63,11 @@ class Intrinsics:
         if isinstance(devices, Device):
             one = Intrinsics.of([devices], dtype)
             return Intrinsics(one.params[0], one.model, one.distorted)
-        models = {d.model for d in devices}
+        models: list[DeviceKind] = sorted({d.model for d in devices})
         if len(models) != 1:
-            raise ValueError(f"devices of one batch must share a model, got {sorted(models)}")
+            raise ValueError(f"devices of one batch must share a model, got {models}")
         params = torch.tensor([[getattr(d, k) for k in PARAMETERS] for d in devices], dtype=dtype)
-        return Intrinsics(params, models.pop(), bool((params[:, 4:] != 0).any()))
+        return Intrinsics(params, models[0], bool((params[:, 4:] != 0).any()))
 
     def __getitem__(self, index: Int[Tensor, "*n"] | int | slice) -> "Intrinsics":
         """Devices chosen along the first batch dimension."""
@@ -75,7 +75,7 @@ class Intrinsics:
 
     def to(self, *args: torch.device | torch.dtype | str) -> "Intrinsics":
         """On another device or of another dtype."""
-        return Intrinsics(self.params.to(*args), self.model, self.distorted)
+        return Intrinsics(self.params.to(*args), self.model, self.distorted)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     def reshape(self, *shape: int) -> "Intrinsics":
         """With another batch shape, for broadcasting against points."""

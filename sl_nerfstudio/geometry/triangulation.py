@@ -34,7 +34,7 @@ def closest_approach(
 
     Lines closer to parallel than 1e-6 rad give NaN.
     """
-    between = o2 - o1
+    between, d1, d2 = torch.broadcast_tensors(o2 - o1, d1, d2)
     # By cross products: 1 - cos^2 of the angle between the lines would lose all digits of float32 at small baselines.
     normal = torch.linalg.cross(d1, d2)
     sin2 = (normal * normal).sum(-1)

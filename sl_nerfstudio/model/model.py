@@ -161,6 +161,8 @@ class SLModel(Model):
         uses_cache = self.training and c.sampling.strategy == "surface" and self._renders(step)
         if uses_cache and (not self.cache.filled or step % _REFRESH_EVERY == 0):
             self.cache.refresh(self.field)
+        if self.training:  # training goes on: with the cache as it was, or the resumed run would be another one
+            self._cache_is_old = False
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: the levels must be those of that step."""

@@ -21,7 +21,7 @@ _OFFSETS = np.array(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GridPattern:
     """Description of a coded grid; lengths in pattern pixels."""
 

@@ -12,12 +12,14 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
+from sl_nerfstudio.progress import track
 from sl_nerfstudio.synthesis.scene import Scene
 
 Number = float | int
 Triple = tuple[Number, Number, Number]
 Field = Callable[[Float[ndarray, "n 3"]], Float[ndarray, "n"]]
 _NEWTON_STEPS = 2
+_BLOCK = 50_000  # points evaluated together
 
 
 def ellipsoid(centre: Triple, radii: Triple, turn_deg: Triple = (0.0, 0.0, 0.0)) -> Field:
@@ -149,8 +151,8 @@ def _sample_near_level(
         place = place[((place >= 0) & (place <= count)).all(1)]
         wanted[tuple(place.T)] = True
     places = np.argwhere(wanted)
-    for start in range(0, len(places), 200_000):
-        block = places[start : start + 200_000]
+    for start in track(range(0, len(places), _BLOCK), "shaping"):
+        block = places[start : start + _BLOCK]
         fine[tuple(block.T)] = field(low + cell * block)
     return fine
 

@@ -26,9 +26,8 @@ SPECIAL = [0.0, 1e-12, 1e-7, 1e-5, 1e-3, 0.29999, 0.3, 0.30001, 1.0, 3.0]
 def twist_matrix(xi: Tensor) -> Tensor:
     """The element of the Lie algebra, (*batch, 4, 4)."""
     out = torch.zeros(*xi.shape[:-1], 4, 4, dtype=xi.dtype)
-    out[..., :3, :3] = torch.linalg.cross(
-        xi[..., None, 3:].expand(*xi.shape[:-1], 3, 3), torch.eye(3, dtype=xi.dtype)
-    ).transpose(-1, -2)
+    for column, axis in enumerate(torch.eye(3, dtype=xi.dtype)):
+        out[..., :3, column] = torch.linalg.cross(xi[..., 3:], axis.expand_as(xi[..., 3:]))
     out[..., :3, 3] = xi[..., :3]
     return out
 

@@ -67,6 +67,13 @@ def test_closest_approach_is_the_least_squares_solution(seed: int, batch: tuple[
         assert np.abs(best - [found_s, found_t]).max() < 1e-8 * (1 + np.abs(best).max())
 
 
+def test_lines_broadcast() -> None:
+    d1 = torch.tensor([1.0, 0, 0])
+    o2 = torch.tensor([[[3.0, 4, 5]], [[6.0, 8, 5]]])
+    s, t = closest_approach(torch.zeros(3), d1, o2, torch.tensor([[0.0, 1, 0]]))
+    assert (s.tolist(), t.tolist()) == ([[3], [6]], [[-4], [-8]])
+
+
 def test_skew_lines_by_hand() -> None:
     o1, d1 = torch.tensor([0.0, 0, 0]), torch.tensor([1.0, 0, 0])
     o2, d2 = torch.tensor([3.0, 4, 5]), torch.tensor([0.0, 1, 0])
@@ -182,8 +189,21 @@ def test_points_behind_a_device_have_no_residual() -> None:
     half_turn = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
     assert bool(epipolar_residual(c, T_c @ half_turn, uv_c, q, T_p, uv_p).isnan().all())
     assert bool(epipolar_residual(c, T_c, uv_c, q, T_p @ half_turn, uv_p).isnan().all())
-    behind = triangulate(c, T_p, uv_c, q, T_c, uv_p)  # the two devices exchanged: rays part
-    assert bool((behind.depth_camera < 0).all())
+
+
+def test_rays_that_part_meet_behind() -> None:
+    """On the axis of a camera, projector 0.4 to the right: the disparity of depth 3 with the wrong sign."""
+    device = DEVICES["pinhole"]
+    intrinsics = Intrinsics.of(device, torch.float64)
+    T_c, T_p = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    T_p[0, 3] = 0.4
+    centre = torch.tensor([device.cx, device.cy], dtype=torch.float64)
+    disparity = torch.tensor([device.fl_x * 0.4 / 3, 0], dtype=torch.float64)
+    for sign, depth in ((-1, 3.0), (1, -3.0)):
+        found = triangulate(intrinsics, T_c, centre, intrinsics, T_p, centre + sign * disparity)
+        assert float(found.depth_camera) == pytest.approx(depth)
+        assert float(found.depth_projector) == pytest.approx(depth * (1 + (0.4 / 3) ** 2) ** 0.5)
+        assert found.p_world.tolist() == pytest.approx([0, 0, -depth], abs=1e-12)
 
 
 @given(seeds, batches)

@@ -49,7 +49,7 @@ def test_coordinates_are_those_of_the_first_point_on_the_mesh(scan):
     mesh = trimesh.load(scan / "ground_truth/mesh.ply", process=False)
     rng = np.random.default_rng(0)
     for camera, projector, T_c, T_p, coords, mask in _frames(scan):
-        uv = rng.permutation(_pixels(mask))[:60]
+        uv = rng.permutation(_pixels(mask))[:40]
         d = analytic.camera_rays(camera, T_c, uv)
         t = analytic.nearest_on_mesh(mesh.vertices, mesh.faces, T_c[:3, 3], d)
         expected = analytic.projector_pixels(projector, T_p, T_c[:3, 3] + t[:, None] * d)
@@ -65,7 +65,7 @@ def test_the_mask_is_what_both_devices_see(scan):
     for camera, projector, T_c, T_p, _, mask in _frames(scan):
         closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((25, 25))) > 0
         around = closed & ~mask  # mostly shadows
-        uv = np.concatenate([rng.permutation(_pixels(part))[:70] for part in (mask, around)])
+        uv = np.concatenate([rng.permutation(_pixels(part))[:45] for part in (mask, around)])
         d = analytic.camera_rays(camera, T_c, uv)
         t = analytic.nearest_on_mesh(mesh.vertices, mesh.faces, T_c[:3, 3], d)
         hit = np.isfinite(t)
@@ -80,7 +80,7 @@ def test_the_mask_is_what_both_devices_see(scan):
         column, row = (uv - 0.5).astype(int).T
         assert (mask[row, column] == expected).all()
         shadowed += (hit & ~expected).sum()
-    assert shadowed > 30, "the sample must hold points in the shadow"
+    assert shadowed > 20, "the sample must hold points in the shadow"
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,7 @@ def test_poses_stay_rigid_and_follow_the_seed(scene, truth, rig):
 
 def test_sigma_is_the_error_along_each_axis(scene, truth):
     rng = np.random.default_rng(0)
-    n = 4000
+    n = 1500
     camera = np.repeat(truth.T_world_camera[:1], n, 0)
     projector = np.repeat(truth.T_world_projector[:1], n, 0)
     motion, relative = (np.tile(np.eye(4), (n, 1, 1)) for _ in range(2))
@@ -161,10 +161,10 @@ def test_sigma_is_the_error_along_each_axis(scene, truth):
     relative[:, :3, :3] = Rotation.from_rotvec(np.radians(0.1) * rng.standard_normal((n, 3))).as_matrix()
     relative[:, :3, 3] = 0.5 * rng.standard_normal((n, 3))
     sigma = pose_sigma(Poses(camera, projector), Poses(motion @ camera, motion @ projector @ relative), scene.centre)
-    assert sigma.camera_translation == pytest.approx(2.0, rel=0.03)
-    assert sigma.camera_rotation_deg == pytest.approx(0.7, rel=0.03)
-    assert sigma.relative_translation == pytest.approx(0.5, rel=0.03)
-    assert sigma.relative_rotation_deg == pytest.approx(0.1, rel=0.03)
+    assert sigma.camera_translation == pytest.approx(2.0, rel=0.05)
+    assert sigma.camera_rotation_deg == pytest.approx(0.7, rel=0.05)
+    assert sigma.relative_translation == pytest.approx(0.5, rel=0.05)
+    assert sigma.relative_rotation_deg == pytest.approx(0.1, rel=0.05)
 
 
 def test_sigma_has_no_zeros_where_only_registration_errs(scene, truth, rig):
