@@ -11,7 +11,7 @@ from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import Fault, ScanError, UserError
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scan"))
-from sphere_scan import edit, write_sphere
+from sphere_scan import edit, write_sphere  # pyright: ignore[reportMissingImports]
 
 
 @pytest.fixture(scope="module")
