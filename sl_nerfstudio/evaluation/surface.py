@@ -8,10 +8,8 @@ import open3d as o3d
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from sl_nerfstudio.evaluation.triangles import nearest_on_triangle, neighbours, thin
 from sl_nerfstudio.meshing.mesh import Mesh
-
-_LONGEST = 1 / 100  # of the size: edges of thin triangles, for nearest points
-
 
 @dataclass(frozen=True)
 class Closest:
@@ -29,31 +27,6 @@ class RayHits:
     hit: Bool[ndarray, "n"]
     distance: Float[ndarray, "n"]  # along the unit direction; NaN where nothing is hit
     face: Int[ndarray, "n"]  # -1 where nothing is hit
-
-
-def split_long(corners: Float[ndarray, "f 3 3"], longest: float) -> tuple[Float[ndarray, "g 3 3"], Int[ndarray, "g"]]:
-    """Bisect long thin triangles until no edge exceeds `longest` or the pieces are thin no more.
-
-    Returns the pieces' corners and the triangle each belongs to. Thin: ten times longer than high.
-    """
-    origin = np.arange(len(corners))
-    done: list[ndarray] = []
-    done_origin: list[ndarray] = []
-    while len(corners):
-        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-        edge = edges.argmax(1)
-        length = edges.max(1)
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        split = (length > longest) & (area < 0.1 * length**2)
-        done.append(corners[~split])
-        done_origin.append(origin[~split])
-        # Turned so that the longest edge is the first one: a - b, with c opposite.
-        turned = np.take_along_axis(corners[split], ((edge[split, None] + np.arange(3)) % 3)[..., None], 1)
-        a, b, c = turned.transpose(1, 0, 2)
-        middle = (a + b) / 2
-        corners = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
-        origin = np.concatenate([origin[split]] * 2)
-    return np.concatenate(done), np.concatenate(done_origin)
 
 
 class Surface:
@@ -81,16 +54,18 @@ class Surface:
         scene.add_triangles(o3d.core.Tensor(self._inside(vertices)), o3d.core.Tensor(faces.astype(np.uint32)))
         return scene
 
-    @cached_property
-    def _compact(self) -> tuple[o3d.t.geometry.RaycastingScene, Int[ndarray, "n"] | None]:
-        """Scene for nearest points, and the face that each of its triangles is a piece of (None: the same faces).
+    def _corners(self, face: Int[ndarray, "n"]) -> tuple[Float[ndarray, "n 3"], ...]:
+        return tuple(self.vertices[self.faces[face, k]] for k in range(3))
 
-        In float32 the nearest point of a long thin triangle (a CAD cylinder's) can be wrong by its width.
-        """
-        pieces, origin = split_long(self.vertices[self.faces], _LONGEST * self.diagonal)
-        if len(pieces) == len(self.faces):
-            return self._scene, None
-        return self._build(pieces.reshape(-1, 3), np.arange(3 * len(pieces)).reshape(-1, 3)), origin
+    @cached_property
+    def _neighbours(self) -> Int[ndarray, "f 3"]:
+        return neighbours(self.faces)
+
+    @cached_property
+    def _by_thin(self) -> Bool[ndarray, "f"]:
+        """Triangles that are long and thin, or have such a neighbour."""
+        is_thin = thin(self.vertices[self.faces])
+        return is_thin | is_thin[self._neighbours].any(1) if is_thin.any() else is_thin
 
     @cached_property
     def face_cross(self) -> Float[ndarray, "f 3"]:
@@ -120,19 +95,22 @@ class Surface:
 
     def closest(self, points: Float[ndarray, "n 3"]) -> Closest:
         """Nearest point of the surface (on its triangles, not its vertices) for each point."""
-        scene, origin = self._compact
-        answer = scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
-        on_surface = answer["points"].numpy().astype(np.float64) / self._scale + self.centre
-        normal = answer["primitive_normals"].numpy().astype(np.float64)
-        # The plane of the triangle in float64: the float32 foot point is only good to 1e-7 of the size.
+        answer = self._scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
         face = answer["primitive_ids"].numpy().astype(np.int64)
-        face = face if origin is None else origin[face]
-        corner = self.vertices[self.faces[face, 0]]
-        cross = self.face_cross[face]
-        length = np.linalg.norm(cross, axis=1, keepdims=True)
-        normal = np.where(length > 0, cross / np.maximum(length, 1e-300), normal)
-        on_surface -= ((on_surface - corner) * normal).sum(1, keepdims=True) * normal
-        return Closest(np.linalg.norm(points - on_surface, axis=1), on_surface, normal)
+        # Open3D's foot point is good to 1e-7 of the size, except on long thin triangles (of a CAD cylinder), where
+        # float32 can miss the right one. So: the nearest of that triangle and its neighbours, in float64.
+        foot = nearest_on_triangle(points, *self._corners(face))
+        best = np.linalg.norm(points - foot, axis=1)
+        near_thin = np.flatnonzero(self._by_thin[face])
+        for other in self._neighbours[face[near_thin]].T:
+            candidate = nearest_on_triangle(points[near_thin], *self._corners(other))
+            distance = np.linalg.norm(points[near_thin] - candidate, axis=1)
+            better = distance < best[near_thin]
+            index = near_thin[better]
+            best[index], foot[index] = distance[better], candidate[better]
+            face[index] = other[better]
+        length = np.linalg.norm(self.face_cross[face], axis=1, keepdims=True)
+        return Closest(best, foot, self.face_cross[face] / np.maximum(length, 1e-300))
 
     def distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Distance of each point from the surface."""

@@ -34,7 +34,7 @@ def test_a_good_scan(good: Path) -> None:
         "  frames              4, 72 x 60 pixels",
         "  projector           OPENCV, 128 x 96 pixels",
         "  units               mm, scale not known",
-        "  working distance    241.3 mm (median)",
+        "  working distance    270.1 mm (median)",
     ]
     assert lines[6].startswith("  starting poses      epipolar residual ")
 
