@@ -15,7 +15,6 @@ from matplotlib.colors import Normalize
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
-from PIL import Image
 
 from sl_nerfstudio.evaluation.pictures import ColourScale, View, render
 from sl_nerfstudio.evaluation.surface import Surface
@@ -74,7 +73,6 @@ def main(demo: Path) -> None:
     bar.set_label(scan.units)
     target = Path(__file__).parent / "pictures" / "demo.png"
     figure.savefig(target, bbox_inches="tight")
-    Image.open(target).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
     print(f"{target}: {target.stat().st_size // 1000} kB")
 
 

@@ -1,0 +1,161 @@
+"""sl-export on a run of ns-train, and on runs that were moved, cut off or made by another method."""
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from sl_nerfstudio.cli.export import main
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.meshing.trained_run import load_run
+from sl_nerfstudio.scan import read_poses, read_scan
+from tests.dataparser.tiny_scan import RADIUS, TinyScan
+from tests.test_ns_commands import train
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
+
+S_WORLD_MM = Similarity(0.1, np.diag([1.0, -1.0, -1.0]), np.array([5.0, -2.5, 20.0]))  # cm, turned and shifted
+CHECKPOINT = "nerfstudio_models/step-000000039.ckpt"
+
+
+@pytest.fixture(scope="module")
+def scan_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scan = TinyScan(units="cm", S_world_mm=S_WORLD_MM, undecoded=0.05)
+    return scan.write(tmp_path_factory.mktemp("scans") / "sphere")
+
+
+@pytest.fixture(scope="module")
+def config(scan_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield train(patch, scan_root, tmp_path_factory.mktemp("outputs"), 40)
+
+
+@pytest.fixture()
+def copy(config: Path, tmp_path: Path) -> Path:
+    """The run's folder, to be spoilt."""
+    return Path(shutil.copytree(config.parent, tmp_path / "copy"))
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["sl-export", *map(str, arguments)])
+    main()
+
+
+def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypatch, capsys):
+    mesh_path, refined = tmp_path / "a mesh.ply", tmp_path / "refined"
+    command(monkeypatch, "--load-config", config, "--output", mesh_path, "--poses", refined, "--resolution", 64)
+    said = capsys.readouterr().out
+    mesh = read_mesh(mesh_path)
+    off_mm = np.abs(np.linalg.norm(mesh.vertices - S_WORLD_MM.t, axis=1) / S_WORLD_MM.scale - RADIUS)
+    assert np.median(off_mm) < 0.05 * RADIUS  # 40 steps; in wrong units or axes it would be off by 0.5 and more
+    towards = (mesh.vertices - S_WORLD_MM.t) @ np.diag([1.0, -1.0, -1.0])
+    assert towards[:, 2].max() > 3.5 > -2.5 > towards[:, 2].min() - 1  # cut at the back, which no frame saw
+    scan = read_scan(scan_root)
+    camera, projector = read_poses(refined / "transforms.json", scan)
+    assert camera is not None and projector is not None
+    np.testing.assert_allclose(camera[:, :3, 3], scan.T_world_camera[:, :3, 3], atol=0.5)  # cm
+    record = json.loads((refined / "training.json").read_text())
+    assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["step"] == 39
+    assert record["settings"]["model"]["sdf"]["hidden"] == 32
+    assert len(record["curves"]["step"]) > 0 and record["versions"]["torch"] == torch.__version__
+    assert f"sl-eval --mesh '{mesh_path}' --data {scan_root} --poses {refined}/transforms.json" in said
+    assert " cm\n" in said
+
+
+def test_faults_end_with_status_1_and_no_traceback(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as end:
+        command(monkeypatch, "--load-config", tmp_path / "config.yml", "--output", tmp_path / "m.ply")
+    error = capsys.readouterr().err
+    assert end.value.code == 1 and error.startswith("error: --load-config") and "Traceback" not in error
+    assert "no such file" in error and "outputs/SCAN/sl-neus/DATE/config.yml" in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_moved_run_is_found_beside_its_config(config, tmp_path):
+    moved = tmp_path / "moved"
+    config.parent.rename(moved)
+    try:
+        assert load_run(moved).step == 39  # a folder will do
+        assert load_run(moved / "config.yml").step == 39
+    finally:
+        moved.rename(config.parent)
+
+
+def test_a_moved_scan_is_asked_for(copy, scan_root):
+    text = (copy / "config.yml").read_text()
+    settings = yaml.load(text, Loader=yaml.Loader)
+    settings.pipeline.datamanager.data = settings.data = Path("/gone/for good")
+    (copy / "config.yml").write_text(yaml.dump(settings))
+    with pytest.raises(UserError, match=r"/gone/for good: no transforms.json(.|\n)*moved(.|\n)*--data FOLDER"):
+        load_run(copy)
+    assert load_run(copy, scan_root).model.scan.root == scan_root
+    with pytest.raises(UserError, match=r"elsewhere: no transforms.json(.|\n)*mistyped"):
+        load_run(copy, Path("elsewhere"))
+
+
+def test_no_checkpoint(copy):
+    shutil.rmtree(copy / "nerfstudio_models")
+    settings = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    settings.experiment_name = "another"
+    (copy / "config.yml").write_text(yaml.dump(settings))
+    with pytest.raises(UserError, match=r"no checkpoint step-\*.ckpt(.|\n)*broken off(.|\n)*train again"):
+        load_run(copy)
+
+
+def test_a_checkpoint_that_is_cut_off(copy):
+    path = copy / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"cannot be read as a checkpoint(.|\n)*cut off"):
+        load_run(copy)
+
+
+def test_a_checkpoint_that_lacks_weights(copy):
+    state = torch.load(copy / CHECKPOINT)
+    key = next(k for k in state["pipeline"] if "mlp" in k)
+    del state["pipeline"][key]
+    torch.save(state, copy / CHECKPOINT)
+    with pytest.raises(UserError, match=r"lacks 1 of the model's weights(.|\n)*another version"):
+        load_run(copy)
+
+
+@pytest.mark.parametrize("text", ["", "a: [", "just words", "!!python/object:no.such.Class {}", "a: 1\n"])
+def test_a_config_that_is_none(text, tmp_path):
+    (tmp_path / "config.yml").write_text(text)
+    with pytest.raises(UserError, match=r"config.yml: (cannot be read as|is no training configuration)"):
+        load_run(tmp_path)
+
+
+def test_a_run_of_another_method(tmp_path):
+    from nerfstudio.configs.method_configs import all_methods
+
+    (tmp_path / "config.yml").write_text(yaml.dump(all_methods["nerfacto"]))
+    with pytest.raises(UserError, match=r"is a run of nerfacto(.|\n)*use ns-export"):
+        load_run(tmp_path)
+
+
+def test_a_scan_that_was_changed_since(copy, scan_root, tmp_path):
+    changed = Path(shutil.copytree(scan_root, tmp_path / "changed"))
+    document = json.loads((changed / "transforms.json").read_text())
+    for frame in document["frames"]:
+        for key in ("transform_matrix", "projector_transform_matrix"):
+            frame[key][0][3] += 3.0
+    (changed / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(UserError, match=r"does not lie in the scene as it did(.|\n)*unchanged scan"):
+        load_run(copy, changed)
+
+
+def test_a_scan_with_fewer_frames(copy, scan_root, tmp_path):
+    changed = Path(shutil.copytree(scan_root, tmp_path / "changed"))
+    document = json.loads((changed / "transforms.json").read_text())
+    document["frames"] = document["frames"][:2]
+    (changed / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(UserError, match=r"does not fit the scan(.|\n)*other frames(.|\n)*--data FOLDER"):
+        load_run(copy, changed)
