@@ -11,6 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.evaluation.triangles import nearest_on_triangle, neighbours, thin
 from sl_nerfstudio.meshing.mesh import Mesh
 
+
 @dataclass(frozen=True)
 class Closest:
     """Nearest points on a surface."""

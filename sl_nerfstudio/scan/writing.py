@@ -92,11 +92,11 @@ class ScanWriter:
         name: str,
         *,
         image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"],
-        coords: Float32[ndarray, "h w 2"] | None,
+        coords: Float32[ndarray, "_ _ 2"] | None,
         T_world_camera: Float[ndarray, "4 4"],
         T_world_projector: Float[ndarray, "4 4"],
-        pattern: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"] | None = None,
-        mask: Bool[ndarray, "h w"] | None = None,
+        pattern: UInt8[ndarray, "_ _"] | UInt16[ndarray, "_ _"] | None = None,
+        mask: Bool[ndarray, "_ _"] | None = None,
         camera: Device | None = None,
         pose_sigma: PoseSigma | None = None,
         true_poses: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]] | None = None,
@@ -111,7 +111,11 @@ class ScanWriter:
         device = camera or self._camera
         if device is None:
             raise ValueError("a frame without common intrinsics needs a camera of its own")
-        if any(f["file_path"] == f"images/{name}.png" for f in self._frames) or not name or Path(name).name != name:
+        if (
+            any(f["file_path"] == f"images/{name}.png" for f in self._frames)
+            or name in ("", ".", "..")
+            or Path(name).name != name
+        ):
             raise ValueError(f"frame name {name!r} was given before or is no file name")
         for what, array in (("image", image), ("coords", coords), ("pattern", pattern), ("mask", mask)):
             if array is not None and array.shape[:2] != (device.h, device.w):
@@ -147,11 +151,21 @@ class ScanWriter:
     def _finish(self) -> None:
         if not self._frames:
             raise UserError(f"{self.root}: no frame was written")
+        self._settle_intrinsics()
         if self._truth:
             truth = {k: v for k, v in self._head.items() if k != "sl_pose_sigma"}
             frames = [{k: v for k, v in f.items() if k != "sl_pose_sigma"} for f in self._truth]
             self._write("ground_truth/transforms.json", encode_json({**truth, "frames": frames}))
         self._write("transforms.json", encode_json({**self._head, "frames": self._frames}))
+
+    def _settle_intrinsics(self) -> None:
+        """Once one frame has a camera of its own, every frame gets its own: programs differ in which they believe."""
+        if self._camera is None or not any("fl_x" in frame for frame in self._frames):
+            return
+        common = device_fields(self._camera, "camera_model")
+        self._head = {key: value for key, value in self._head.items() if key not in common}
+        self._frames = [{**common, **frame} for frame in self._frames]
+        self._truth = [{**common, **frame} for frame in self._truth]
 
     def _remove(self) -> None:
         """Remove what this writer wrote, and the folders it made, as far as the system allows."""
