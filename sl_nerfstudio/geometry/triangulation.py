@@ -25,11 +25,11 @@ class Triangulation:
 
 
 def closest_approach(
-    o1: Float[Tensor, "*batch 3"],
-    d1: Float[Tensor, "*batch 3"],
-    o2: Float[Tensor, "*batch 3"],
-    d2: Float[Tensor, "*batch 3"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    o1: Float[Tensor, "*#batch 3"],
+    d1: Float[Tensor, "*#batch 3"],
+    o2: Float[Tensor, "*#batch 3"],
+    d2: Float[Tensor, "*#batch 3"],
+) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
     """Distances along two lines (unit directions) of the points where they are nearest to each other.
 
     Lines closer to parallel than 1e-6 rad give NaN.

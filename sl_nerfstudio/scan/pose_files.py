@@ -27,7 +27,7 @@ def write_transforms(
     path: Path,
     scan: Scan,
     T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
+    T_world_projector: Float[ndarray, "m 4 4"],
     extra_frame_fields: Sequence[dict[str, Any]] | None = None,
     extra_fields: dict[str, Any] | None = None,
 ) -> None:
