@@ -7,7 +7,6 @@ residuals, and docs/method.md for why this comes before, and not out of, volume 
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -24,12 +23,12 @@ from sl_nerfstudio.calibration.linearisation import (
     normal_equations,
     residuals_of,
 )
+from sl_nerfstudio.calibration.modes import RefinePoses, free_directions
 from sl_nerfstudio.geometry.devices import project, unproject
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.progress import track
 
-RefinePoses = Literal["free", "rigid-rig", "known-rig", "off"]
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
 _INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
 _SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
@@ -95,7 +94,7 @@ def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
     """
     rough = max(settings.max_iterations // 2 - settings.rigid_iterations, 1)
     found = [_Stage(refine, True, rough), _Stage(refine, False, settings.max_iterations)]
-    if refine in ("free", "rigid-rig"):
+    if refine in ("free", "rigid-rig"):  # a static projector has its place already
         found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
     return found
 
@@ -139,21 +138,6 @@ def observe(
     starts = torch.searchsorted(rows[0].contiguous(), rows[0].contiguous())
     rows = rows[:, torch.arange(rows.shape[1]) - starts < per_anchor]
     return Observations(rows[0], rows[1])
-
-
-def free_directions(refine: RefinePoses, frames: int) -> Float[Tensor, "unknowns k"]:
-    """Columns: the increments (delta, rho) of all frames that a mode leaves free."""
-    n, eye = frames, torch.eye(6 * frames, dtype=torch.float64)
-    zero = torch.zeros_like(eye)
-    delta = torch.cat([eye, zero])
-    if refine == "free":
-        return torch.cat([delta, torch.cat([zero, eye])], 1)
-    if refine == "rigid-rig":
-        shared = torch.eye(6, dtype=torch.float64).repeat(n, 1)
-        return torch.cat([delta, torch.cat([torch.zeros_like(shared), shared])], 1)
-    if refine == "known-rig":
-        return delta
-    return delta[:, :0]
 
 
 def prior_equations(
@@ -225,12 +209,11 @@ def adjust(
     per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // rig.frames))
     anchors = place_anchors(rig, maps, per_frame, generator)
     stages, stage_start = _stages(refine, settings), 0
-    B = free_directions(stages[0].refine, rig.frames)
     everything = float("inf")
     observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
     r = residuals_of(rig, anchors, observations, maps)
     if settings.max_iterations < 1 or not r.cross_valid.any():
-        return _unmoved(start, prior, B)
+        return _unmoved(start, prior, free_directions(refine, rig))
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
     noise = max(before, _NOISE_FLOOR)
     width, damping = 2 * noise, _DAMPING
@@ -248,20 +231,24 @@ def adjust(
         H_prior, g_prior = prior_equations(prior, start, rig)
         independent = _INDEPENDENT_ROWS * rig.frames / max(int(r.cross_valid.sum()), 1)
         trust = noise**2 / min(independent, 1.0) if stages[0].rough else noise**2
+        B = free_directions(stages[0].refine, rig)
         H = B.T @ (equations.H + trust * H_prior) @ B
         g = B.T @ (equations.g + trust * g_prior)
         rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
         small = size < _SMALL_STEP and (damping < 1 or size == 0)  # or damped to be small
         settled = width > _SETTLED * previous and small
-        last = iteration + 1 == settings.max_iterations  # H and B must be of one stage below
         over = settled or iteration + 1 - stage_start >= stages[0].iterations
-        if len(stages) > 1 and not last and over:
+        if len(stages) > 1 and over:
             stages, stage_start, damping = stages[1:], iteration + 1, _DAMPING
-            B = free_directions(stages[0].refine, rig.frames)
         elif settled and len(stages) == 1:
             break
-    r = residuals_of(rig, anchors, observations, maps)
+    linear = linearise(rig, anchors, observations, maps)
+    r = linear.residuals
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * width)
+    # at the result, with every residual trusted, in whichever stage the steps ended
+    equations = normal_equations(linear, anchors, observations, *_weights(r, width), rig.frames)
+    B = free_directions(refine, rig)
+    H = B.T @ (equations.H + noise**2 * prior_equations(prior, start, rig)[0]) @ B
     return Adjustment(
         rig=rig,
         covariance=_covariance(rig, B, H, noise),

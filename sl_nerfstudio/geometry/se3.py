@@ -158,6 +158,13 @@ def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     return pose(R_t, -(R_t @ T[..., :3, 3:]).squeeze(-1))
 
 
+def adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6 6"]:
+    """`exp(adjoint(T) xi) = T exp(xi) inverse(T)`, for xi = (translation, rotation)."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    upper = torch.cat([R, hat(t) @ R], -1)
+    return torch.cat([upper, torch.cat([torch.zeros_like(R), R], -1)], -2)
+
+
 def transform(T: Float[Tensor, "*#batch 4 4"], p: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
     """`p_a` of `p_b` under `T_a_b`; batch shapes broadcast."""
     return rotate(T, p) + T[..., :3, 3]

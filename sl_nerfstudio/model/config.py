@@ -5,7 +5,8 @@ from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
-from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, RefinePoses
+from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
+from sl_nerfstudio.calibration.modes import RefinePoses
 from sl_nerfstudio.model.field import FieldConfig
 from sl_nerfstudio.model.refinement import PriorConfig
 from sl_nerfstudio.model.schedule import AnnealingConfig
@@ -58,7 +59,7 @@ class SLModelConfig(ModelConfig):
     """Steps over which annealing proceeds; filled in by the trainer with the length of the run."""
     refine_poses: RefinePoses = "free"
     """What is refined: `free` (camera and projector of every frame), `rigid-rig` (frames, and one relative pose for
-    all of them), `known-rig` (frames only), `off`."""
+    all of them), `known-rig` (frames only), `static-projector` (frames, and a projector that never moves), `off`."""
     adjust_poses: bool = True
     """Adjust all poses jointly, by second-order steps on the decoded coordinates, before the first training step."""
     pose_parameters: Literal["rig", "independent"] = "rig"

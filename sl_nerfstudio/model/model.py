@@ -24,7 +24,7 @@ from sl_nerfstudio.model.direct import direct_losses, measure
 from sl_nerfstudio.model.field import SDFField
 from sl_nerfstudio.model.history import History
 from sl_nerfstudio.model.losses import coordinate_loss, pattern_loss
-from sl_nerfstudio.model.poses import IndependentPoses, RigPoses
+from sl_nerfstudio.model.poses import IndependentPoses, RigPoses, StaticProjectorPoses
 from sl_nerfstudio.model.refinement import refine, scene_rig, sigmas_in_scan_units
 from sl_nerfstudio.model.rendering import Rendered, render
 from sl_nerfstudio.model.sampling import first_crossing, sphere_interval, uniform_samples
@@ -35,6 +35,7 @@ from sl_nerfstudio.scan import Scan, read_scan
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
 _EVAL_SAMPLES = 24
 _SHADOW_SAMPLES = 32
+_POSE_PARAMETERS = {"rig": RigPoses, "independent": IndependentPoses}
 
 
 class SLModel(Model):
@@ -63,12 +64,12 @@ class SLModel(Model):
         self._cache_is_old = False  # after a checkpoint was loaded to be looked at: as old as the last refresh
         rig = scene_rig(self.scan, self.S_scene_world)
         moves = c.train_poses and c.refine_poses != "off"
-        make = RigPoses if c.pose_parameters == "rig" else IndependentPoses
+        make = StaticProjectorPoses if c.refine_poses == "static-projector" else _POSE_PARAMETERS[c.pose_parameters]
         self.device_poses = make(
             rig.T_world_camera,
             rig.T_world_projector,
             refine_camera=moves,
-            refine_projector=moves and c.refine_poses != "known-rig",
+            refine_projector=moves and c.refine_poses not in ("known-rig", "static-projector"),
             shared_projector=c.refine_poses == "rigid-rig",
         )
         projector = Intrinsics.of(self.scan.projector)

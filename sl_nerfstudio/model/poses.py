@@ -1,6 +1,7 @@
 """Poses of all devices as parameters, in the scene frame.
 
 `RigPoses` (ours): a frame moves as a whole, and its projector moves against its camera.
+`StaticProjectorPoses`: cameras move about a projector that does not.
 `IndependentPoses` (the paper's): camera and projector of a frame know nothing of each other.
 
 Both start from a *base* that may be replaced (by the joint adjustment) before training goes on; the
@@ -67,6 +68,14 @@ class RigPoses(Poses):
         camera = exp_se3(self.camera_step.double()) @ self.base_camera
         relative = exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
         return camera, camera @ relative
+
+
+class StaticProjectorPoses(Poses):
+    """`T_scene_camera = exp(delta) base`, and a projector that stays where it is: only cameras move about it."""
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See Poses."""
+        return exp_se3(self.camera_step.double()) @ self.base_camera, self.base_projector
 
 
 class IndependentPoses(Poses):

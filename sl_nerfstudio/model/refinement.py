@@ -11,16 +11,16 @@ from torch import Tensor
 from sl_nerfstudio.calibration.bundle_adjustment import (
     AdjustmentSettings,
     PosePrior,
-    RefinePoses,
     adjust,
 )
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.gauge import known_baseline, restore
 from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
 from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.calibration.modes import RefinePoses, constrained
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.se3 import inverse, pose
+from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
@@ -114,24 +114,21 @@ def refine(
     """Adjust all poses jointly, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
     maps, held_out = _maps(scan, samples)
-    begin = _with_shared_relative_pose(start) if mode == "rigid-rig" else start
-    found = adjust(begin, maps, pose_prior(scan, S_scene_world, prior), mode, settings)
+    stated = pose_prior(scan, S_scene_world, prior)
+    found = adjust(constrained(mode, start), maps, stated, mode, settings)
     known = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
     rig = restore(start, found.rig, known)
     verdict = compare(start, rig, held_out, maps, _GUARD_WIDTH * found.noise_px)
-    kept = rig if verdict.better else start
-    n = rig.frames
-    sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, n, 6).transpose(0, 1).reshape(n, 12)
-    return Refinement(kept.T_world_camera, kept.T_world_projector, sigma, verdict, found.noise_px)
+    if not verdict.better:
+        return Refinement(start.T_world_camera, start.T_world_projector, _prior_sigma(stated), verdict, found.noise_px)
+    sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, rig.frames, 6).transpose(0, 1)
+    return Refinement(rig.T_world_camera, rig.T_world_projector, sigma.flatten(1), verdict, found.noise_px)
 
 
-def _with_shared_relative_pose(rig: Rig) -> Rig:
-    """All frames with the mean of their relative poses: the chordal mean of rotations, the mean of translations."""
-    relative = rig.T_camera_projector
-    U, _, Vt = torch.linalg.svd(relative[:, :3, :3].mean(0))
-    sign = torch.tensor([1.0, 1.0, float(torch.det(U @ Vt).sign())], dtype=relative.dtype)
-    mean = pose((U * sign) @ Vt, relative[:, :3, 3].mean(0))
-    return Rig(rig.camera, rig.projector, rig.T_world_camera, mean.expand_as(relative).clone())
+def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:
+    """What is known of poses that were not refined: the uncertainty they came with, per axis."""
+    parts = (prior.frame_translation, prior.frame_rotation, prior.relative_translation, prior.relative_rotation)
+    return torch.stack(parts, 1).repeat_interleave(3, 1)
 
 
 def _maps(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOut]:

@@ -51,6 +51,16 @@ def rig_of(frames: int, size: int, projector: str = "pinhole") -> Rig:
     )
 
 
+def static_rig(frames: int, size: int) -> Rig:
+    """Cameras on a ring around one projector that stays where it is."""
+    light = look_at((0.6, -0.5, 3.0))
+    turns = [radians(360 * k / frames) for k in range(frames)]
+    camera = torch.stack([look_at((0.6 + 0.9 * cos(a), -0.5 + 0.9 * sin(a), 2.7)) for a in turns])
+    intrinsics = Intrinsics.of([camera_of(size)] * frames, torch.float64)
+    projector = Intrinsics.of(PROJECTORS["pinhole"], torch.float64)
+    return Rig(intrinsics, projector, camera, inverse(camera) @ light)
+
+
 def cast(o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     """Distance of unit rays to what they meet first (infinite: nothing), and which part of the scene it is."""
     distances = []

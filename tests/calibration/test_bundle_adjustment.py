@@ -13,15 +13,15 @@ from sl_nerfstudio.calibration.bundle_adjustment import (
     AdjustmentSettings,
     PosePrior,
     adjust,
-    free_directions,
     prior_equations,
 )
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.calibration.modes import constrained, free_directions
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
-from .analytic import ExactMaps, disturbed, images_of, rig_of
+from .analytic import ExactMaps, disturbed, images_of, rig_of, static_rig
 
 FRAMES, SIZE = 6, 100
 QUICK = AdjustmentSettings(anchors_per_frame=80, frames_per_anchor=3, max_iterations=16)
@@ -89,6 +89,18 @@ def test_a_rigid_rig_moves_all_projectors_alike(true, maps):
     moved = found.T_camera_projector @ inverse(start.T_camera_projector)
     assert torch.allclose(moved, moved[:1].expand_as(moved), rtol=0, atol=1e-12)
     assert not torch.allclose(moved[0], torch.eye(4, dtype=torch.float64), atol=1e-4)
+
+
+def test_a_static_projector_stays_in_one_place_while_cameras_come_back():
+    true = static_rig(FRAMES, SIZE)
+    start = constrained("static-projector", disturbed(true, 3, relative=0.1))
+    there = start.T_world_projector
+    assert torch.allclose(there, there[:1].expand_as(there), rtol=0, atol=1e-12)
+    found = adjust(start, ExactMaps.around(true, SIZE), prior_of(FRAMES), "static-projector", QUICK)
+    assert torch.allclose(found.rig.T_world_projector, there, rtol=0, atol=1e-9)
+    assert errors(start, true)[0] > 0.1
+    turn, shift = errors(found.rig, true)
+    assert turn < 1e-2 and shift < 1e-3
 
 
 def test_off_moves_nothing(true, maps):
@@ -163,10 +175,11 @@ def test_the_covariance_is_one(known_rig):
 
 
 @pytest.mark.parametrize(
-    "mode, columns", [("free", 12 * 3), ("rigid-rig", 6 * 3 + 6), ("known-rig", 6 * 3), ("off", 0)]
+    "mode, columns", [("free", 36), ("rigid-rig", 24), ("known-rig", 18), ("static-projector", 18), ("off", 0)]
 )
 def test_free_directions_of_each_mode(mode, columns):
-    B = free_directions(mode, 3)
+    rig = rig_of(3, SIZE)
+    B = free_directions(mode, rig)
     assert B.shape == (36, columns)
     x = B @ torch.randn(columns, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     delta, rho = x.reshape(2, 3, 6)
@@ -176,6 +189,9 @@ def test_free_directions_of_each_mode(mode, columns):
         assert torch.equal(rho, rho[:1].expand_as(rho)) and (rho != 0).all()
     if mode in ("known-rig", "off"):
         assert torch.equal(rho, torch.zeros_like(rho))
+    if mode == "static-projector":
+        stays = rig.moved(delta, rho).T_world_projector
+        assert torch.allclose(stays, rig.T_world_projector, rtol=0, atol=1e-9)
 
 
 def test_prior_equations_are_derivatives_of_the_weighted_departure():

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sl_nerfstudio.geometry.se3 import (
+    adjoint,
     exp_se3,
     exp_so3,
     hat,
@@ -177,3 +178,11 @@ def test_zero_twist_has_an_exact_gradient() -> None:
     jacobian = torch.autograd.functional.jacobian(exp_se3, xi)
     for index in range(6):
         assert torch.equal(jacobian[..., index], twist_matrix(torch.eye(6, dtype=torch.float64)[index]))
+
+
+@given(seeds, batches, angles)
+def test_the_adjoint_moves_a_twist_to_other_axes(seed: int, batch: tuple[int, ...], angle: float) -> None:
+    g = generator(seed)
+    T, xi = motions(batch, g), twists(batch, angle, g)
+    moved = torch.matrix_exp(twist_matrix((adjoint(T) @ xi[..., None]).squeeze(-1)))
+    assert close(moved, T @ torch.matrix_exp(twist_matrix(xi)) @ torch.linalg.inv(T), 1e-9)

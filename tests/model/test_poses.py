@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
-from sl_nerfstudio.model.poses import IndependentPoses, Poses, RigPoses
+from sl_nerfstudio.model.poses import IndependentPoses, Poses, RigPoses, StaticProjectorPoses
 
 FRAMES = 3
 KINDS = pytest.mark.parametrize("kind", [RigPoses, IndependentPoses])
@@ -41,6 +41,14 @@ def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_against_the_ca
     delta, rho = exp_se3(poses.camera_step), exp_se3(poses.projector_step)
     assert torch.allclose(camera, delta @ random_poses(0), atol=1e-13)
     assert torch.allclose(inverse(camera) @ projector, rho @ inverse(random_poses(0)) @ random_poses(1), atol=1e-13)
+
+
+def test_a_static_projector_stays_while_its_cameras_turn_about_the_scene():
+    poses = make(StaticProjectorPoses, projector=False)
+    set_steps(poses)
+    camera, projector = poses()
+    assert torch.equal(projector, random_poses(1))
+    assert torch.allclose(camera, exp_se3(poses.camera_step) @ random_poses(0), atol=1e-12)
 
 
 def test_independent_devices_turn_about_themselves():

@@ -93,6 +93,9 @@ def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
     rig = scene_rig(scan, S_SCENE_WORLD)
     assert not found.verdict.better and torch.equal(found.T_scene_camera, rig.T_world_camera)
     assert torch.equal(found.T_scene_projector, rig.T_world_projector)
+    prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
+    assert torch.equal(found.sigma[:, 0], prior.frame_translation)  # nothing was learnt
+    assert torch.equal(found.sigma[:, 11], prior.relative_rotation)
     assert found.message().startswith("Poses NOT changed") and found.message().endswith("starting poses are kept.")
 
 
