@@ -47,7 +47,7 @@ def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "dots"}, '"kind" is not "grid"'),
+        ({"kind": "dots"}, '"kind" is neither "grid" nor "gray-code"'),
         ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
         ({"period": None}, "contradicts itself"),
         ({"codes": [[0, 1], [2]]}, "contradicts itself"),

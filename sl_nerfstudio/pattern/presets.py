@@ -1,0 +1,46 @@
+"""Coded grids for common projectors."""
+
+from typing import Literal
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.grid import GridPattern
+
+Preset = Literal["800x800", "1280x720", "doe"]
+
+# size and period in pattern pixels; lines and gaps keep their share of the period, which decoders are made for
+PRESETS: dict[str, tuple[int, int, float]] = {
+    "800x800": (800, 800, 20.0),
+    "1280x720": (1280, 720, 20.0),  # a projector: about 11 periods across a fifth of the picture's width
+    "doe": (800, 800, 25.0),  # an element's single orders blur: wider lines, and the fewer nodes the surer
+}
+LINE_SHARE, GAP_SHARE = 0.2, 0.3  # of the period
+
+
+def make_grid(
+    preset: Preset = "800x800",
+    w: int | None = None,
+    h: int | None = None,
+    period: float | None = None,
+    line_width: float | None = None,
+    gap: float | None = None,
+    seed: int = 0,
+) -> GridPattern:
+    """The grid of a preset, with other values where given. Raises UserError for a grid that cannot be drawn."""
+    preset_w, preset_h, preset_period = PRESETS[preset]
+    period = preset_period if period is None else period
+    w, h = preset_w if w is None else w, preset_h if h is None else h
+    if not 2 <= period <= max(w, h):
+        raise UserError(f"--period {period:g}: give 2 pixels or more, and less than the pattern's {max(w, h)}")
+    if max(w, h) / period > 200 or w * h > 100_000_000:
+        raise UserError(f"a {w} x {h} pattern of period {period:g} is too large: give at most 200 nodes a side")
+    try:
+        return GridPattern(
+            w=w,
+            h=h,
+            period=period,
+            line_width=LINE_SHARE * period if line_width is None else line_width,
+            gap=GAP_SHARE * period if gap is None else gap,
+            seed=seed,
+        )
+    except ValueError as error:
+        raise UserError(f"--width, --height, --period, --line-width, --gap: {error}") from error

@@ -1,0 +1,85 @@
+"""sl-pattern: what it writes is complete, and bad flags are named."""
+
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sl_nerfstudio.cli.pattern import main
+from sl_nerfstudio.pattern.codes import hamming_margin
+from sl_nerfstudio.pattern.files import read_grid, read_layout
+from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.presets import PRESETS
+from sl_nerfstudio.scan.images import read_image
+
+
+def _run(monkeypatch, *flags):
+    monkeypatch.setattr(sys, "argv", ["sl-pattern", *map(str, flags)])
+    main()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets(monkeypatch, tmp_path, capsys, preset):
+    out = tmp_path / "müster"
+    _run(monkeypatch, "--output", out, "--preset", preset)
+    grid = read_grid(out / "pattern.json")
+    assert (grid.w, grid.h, grid.period) == PRESETS[preset]
+    codes = np.asarray(grid.codes)
+    assert hamming_margin(codes, rotations=False) == 3 and hamming_margin(codes, rotations=True) == 2
+    image = read_image(out / "pattern.png")
+    assert image.shape == (grid.h, grid.w)
+    # the description alone gives the same picture
+    assert np.abs(image / 255 - grid.render(4)).max() < 0.5 / 255 + 1e-6
+    assert "differ in at least 3 of 9 symbols, in 2 where the camera may roll" in capsys.readouterr().out
+
+
+def test_flags_override_the_preset(monkeypatch, tmp_path):
+    out = tmp_path / "p"
+    _run(
+        monkeypatch, "--output", out, "--width", 320, "--height", 200, "--period", 16, "--line-width", 3, "--gap", 5,
+        "--seed", 4, "--print-width", 80,
+    )  # fmt: skip
+    grid = read_grid(out / "pattern.json")
+    assert (grid.w, grid.h, grid.period, grid.line_width, grid.gap, grid.seed) == (320, 200, 16, 3, 5, 4)
+    with Image.open(out / "pattern.png") as image:
+        assert image.info["dpi"][0] == pytest.approx(320 / 80 * 25.4, rel=1e-3)
+
+
+def test_gray_code(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "g"
+    _run(monkeypatch, "--output", out, "--kind", "gray-code", "--width", 32, "--height", 24, "--cell", 2)
+    layout = read_layout(out / "pattern.json")
+    assert layout == GrayCode(32, 24, 2)
+    shown = [read_image(path) for path in sorted((out / "sequence").iterdir())]
+    assert all(np.array_equal(a, b) for a, b in zip(shown, layout.sequence(), strict=True))
+    assert "18 images" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--period", "0"], "--period 0: give 2 pixels or more"),
+        (["--line-width", "25"], "a grid needs 0 < line_width < period"),
+        (["--gap", "19"], "gap < period - line_width"),
+        (["--width", "30"], "fewer than 3 x 3 nodes"),
+        (["--width", "100000"], "too large: give at most 200 nodes a side"),
+        (["--seed", "-1"], "--seed -1: seeds are at least 0"),
+        (["--print-width", "0"], "--print-width 0: give a width in millimetres above 0"),
+        (["--kind", "gray-code", "--gap", "3"], "--gap: Gray code has none"),
+        (["--kind", "gray-code", "--cell", "0"], "at least 2 x 2 cells"),
+    ],
+)
+def test_bad_flags(monkeypatch, tmp_path, capsys, flags, message):
+    with pytest.raises(SystemExit) as stop:
+        _run(monkeypatch, "--output", tmp_path / "x", *flags)
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_nothing_is_overwritten(monkeypatch, tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("x")
+    with pytest.raises(SystemExit):
+        _run(monkeypatch, "--output", tmp_path)
+    assert "is not empty" in capsys.readouterr().err and len(list(tmp_path.iterdir())) == 1

@@ -1,0 +1,50 @@
+"""Gray code: neighbours differ in one bit, and the sequence shows the bits."""
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.files import encode_gray_code, read_grid, read_layout, read_pattern
+from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
+
+
+def test_neighbours_differ_in_one_bit_and_numbers_come_back():
+    cells = np.arange(1 << 11)
+    codes = gray(cells)
+    assert {int(x).bit_count() for x in codes[1:] ^ codes[:-1]} == {1}
+    assert np.array_equal(ungray(codes, 11), cells)
+
+
+@pytest.mark.parametrize("layout", [GrayCode(40, 30, 2), GrayCode(37, 21, 4), GrayCode(1024, 16, 1)])
+def test_the_sequence_spells_the_cell_of_every_pixel(layout):
+    images = list(layout.sequence())
+    assert len(images) == layout.images and images[0].min() == 255 and images[1].max() == 0
+    for axis, size in ((0, layout.w), (1, layout.h)):
+        code = np.zeros((layout.h, layout.w), dtype=np.int64)
+        for direct, inverse in layout.bit_images(axis):
+            assert (images[direct].astype(int) + images[inverse] == 255).all()
+            code = 2 * code + (images[direct] > 0)
+        cell = np.arange(size) // layout.cell
+        expected = np.broadcast_to(cell if axis == 0 else cell[:, None], code.shape)
+        assert np.array_equal(ungray(code, layout.bits[axis]), expected)
+    assert layout.finest().shape == (layout.h, layout.w)
+
+
+def test_full_hd_in_cells_of_two_pixels_is_42_images():
+    layout = GrayCode(1920, 1080, 2)
+    assert (layout.columns, layout.rows, layout.bits, layout.images) == (960, 540, (10, 10), 42)
+
+
+def test_the_description_comes_back(tmp_path):
+    path = tmp_path / "pattern.json"
+    path.write_bytes(encode_gray_code(GrayCode(1280, 720, 4)))
+    assert read_layout(path) == GrayCode(1280, 720, 4)
+    image, grid = read_pattern(path)
+    assert grid is None and np.array_equal(image, GrayCode(1280, 720, 4).finest())
+    with pytest.raises(UserError, match="describes a Gray-code sequence, where a coded grid is needed"):
+        read_grid(path)
+
+
+def test_sizes_that_make_no_sequence():
+    with pytest.raises(ValueError, match="at least 2 x 2 cells"):
+        GrayCode(3, 100, 2)
