@@ -1,0 +1,68 @@
+"""Correspondences of one frame as pairs of rays, with what is needed to measure errors in projector pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian, unproject
+
+_BLOCKS_A_SIDE = 25  # of the pattern: two periods of a grid of 50 lines, about as far as a decoder's errors reach
+
+
+@dataclass(frozen=True)
+class RayPairs:
+    """Unit rays in each device's own axes."""
+
+    d_camera: Float64[ndarray, "n 3"]
+    d_projector: Float64[ndarray, "n 3"]
+    d_projector_by_uv: Float64[ndarray, "n 3 2"]  # derivative by the projector's pixel
+    block: Int64[ndarray, "n"]  # square of the pattern: decoding errors within one are taken to be dependent
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.d_camera)
+
+    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "RayPairs":
+        """Some of the pairs."""
+        return RayPairs(self.d_camera[index], self.d_projector[index], self.d_projector_by_uv[index], self.block[index])
+
+
+def correspondences_of(
+    coords: Float32[ndarray, "h w 2"],
+) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
+    """Camera pixel centres and pattern coordinates of all decoded pixels."""
+    row, column = np.nonzero(np.isfinite(coords).all(-1))
+    return np.stack([column, row], -1) + 0.5, coords[row, column].astype(np.float64)
+
+
+def ray_pairs(
+    uv_camera: Float[ndarray, "n 2"], uv_projector: Float[ndarray, "n 2"], camera: Device, projector: Device
+) -> tuple[RayPairs, Int64[ndarray, "m"]]:
+    """Rays of correspondences, and the indices of those that have a ray in both devices.
+
+    A DOE has no ray beyond 90 degrees; coordinates that are not finite have none at all.
+    """
+    d_camera = directions(camera, uv_camera)
+    d_projector = directions(projector, uv_projector)
+    usable = np.flatnonzero(np.isfinite(d_camera).all(-1) & np.isfinite(d_projector).all(-1))
+    d_camera, d_projector = d_camera[usable], d_projector[usable]
+    intrinsics = Intrinsics.of(projector, torch.float64)
+    J = project_jacobian(intrinsics, torch.from_numpy(d_projector))
+    # Projection does not feel the length of a ray, so J d = 0 and the right inverse square to d is the pseudo-inverse.
+    by_uv = J.transpose(-1, -2) @ torch.linalg.inv(J @ J.transpose(-1, -2))
+    return RayPairs(d_camera, d_projector, by_uv.numpy(), _blocks(uv_projector[usable], projector)), usable
+
+
+def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
+    """Unit directions of pixels in the device's axes; NaN where there is none."""
+    pixels = torch.from_numpy(np.ascontiguousarray(uv, dtype=np.float64))
+    return unproject(Intrinsics.of(device, torch.float64), pixels).numpy()
+
+
+def _blocks(uv: Float[ndarray, "n 2"], projector: Device) -> Int64[ndarray, "n"]:
+    side = max(projector.w, projector.h) / _BLOCKS_A_SIDE
+    column, row = np.floor(uv / side).astype(np.int64).clip(-1, 4 * _BLOCKS_A_SIDE).T
+    return (row + 1) * (5 * _BLOCKS_A_SIDE) + column + 1

@@ -1,0 +1,87 @@
+"""One frame by formula: points on a surface, seen by a camera and lit by a projector."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+
+CAMERA = Device(640, 480, 800.0, 790.0, 322.0, 238.0)
+PROJECTORS = {
+    "pinhole": Device(800, 800, 1100.0, 1110.0, 395.0, 405.0),
+    "lens": Device(800, 800, 1100.0, 1110.0, 395.0, 405.0, k1=-0.15, k2=0.05, p1=1e-3, p2=-2e-3),
+    "DOE": Device(800, 800, 1250.0, 1250.0, 400.0, 400.0, model="DOE"),
+}
+
+
+@dataclass(frozen=True)
+class View:
+    """Correspondences with the pose and the points they come from."""
+
+    camera: Device
+    projector: Device
+    T_camera_projector: ndarray
+    uv_camera: ndarray
+    uv_projector: ndarray
+    p_camera: ndarray
+
+    def noisy(self, sigma: float, seed: int, wrong: float = 0.0) -> "View":
+        """Independent noise, and a fraction of coordinates that are off by 20 to 80 pixels."""
+        rng = np.random.default_rng(seed)
+        uv = self.uv_projector + sigma * rng.standard_normal(self.uv_projector.shape)
+        off = rng.random(len(uv)) < wrong
+        uv[off] += rng.uniform(20, 80, (off.sum(), 2)) * rng.choice([-1, 1], (off.sum(), 2))
+        return replace(self, uv_projector=uv)
+
+    @property
+    def arguments(self) -> tuple[ndarray, ndarray, Device, Device]:
+        """What calibrate_frame takes."""
+        return self.uv_camera, self.uv_projector, self.camera, self.projector
+
+
+def pose_of(offset: tuple[float, float, float], target: tuple[float, float, float], roll_deg: float) -> ndarray:
+    """Pose in camera axes of a projector at `offset` that looks at `target`."""
+    back = np.subtract(offset, target)
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right = right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
+    T[:3, 3] = offset
+    return T
+
+
+def view(
+    projector: str = "pinhole",
+    offset: tuple[float, float, float] = (1.0, 0.25, 0.1),
+    relief: float = 1.0,
+    count: int = 4000,
+    seed: int = 0,
+    roll_deg: float = 10.0,
+) -> View:
+    """A bumpy surface about 4.5 away and 1.5 wide; `relief` 0 makes it a plane. All points are lit and seen."""
+    rng = np.random.default_rng(seed)
+    device, centre = PROJECTORS[projector], (0.0, 0.0, -4.5)
+    uv = rng.uniform([180, 100], [460, 380], (count, 2))
+    d = unproject(Intrinsics.of(CAMERA, torch.float64), torch.from_numpy(uv)).numpy()
+    x, y = d[:, 0] / -d[:, 2], d[:, 1] / -d[:, 2]
+    bumps = np.sin(9 * x + 1) * np.cos(7 * y) + 0.6 * np.sin(23 * x * y + 5 * y) - 6 * (x * x + y * y)
+    depth = 4.5 / (1 - 0.2 * x - 0.1 * y) - relief * 0.45 * bumps
+    p = d * (depth / -d[:, 2])[:, None]
+    T = pose_of(offset, centre, roll_deg)
+    p_projector = (p - T[:3, 3]) @ T[:3, :3]
+    uv_projector, lit = project(Intrinsics.of(device, torch.float64), torch.from_numpy(p_projector))
+    assert lit.all()
+    return View(CAMERA, device, T, uv, uv_projector.numpy(), p)
+
+
+def errors_deg(T_found: ndarray, T_true: ndarray) -> tuple[float, float]:
+    """Angle of the rotation's error and of the baseline direction's."""
+    turn = Rotation.from_matrix(T_true[:3, :3].T @ T_found[:3, :3]).magnitude()
+    a, b = (T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (T_found, T_true))
+    swing = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
+    return float(np.degrees(turn)), float(np.degrees(swing))
