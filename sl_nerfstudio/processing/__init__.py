@@ -1,0 +1,1 @@
+"""From photographs to a scan folder: frames, stages, manifest and report."""
