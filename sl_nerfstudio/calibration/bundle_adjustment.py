@@ -6,35 +6,28 @@ from the stated uncertainty of the starting poses, and a fixed gauge. See `linea
 residuals, and docs/method.md for why this comes before, and not out of, volume rendering.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.calibration.linearisation import (
-    Anchors,
-    NormalEquations,
-    Observations,
-    Residuals,
-    Rig,
-    linearise,
-    normal_equations,
-    residuals_of,
-)
+from sl_nerfstudio.calibration.kernel import NOISE_FLOOR_PX, Kernel, frame_medians, narrowed, noise_of
+from sl_nerfstudio.calibration.linearisation import Observations, Rig, linearise, normal_equations, residuals_of
 from sl_nerfstudio.calibration.modes import RefinePoses, free_directions
-from sl_nerfstudio.geometry.devices import project, unproject
-from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3, transform
-from sl_nerfstudio.geometry.triangulation import closest_approach
+from sl_nerfstudio.calibration.observations import observe, place_anchors
+from sl_nerfstudio.calibration.steps import DAMPING, Descent, Pull, descend
+from sl_nerfstudio.calibration.strays import lead_home
+from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 from sl_nerfstudio.progress import track
 
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
 _INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
 _SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
 _SMALL_STEP = 1e-4  # of the scene's radius, or radian: the adjustment has converged
-_DAMPING = 1e-4  # of the diagonal, at the start of each stage
-_NOISE_FLOOR = 0.01  # projector pixels: residuals are not believed to be better than this
+_SEARCHES = 3  # for frames that went astray, at most: those found help to find the others
+_EVERYTHING = float("inf")  # pixels: no residual is too large to be looked at
 
 
 @dataclass(frozen=True)
@@ -99,47 +92,6 @@ def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
     return found
 
 
-def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
-    """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
-    parts = []
-    for frame in range(rig.frames):
-        uv = maps.draw(frame, per_frame, generator)
-        index = torch.full((len(uv),), frame)
-        seen = maps.look_up(index, uv)
-        d_camera = unproject(rig.camera[frame], uv)
-        T = rig.T_camera_projector[frame]
-        d_projector = (T[:3, :3] @ unproject(rig.projector, seen.uv_projector)[..., None]).squeeze(-1)
-        depth, depth_projector = closest_approach(
-            torch.zeros_like(d_camera), d_camera, T[:3, 3].expand_as(d_camera), d_projector
-        )
-        good = seen.valid & (depth > 0) & (depth_projector > 0)
-        parts.append(Anchors(index, d_camera, seen.uv_projector, depth).chosen(good))
-    return Anchors(*(torch.cat([getattr(p, f) for p in parts]) for f in ("frame", "d_camera", "uv_projector", "depth")))
-
-
-def observe(
-    rig: Rig, anchors: Anchors, maps: CoordinateMaps, per_anchor: int, gate_px: float, generator: torch.Generator
-) -> Observations:
-    """For every anchor up to `per_anchor` other frames that decoded something near it, within `gate_px` of it."""
-    chosen = []
-    p_world = transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)
-    for j in range(rig.frames):
-        anchor = (anchors.frame != j).nonzero().squeeze(-1)
-        frame = torch.full_like(anchor, j)
-        p_j = transform(inverse(rig.T_world_camera[j]), p_world[anchor])
-        uv_camera, in_front = project(rig.camera[j], p_j)
-        expected, lit = project(rig.projector, transform(inverse(rig.T_camera_projector[j]), p_j))
-        miss = (maps.decoded_at(frame, uv_camera) - expected).norm(dim=-1)
-        keep = in_front & lit & (miss < gate_px)  # False where nothing is decoded
-        chosen.append(torch.stack([anchor[keep], frame[keep]]))
-    rows = torch.cat(chosen, 1)
-    rows = rows[:, torch.randperm(rows.shape[1], generator=generator)]
-    rows = rows[:, torch.argsort(rows[0], stable=True)]
-    starts = torch.searchsorted(rows[0].contiguous(), rows[0].contiguous())
-    rows = rows[:, torch.arange(rows.shape[1]) - starts < per_anchor]
-    return Observations(rows[0], rows[1])
-
-
 def prior_equations(
     prior: PosePrior, start: Rig, rig: Rig
 ) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
@@ -178,18 +130,68 @@ def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
     return out.reshape(12 * n, 7)
 
 
-def _kernel_weight(r: Float[Tensor, "n 2"], width: float) -> Float[Tensor, "n"]:
-    return (width**2 / (width**2 + (r * r).sum(-1))) ** 2
+@dataclass(frozen=True)
+class _Problem:
+    """What does not change during an adjustment."""
+
+    start: Rig
+    maps: CoordinateMaps
+    prior: PosePrior
+    settings: AdjustmentSettings
+    generator: torch.Generator
+
+    def observe(self, state: Descent) -> Observations:
+        """A new choice of which frame looks for which anchor."""
+        return observe(
+            state.rig, state.anchors, self.maps, self.settings.frames_per_anchor, _EVERYTHING, self.generator
+        )
 
 
-def _cost(r: Float[Tensor, "n 2"], width: float) -> float:
-    r2 = (r * r).sum(-1)
-    return float((width**2 * r2 / (width**2 + r2)).sum())
+@dataclass(frozen=True)
+class _Found:
+    """How far an adjustment has come."""
+
+    state: Descent
+    rows: Observations
+    widths: Float[Tensor, "frames"]  # of each frame's kernel
+    noise: float
+    iterations: int
+
+    @property
+    def pairs(self) -> Int[Tensor, "2 rows"]:
+        """Frame of the anchor, frame that looks for it."""
+        return torch.stack([self.state.anchors.frame[self.rows.anchor], self.rows.frame])
+
+    def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "_Found":
+        """The same with some frames elsewhere: their kernels open again."""
+        widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
+        return replace(self, state=Descent(rig, self.state.anchors), widths=widths)
 
 
-def _weights(r: Residuals, width: float) -> tuple[Tensor, Tensor]:
-    cross = _kernel_weight(r.cross, width)
-    return _kernel_weight(r.own, width), torch.where(r.cross_valid, cross, torch.zeros_like(cross))
+def _run(problem: _Problem, stage: _Stage, found: _Found) -> _Found:
+    """Steps of one stage, until nothing moves any more."""
+    state, start, maps = replace(found.state, damping=DAMPING), problem.start, problem.maps
+    found = replace(found, state=state)
+    for iteration in track(range(stage.iterations), "Adjusting poses"):
+        if stage.rough and iteration % _OBSERVE_EVERY == 0:
+            found = replace(found, rows=problem.observe(found.state))
+        linear = linearise(found.state.rig, found.state.anchors, found.rows, maps)
+        r = linear.residuals
+        target = 2 * frame_medians(r, found.pairs, start.frames)
+        noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
+        widths = narrowed(found.widths, target).clamp_min(3 * noise)
+        kernel = Kernel(widths, found.state.anchors.frame, found.pairs)
+        independent = _INDEPENDENT_ROWS * start.frames / max(int(r.cross_valid.sum()), 1)
+        trust = noise**2 / min(independent, 1.0) if stage.rough else noise**2
+        H, g = prior_equations(problem.prior, start, found.state.rig)
+        B = free_directions(stage.refine, found.state.rig)
+        state = descend(found.state, linear, found.rows, maps, kernel, B, Pull(trust * H, trust * g))
+        small = state.size < _SMALL_STEP and (state.damping < 1 or state.size == 0)  # or damped to be small
+        settled = bool((widths >= _SETTLED * found.widths).all()) and small
+        found = _Found(state, found.rows, widths, noise, found.iterations + 1)
+        if settled:
+            break
+    return found
 
 
 def adjust(
@@ -205,55 +207,39 @@ def adjust(
     with others stay where they are.
     """
     generator = torch.Generator().manual_seed(settings.seed)
-    rig = start
-    per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // rig.frames))
-    anchors = place_anchors(rig, maps, per_frame, generator)
-    stages, stage_start = _stages(refine, settings), 0
-    everything = float("inf")
-    observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
-    r = residuals_of(rig, anchors, observations, maps)
+    per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // start.frames))
+    anchors = place_anchors(start, maps, per_frame, generator)
+    rows = observe(start, anchors, maps, settings.frames_per_anchor, _EVERYTHING, generator)
+    r = residuals_of(start, anchors, rows, maps)
     if settings.max_iterations < 1 or not r.cross_valid.any():
-        return _unmoved(start, prior, free_directions(refine, rig))
+        return _unmoved(start, prior, free_directions(refine, start))
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
-    noise = max(before, _NOISE_FLOOR)
-    width, damping = 2 * noise, _DAMPING
-    iteration = 0
-    for iteration in track(range(settings.max_iterations), "Adjusting poses"):
-        if iteration % _OBSERVE_EVERY == 0 and iteration < settings.max_iterations // 2:
-            observations = observe(rig, anchors, maps, settings.frames_per_anchor, everything, generator)
-        linear = linearise(rig, anchors, observations, maps)
-        r = linear.residuals
-        median = float(r.cross[r.cross_valid].norm(dim=-1).median())
-        noise = _noise(r, width)
-        previous, width = width, max(min(width, 2 * median), 3 * noise)
-        own_weight, cross_weight = _weights(r, width)
-        equations = normal_equations(linear, anchors, observations, own_weight, cross_weight, rig.frames)
-        H_prior, g_prior = prior_equations(prior, start, rig)
-        independent = _INDEPENDENT_ROWS * rig.frames / max(int(r.cross_valid.sum()), 1)
-        trust = noise**2 / min(independent, 1.0) if stages[0].rough else noise**2
-        B = free_directions(stages[0].refine, rig)
-        H = B.T @ (equations.H + trust * H_prior) @ B
-        g = B.T @ (equations.g + trust * g_prior)
-        rig, anchors, damping, size = _step(rig, anchors, observations, maps, equations, B, H, g, r, width, damping)
-        small = size < _SMALL_STEP and (damping < 1 or size == 0)  # or damped to be small
-        settled = width > _SETTLED * previous and small
-        over = settled or iteration + 1 - stage_start >= stages[0].iterations
-        if len(stages) > 1 and over:
-            stages, stage_start, damping = stages[1:], iteration + 1, _DAMPING
-        elif settled and len(stages) == 1:
+    problem = _Problem(start, maps, prior, settings, generator)
+    widths = torch.full((start.frames,), float("inf"), dtype=torch.float64)
+    found = _Found(Descent(start, anchors), rows, widths, max(before, NOISE_FLOOR_PX), 0)
+    *rough, last = _stages(refine, settings)
+    for stage in rough:
+        found = _run(problem, stage, found)
+    for _ in range(_SEARCHES if refine in ("free", "rigid-rig", "known-rig") else 0):
+        home = lead_home(found.state.rig, maps, found.noise, prior.frame_rotation, prior.frame_translation, generator)
+        moved = (home.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
+        if not moved.any():
             break
-    linear = linearise(rig, anchors, observations, maps)
-    r = linear.residuals
-    inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * width)
+        found = _run(problem, rough[-1], found.at(home, moved))
+    found = _run(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
+    state = found.state
+    linear = linearise(state.rig, state.anchors, found.rows, maps)
+    r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
+    inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     # at the result, with every residual trusted, in whichever stage the steps ended
-    equations = normal_equations(linear, anchors, observations, *_weights(r, width), rig.frames)
-    B = free_directions(refine, rig)
-    H = B.T @ (equations.H + noise**2 * prior_equations(prior, start, rig)[0]) @ B
+    equations = normal_equations(linear, state.anchors, found.rows, *kernel.weights(r), start.frames)
+    B = free_directions(refine, state.rig)
+    H = B.T @ (equations.H + found.noise**2 * prior_equations(prior, start, state.rig)[0]) @ B
     return Adjustment(
-        rig=rig,
-        covariance=_covariance(rig, B, H, noise),
-        noise_px=noise,
-        iterations=iteration + 1,
+        rig=state.rig,
+        covariance=_covariance(state.rig, B, H, found.noise),
+        noise_px=found.noise,
+        iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
     )
@@ -263,44 +249,7 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor) -> Adjustment:
     """The starting poses, where no step is asked for or no frame sees what another decoded; known as the prior says."""
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
-    return Adjustment(start, _covariance(start, B, H, 1.0), _NOISE_FLOOR, 0, nan, nan)
-
-
-def _noise(r: Residuals, width: float) -> float:
-    """Robust 1 sigma of one residual component among those that the kernel keeps."""
-    inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
-    values = torch.cat([r.cross[inliers].reshape(-1)]).abs()
-    return max(float(values.median()) * 1.4826, _NOISE_FLOOR)
-
-
-def _step(
-    rig: Rig,
-    anchors: Anchors,
-    observations: Observations,
-    maps: CoordinateMaps,
-    equations: NormalEquations,
-    B: Tensor,
-    H: Tensor,
-    g: Tensor,
-    r: Residuals,
-    width: float,
-    damping: float,
-) -> tuple[Rig, Anchors, float, float]:
-    """One damped step that lowers the cost, trying stronger damping until it does."""
-    n = rig.frames
-    for _ in range(8):
-        x = B @ torch.linalg.solve(H + damping * torch.diag(torch.diag(H)), -g) if B.shape[1] else B.sum(1)
-        depth = anchors.depth + equations.depth_step(x)
-        depth = depth.clamp(0.7 * anchors.depth, 1.4 * anchors.depth)
-        moved = rig.moved(x[: 6 * n].reshape(n, 6), x[6 * n :].reshape(n, 6))
-        after = residuals_of(moved, anchors.at(depth), observations, maps)
-        both = r.cross_valid & after.cross_valid
-        old = _cost(r.own, width) + _cost(r.cross[both], width)
-        new = _cost(after.own, width) + _cost(after.cross[both], width)
-        if new < old:
-            return moved, anchors.at(depth), max(damping / 5, 1e-9), float(x.abs().max())
-        damping = damping * 10
-    return rig, anchors, damping, 0.0
+    return Adjustment(start, _covariance(start, B, H, 1.0), NOISE_FLOOR_PX, 0, nan, nan)
 
 
 def _covariance(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.calibration.bundle_adjustment import observe
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.linearisation import Anchors, Observations, Rig, residuals_of
+from sl_nerfstudio.calibration.observations import observe
 from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
 
@@ -66,4 +66,5 @@ def _anchors(rig: Rig, held_out: HeldOut) -> Anchors:
     T = rig.T_camera_projector[held_out.frame]
     d_projector = (T[:, :3, :3] @ unproject(rig.projector, held_out.uv_projector)[..., None]).squeeze(-1)
     depth, _ = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
-    return Anchors(held_out.frame, d_camera, held_out.uv_projector, torch.nan_to_num(depth, nan=1.0))
+    # no map around a held-out pixel, so no normal: towards the camera is near enough to choose who else sees it
+    return Anchors(held_out.frame, d_camera, held_out.uv_projector, torch.nan_to_num(depth, nan=1.0), -d_camera)

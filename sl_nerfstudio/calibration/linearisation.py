@@ -15,7 +15,7 @@ the origin, which is the centre of the scene), `T_camera_projector <- exp(rho) T
 moves its projector against its camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numba
 import numpy as np
@@ -66,14 +66,15 @@ class Anchors:
     d_camera: Float[Tensor, "anchors 3"]  # unit ray direction in camera axes
     uv_projector: Float[Tensor, "anchors 2"]  # decoded there
     depth: Float[Tensor, "anchors"]  # along the ray
+    normal: Float[Tensor, "anchors 3"]  # of the surface there, in camera axes, towards the camera
 
     def at(self, depth: Float[Tensor, "anchors"]) -> "Anchors":
         """The same anchors at other depths."""
-        return Anchors(self.frame, self.d_camera, self.uv_projector, depth)
+        return replace(self, depth=depth)
 
     def chosen(self, index: Tensor) -> "Anchors":
         """Some of the anchors, by mask or by index."""
-        return Anchors(self.frame[index], self.d_camera[index], self.uv_projector[index], self.depth[index])
+        return Anchors(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
 @dataclass(frozen=True)

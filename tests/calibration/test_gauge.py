@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from sl_nerfstudio.calibration.bundle_adjustment import observe, place_anchors
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.gauge import baselines, known_baseline, restore
 from sl_nerfstudio.calibration.linearisation import Rig, residuals_of
+from sl_nerfstudio.calibration.observations import observe, place_anchors
 from sl_nerfstudio.geometry.se3 import exp_se3
 
 from .analytic import disturbed, images_of, rig_of

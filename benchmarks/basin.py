@@ -1,0 +1,128 @@
+"""From how far away the joint adjustment finds the poses again.
+
+    python -m benchmarks.basin [--scene cone-and-cylinder] [--frames 22] [--seeds 1 2 3] [--output FILE]
+
+For every seed one noisy scan is made; starting poses of growing error take the place of its own (registration errors as
+given, auto-calibration errors as sl-synth's default), and are adjusted as `ns-train
+sl-neus` does before its first step.
+`astray` counts frames that end more than a degree off.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.machine import describe
+from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
+from sl_nerfstudio.dataparser.dataparser import LoadedScan, load_scan
+from sl_nerfstudio.evaluation.poses import compare_poses
+from sl_nerfstudio.model.refinement import PriorConfig, refine
+from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+LEVELS = (
+    (0.0, 0.0),
+    (0.25, 1.0),
+    (0.5, 2.0),
+    (1.0, 3.0),
+    (2.0, 6.0),
+    (3.0, 10.0),
+    (5.0, 15.0),
+    (7.0, 20.0),
+    (10.0, 30.0),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One adjustment; RMS over the frames' cameras after one similarity, in mm and degrees."""
+
+    seed: int
+    frame_deg: float
+    frame_mm: float
+    start_mm: float
+    start_deg: float
+    end_mm: float
+    end_deg: float
+    astray: int
+    kept: bool
+    seconds: float
+
+
+def from_errors(scan: Scan, setup: Setup) -> Scan:
+    """The scan with the starting poses of a setup."""
+    poses = zip(scan.frames, setup.start.T_world_camera, setup.start.T_world_projector, strict=True)
+    frames = (replace(f, T_world_camera=c, T_world_projector=p, pose_sigma=setup.sigma) for f, c, p in poses)
+    return replace(scan, frames=tuple(frames))
+
+
+def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, float]) -> Row:
+    """Adjust one set of starting poses."""
+    start, truth = setup.start, (setup.truth.T_world_camera, setup.truth.T_world_projector)
+    begin = time.monotonic()
+    found = refine(
+        from_errors(loaded.scan, setup),
+        loaded.S_scene_world,
+        loaded.samples,
+        "free",
+        PriorConfig(),
+        AdjustmentSettings(),
+    )
+    seconds = time.monotonic() - begin
+    S = loaded.S_scene_world.inverse()
+    end = compare_poses(S.poses(found.T_scene_camera.numpy()), S.poses(found.T_scene_projector.numpy()), *truth).camera
+    before = compare_poses(start.T_world_camera, start.T_world_projector, *truth).camera
+    return Row(
+        seed,
+        *level,
+        before.translation_rmse,
+        before.rotation_rmse_deg,
+        end.translation_rmse,
+        end.rotation_rmse_deg,
+        int((np.asarray(end.rotation_deg) > 1).sum()),
+        found.verdict.better,
+        seconds,
+    )
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="cone-and-cylinder")
+    parser.add_argument("--frames", type=int, default=22)
+    parser.add_argument("--resolution", type=int, default=400)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--folder", type=Path, default=Path("outputs/basin"), help="for the scans; made once")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/basin.json"))
+    options = parser.parse_args()
+    rows: list[Row] = []
+    for seed in options.seeds:
+        config = SynthConfig(scene=options.scene, frames=options.frames, resolution=options.resolution, seed=seed)
+        folder = options.folder / f"{options.scene}-{options.frames}-{options.resolution}-{seed}"
+        if not folder.exists():
+            synthesise(config, folder)
+        loaded = load_scan(folder)
+        for level in LEVELS:
+            rows.append(measure(loaded, make_setup(replace(config, pose_error=level)), seed, level))
+            print(text(rows[-1]), flush=True)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n")
+
+
+def text(r: Row) -> str:
+    """One line of the table."""
+    return (
+        f"seed {r.seed}  frames off by {r.frame_deg:5.2f} deg {r.frame_mm:4.0f} mm | cameras {r.start_mm:6.2f} mm "
+        f"{r.start_deg:6.3f} deg -> {r.end_mm:6.3f} mm {r.end_deg:6.3f} deg, {r.astray} astray"
+        f"{'' if r.kept else ', start kept'} | {r.seconds:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""Frames that went astray are found by their residuals and led back to where the others want them."""
+
+from dataclasses import replace
+from math import radians
+
+import pytest
+import torch
+
+from sl_nerfstudio.calibration.strays import find_strays, lead_home
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
+
+from .analytic import ExactMaps, rig_of
+
+FRAMES, SIZE, STRAY = 6, 100, 2
+SIGMA = (torch.full((FRAMES,), radians(3.0), dtype=torch.float64), torch.full((FRAMES,), 0.05, dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def true():
+    return rig_of(FRAMES, SIZE)
+
+
+def led(rig, true):
+    generator = torch.Generator().manual_seed(0)
+    return lead_home(rig, ExactMaps.around(true, SIZE), 0.05, *SIGMA, generator)
+
+
+def test_a_stray_comes_home_and_nobody_else_moves(true):
+    away = exp_se3(torch.tensor([0.08, -0.05, 0.04, 0.06, 0.05, -0.1], dtype=torch.float64))
+    cameras = true.T_world_camera.clone()
+    cameras[STRAY] = away @ cameras[STRAY]
+    found = led(replace(true, T_world_camera=cameras), true).T_world_camera
+    others = torch.arange(FRAMES) != STRAY
+    assert torch.equal(found[others], true.T_world_camera[others])
+    off = inverse(true.T_world_camera[STRAY]) @ found[STRAY]
+    assert float(log_so3(off[:3, :3]).norm()) < radians(0.01) and float(off[:3, 3].norm()) < 1e-3
+
+
+def test_where_all_agree_nobody_is_looked_for(true):
+    assert torch.equal(led(true, true).T_world_camera, true.T_world_camera)
+
+
+def test_strays_are_those_with_few_residuals_within_the_noise_the_best_first():
+    shares = torch.tensor([0.8, 0.3, 0.85, 0.5, float("nan"), 0.9, 0.8], dtype=torch.float64)
+    assert find_strays(shares).tolist() == [3, 1]
