@@ -77,8 +77,9 @@ demo: install
 	@echo "figures  $(DEMO)/evaluation.json"
 	@echo "report   $(CURDIR)/$(DEMO)/report.html (open it in a browser)"
 
+# On more than one core; a file's tests stay together, because they share what was trained for them.
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 bench: install
 	$(BIN)/python -m benchmarks

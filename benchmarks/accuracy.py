@@ -128,8 +128,8 @@ def main() -> None:
     options = parser.parse_args()
     options.folder.mkdir(parents=True)
     rows: list[Row] = []
-    for scene in options.scenes:
-        for seed in options.seeds:
+    for seed in options.seeds:
+        for scene in options.scenes:
             folder = options.folder / f"{scene}-{seed}"
             folder.mkdir()
             rows += measure(scene, seed, options.iterations, folder, options.variants)

@@ -1,0 +1,157 @@
+"""Memory and time per step against the number of frames and their size.
+
+    python -m benchmarks.resources [--frames 5 22 57] [--sizes 400 1200] [--steps 60] [--output FILE]
+
+Every scan is checked, read and trained for a few steps in a process of its own: by what `ns-train sl-neus` runs, joint
+adjustment included. Larger images are those of the 400-pixel scan with every pixel repeated: they hold no more truth,
+but they cost what real ones cost.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.machine import describe
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan.writing import ScanWriter
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+BASE = 400
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scan."""
+
+    frames: int
+    size: int
+    peak_gb: float  # resident memory of the whole process, libraries included
+    check_seconds: float
+    read_seconds: float
+    adjust_seconds: float
+    step_ms: float  # median
+
+
+def enlarged(device: Device, factor: int) -> Device:
+    """The same camera with every pixel split into factor x factor."""
+    return replace(
+        device,
+        w=device.w * factor,
+        h=device.h * factor,
+        fl_x=device.fl_x * factor,
+        fl_y=device.fl_y * factor,
+        cx=device.cx * factor,
+        cy=device.cy * factor,
+    )
+
+
+def make_scan(source: Path, frames: int, factor: int, to: Path) -> None:
+    """The first frames of a scan, enlarged."""
+    scan = read_scan(source)
+
+    def large(image: np.ndarray) -> np.ndarray:
+        return np.repeat(np.repeat(image, factor, 0), factor, 1)
+
+    pattern = (scan.read_pattern() * 255).round().astype(np.uint8)
+    camera = enlarged(scan.frames[0].camera, factor)
+    with ScanWriter(
+        to, units=scan.units, scale=scan.scale, projector=scan.projector, pattern=pattern, camera=camera
+    ) as writer:
+        for frame in scan.frames[:frames]:
+            writer.add_frame(
+                frame.name,
+                image=large(frame.read_image()),
+                coords=large(frame.read_coords()),
+                mask=large(frame.read_mask()),
+                T_world_camera=frame.T_world_camera,
+                T_world_projector=frame.T_world_projector,
+            )
+
+
+def measure_here(scan: Path, steps: int) -> dict[str, float]:
+    """Check, read, adjust and train in this process."""
+    from sl_nerfstudio.dataparser.dataparser import load_scan
+    from sl_nerfstudio.methods import sl_neus
+    from sl_nerfstudio.scan import check_scan
+
+    times = [time.monotonic()]
+    faults = check_scan(scan)
+    if faults:
+        raise SystemExit("\n".join(map(str, faults)))
+    times.append(time.monotonic())
+    load_scan(scan)
+    times.append(time.monotonic())
+    with tempfile.TemporaryDirectory() as folder:
+        config = replace(sl_neus.config, data=scan, output_dir=Path(folder), max_num_iterations=1000)
+        config.pipeline.model.warm_start = 0.0  # rendering from the first step on
+        config.set_timestamp()
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        begin = time.monotonic()
+        trainer.pipeline.model.start(trainer.pipeline.datamanager.samples)
+        adjust = time.monotonic() - begin
+        each = []
+        for step in range(1, steps + 1):
+            trainer.pipeline.model.anneal(step)
+            begin = time.monotonic()
+            trainer.train_iteration(step)
+            each.append(time.monotonic() - begin)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    return {
+        "peak_gb": peak,
+        "check_seconds": times[1] - times[0],
+        "read_seconds": times[2] - times[1],
+        "adjust_seconds": adjust,
+        "step_ms": float(np.median(each[len(each) // 3 :]) * 1000),
+    }
+
+
+def measure(scan: Path, steps: int) -> dict[str, float]:
+    """The same in a fresh process, whose peak of memory is its own."""
+    command = [sys.executable, "-m", "benchmarks.resources", "--scan", str(scan), "--steps", str(steps)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(done.stdout + done.stderr)
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", nargs="+", type=int, default=[5, 22, 57])
+    parser.add_argument("--sizes", nargs="+", type=int, default=[400, 1200], help="multiples of 400")
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/resources"), help="for the scans; made once")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/resources.json"))
+    parser.add_argument("--scan", type=Path, help="measure this scan, in this process, and print the figures only")
+    options = parser.parse_args()
+    if options.scan:
+        print(json.dumps(measure_here(options.scan, options.steps)))
+        return
+    source = options.folder / "source"
+    if not source.exists():
+        synthesise(SynthConfig(scene="frog", frames=max(options.frames), resolution=BASE, seed=1), source)
+    rows = []
+    for size in options.sizes:
+        for frames in options.frames:
+            scan = options.folder / f"{frames}x{size}"
+            if not scan.exists():
+                make_scan(source, frames, size // BASE, scan)
+            rows.append(Row(frames, size, **measure(scan, options.steps)))
+            print(rows[-1], flush=True)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
