@@ -17,27 +17,16 @@ from sl_nerfstudio.calibration.kernel import NOISE_FLOOR_PX, Kernel, frame_media
 from sl_nerfstudio.calibration.linearisation import Observations, Rig, linearise, normal_equations, residuals_of
 from sl_nerfstudio.calibration.modes import RefinePoses, free_directions
 from sl_nerfstudio.calibration.observations import observe, place_anchors
+from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations, rough_trust
 from sl_nerfstudio.calibration.steps import DAMPING, Descent, Pull, descend
 from sl_nerfstudio.calibration.strays import lead_home
-from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 from sl_nerfstudio.progress import track
 
 _OBSERVE_EVERY = 4  # iterations between new choices of which frame sees which anchor
-_INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
 _SETTLED = 0.98  # of its last width: the kernel has stopped shrinking
 _SMALL_STEP = 1e-4  # of the scene's radius, or radian: the adjustment has converged
 _SEARCHES = 3  # for frames that went astray, at most: those found help to find the others
 _EVERYTHING = float("inf")  # pixels: no residual is too large to be looked at
-
-
-@dataclass(frozen=True)
-class PosePrior:
-    """How well the starting poses are known: 1 sigma per frame, lengths in the scene's unit, angles in radian."""
-
-    frame_translation: Float[Tensor, "frames"]
-    frame_rotation: Float[Tensor, "frames"]
-    relative_translation: Float[Tensor, "frames"]
-    relative_rotation: Float[Tensor, "frames"]
 
 
 @dataclass
@@ -90,34 +79,6 @@ def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
     if refine in ("free", "rigid-rig"):  # a static projector has its place already
         found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
     return found
-
-
-def prior_equations(
-    prior: PosePrior, start: Rig, rig: Rig
-) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
-    """Information matrix and gradient of the departure from the starting poses."""
-    n = rig.frames
-    delta = log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
-    weight = torch.cat([(1 / s**2)[:, None].expand(n, 3) for s in (prior.frame_translation, prior.frame_rotation)], 1)
-    # relative: position and rotation of the projector in camera axes
-    t = rig.T_camera_projector[:, :3, 3]
-    e = torch.cat(
-        [
-            t - start.T_camera_projector[:, :3, 3],
-            log_so3(rig.T_camera_projector[:, :3, :3] @ start.T_camera_projector[:, :3, :3].transpose(1, 2)),
-        ],
-        1,
-    )
-    eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
-    J = torch.cat([torch.cat([eye, -hat(t)], -1), torch.cat([torch.zeros_like(eye), eye], -1)], -2)
-    w_relative = torch.cat(
-        [(1 / s**2)[:, None].expand(n, 3) for s in (prior.relative_translation, prior.relative_rotation)], 1
-    )
-    JtW = J.transpose(1, 2) * w_relative[:, None, :]
-    H = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-    H[: 6 * n, : 6 * n] = torch.diag(weight.reshape(-1))
-    H[6 * n :, 6 * n :] = torch.block_diag(*(JtW @ J))
-    return H, torch.cat([(weight * delta).reshape(-1), (JtW @ e[..., None]).reshape(-1)])
 
 
 def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
@@ -181,8 +142,8 @@ def _run(problem: _Problem, stage: _Stage, found: _Found) -> _Found:
         noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
         widths = narrowed(found.widths, target).clamp_min(3 * noise)
         kernel = Kernel(widths, found.state.anchors.frame, found.pairs)
-        independent = _INDEPENDENT_ROWS * start.frames / max(int(r.cross_valid.sum()), 1)
-        trust = noise**2 / min(independent, 1.0) if stage.rough else noise**2
+        rows_of_a_frame = float(r.cross_valid.sum()) / start.frames
+        trust = rough_trust(noise, rows_of_a_frame) if stage.rough else noise**2
         H, g = prior_equations(problem.prior, start, found.state.rig)
         B = free_directions(stage.refine, found.state.rig)
         state = descend(found.state, linear, found.rows, maps, kernel, B, Pull(trust * H, trust * g))
@@ -221,7 +182,7 @@ def adjust(
     for stage in rough:
         found = _run(problem, stage, found)
     for _ in range(_SEARCHES if refine in ("free", "rigid-rig", "known-rig") else 0):
-        home = lead_home(found.state.rig, maps, found.noise, prior.frame_rotation, prior.frame_translation, generator)
+        home = lead_home(found.state.rig, start, maps, prior, found.noise, generator)
         moved = (home.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():
             break

@@ -4,7 +4,7 @@ With all other frames held, a frame is six unknowns and thousands of residuals: 
 places around where it stands, it finds the surface that the others agree on.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,12 +14,14 @@ from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.kernel import Kernel, frame_medians, narrowed
 from sl_nerfstudio.calibration.linearisation import Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.calibration.observations import observe, place_anchors
-from sl_nerfstudio.calibration.steps import Descent, descend
+from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations, rough_trust
+from sl_nerfstudio.calibration.steps import Descent, Pull, descend
 
-_FEW_INLIERS = 0.75  # of the share of residuals within the noise that frames have in the middle: astray
-_HOME = 0.9  # of that share: the frame is where it belongs
+_BLIND, _HAIR = 0.75, 0.95  # of the share of residuals within the noise that frames have in the middle
+_BETTER = 0.02  # more residuals within the noise, as a share: a better place
 _INLIER = 5.0  # times the noise
-_STEPS = 14
+_STEPS = 20
+_STEPS_AS_A_WHOLE = 8
 _ANCHORS = 200  # of each frame
 _ROWS = 6000  # at most, of one frame with all others
 _TRIES = 12  # places from which a frame is led home
@@ -54,37 +56,46 @@ class _Scene:
         return observe(rig, self.anchors, self.maps, rig.frames, float("inf"), self.generator, around)
 
 
+def belongs(shares: Float[Tensor, "frames"]) -> float:
+    """The share of residuals within the noise from which on a frame is where it belongs.
+
+    Four robust sigmas below the frames in the middle, but neither hair-splitting nor blind.
+    """
+    middle = shares.nanmedian()
+    sigma = 1.4826 * (shares - middle).abs().nanmedian()
+    return float((middle - 4 * sigma).clamp(_BLIND * middle, _HAIR * middle))
+
+
 def find_strays(shares: Float[Tensor, "frames"]) -> Int[Tensor, "strays"]:
     """Frames with far fewer residuals within the noise than most, the best of them first."""
-    astray = (shares < _FEW_INLIERS * shares.nanmedian()).nonzero().squeeze(-1)
+    astray = (shares < belongs(shares)).nonzero().squeeze(-1)
     return astray[shares[astray].argsort(descending=True)]
 
 
 def lead_home(
-    rig: Rig,
-    maps: CoordinateMaps,
-    noise: float,
-    rotation: Float[Tensor, "frames"],
-    translation: Float[Tensor, "frames"],
-    generator: torch.Generator,
+    rig: Rig, start: Rig, maps: CoordinateMaps, prior: PosePrior, noise: float, generator: torch.Generator
 ) -> Rig:
-    """The rig with strays moved, as wholes, to where the other frames want them; who finds no better place stays.
+    """The rig with strays moved to where the other frames want them; who finds no better place stays.
 
-    `rotation` (radian) and `translation` (scene units), 1 sigma per axis, say how far from where it stands a frame is
-    looked for.
+    A stray is looked for around where it stands, as far as the prior is uncertain of frames, with the relative pose it
+    started with: what was made of that in a wrong place is worth nothing.
     """
     scene = _Scene(place_anchors(rig, maps, _ANCHORS, generator), maps, noise, generator)
     shares = scene.shares(rig, scene.rows(rig))
     strays = find_strays(shares)
     settled = ~torch.isin(torch.arange(rig.frames), strays) & shares.isfinite()
-    enough = _HOME * float(shares.nanmedian())
+    enough = belongs(shares)
     for k in strays.tolist():
-        best, best_share = rig, float(shares[k])
+        best, best_share = rig, float(shares[k]) + _BETTER
+        sigma = torch.cat([prior.frame_translation[k].expand(3), prior.frame_rotation[k].expand(3)])
         for attempt in range(_TRIES):
-            sigma = torch.cat([translation[k].expand(3), rotation[k].expand(3)]) * (attempt > 0)
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)
-            delta[k] = sigma * torch.randn(6, generator=generator, dtype=torch.float64)
-            found, share = _settle(rig.moved(delta, torch.zeros_like(delta)), k, settled, scene)
+            if attempt:
+                delta[k] = sigma * torch.randn(6, generator=generator, dtype=torch.float64)
+            relative = rig.T_camera_projector.clone()
+            relative[k] = start.T_camera_projector[k]
+            there = replace(rig, T_camera_projector=relative).moved(delta, torch.zeros_like(delta))
+            found, share = _settle(there, k, settled, start, prior, scene)
             if share > best_share:
                 best, best_share = found, share
             if best_share > enough:
@@ -94,28 +105,32 @@ def lead_home(
     return rig
 
 
-def _settle(rig: Rig, k: int, settled: Bool[Tensor, "frames"], scene: _Scene) -> tuple[Rig, float]:
-    """Move frame k alone; the rig and the share of the frame's residuals that end within the noise."""
-    B = torch.zeros(12 * rig.frames, 6, dtype=torch.float64)
-    B[6 * k : 6 * k + 6] = torch.eye(6, dtype=torch.float64)
+def _settle(
+    rig: Rig, k: int, settled: Bool[Tensor, "frames"], start: Rig, prior: PosePrior, scene: _Scene
+) -> tuple[Rig, float]:
+    """Move frame k alone, as a whole, then its projector too; and the share of its residuals within the noise."""
+    n = rig.frames
+    B = torch.zeros(12 * n, 12, dtype=torch.float64)
+    B[6 * k : 6 * k + 6, :6] = B[6 * (n + k) : 6 * (n + k) + 6, 6:] = torch.eye(6, dtype=torch.float64)
     allowed = settled.clone()
     allowed[k] = True
-    width = torch.full((rig.frames,), float("inf"), dtype=torch.float64)
+    width = torch.full((n,), float("inf"), dtype=torch.float64)
     state = Descent(rig, scene.anchors)
     for step in range(_STEPS):
         if step % 3 == 0:
             rows = _rows_of(state.rig, k, allowed, scene)
-            if not len(rows.anchor):
-                return rig, 0.0
-        pair = torch.stack([scene.anchors.frame[rows.anchor], rows.frame])
         linear = linearise(state.rig, state.anchors, rows, scene.maps)
         if not linear.residuals.cross_valid.any():
             return rig, 0.0
-        median = frame_medians(linear.residuals, pair, rig.frames)[k]
+        pair = torch.stack([scene.anchors.frame[rows.anchor], rows.frame])
+        median = frame_medians(linear.residuals, pair, n)[k]
         width = narrowed(width, torch.full_like(width, 2 * float(median))).clamp_min(3 * scene.noise)
-        state = descend(state, linear, rows, scene.maps, Kernel(width, scene.anchors.frame, pair), B)
-    rows = _rows_of(state.rig, k, allowed, scene)
-    return state.rig, float(scene.shares(state.rig, rows)[k].nan_to_num())
+        H, g = prior_equations(prior, start, state.rig)
+        trust = rough_trust(scene.noise, float(linear.residuals.cross_valid.sum()))
+        kernel = Kernel(width, scene.anchors.frame, pair)
+        free = B[:, :6] if step < _STEPS_AS_A_WHOLE else B
+        state = descend(state, linear, rows, scene.maps, kernel, free, Pull(trust * H, trust * g))
+    return state.rig, float(scene.shares(state.rig, _rows_of(state.rig, k, allowed, scene))[k].nan_to_num())
 
 
 def _rows_of(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], scene: _Scene) -> Observations:

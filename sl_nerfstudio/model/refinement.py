@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sl_nerfstudio.calibration.bundle_adjustment import (
     AdjustmentSettings,
-    PosePrior,
     adjust,
 )
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
@@ -18,6 +17,7 @@ from sl_nerfstudio.calibration.gauge import known_baseline, restore
 from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import RefinePoses, constrained
+from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.se3 import inverse

@@ -11,13 +11,12 @@ from torch import Tensor
 from sl_nerfstudio.calibration.bundle_adjustment import (
     Adjustment,
     AdjustmentSettings,
-    PosePrior,
     adjust,
-    prior_equations,
 )
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import constrained, free_directions
+from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 

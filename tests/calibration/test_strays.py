@@ -6,13 +6,14 @@ from math import radians
 import pytest
 import torch
 
+from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.calibration.strays import find_strays, lead_home
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
 
 from .analytic import ExactMaps, rig_of
 
 FRAMES, SIZE, STRAY = 6, 100, 2
-SIGMA = (torch.full((FRAMES,), radians(3.0), dtype=torch.float64), torch.full((FRAMES,), 0.05, dtype=torch.float64))
+PRIOR = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.05, radians(3.0), 0.01, radians(0.3))))
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +23,7 @@ def true():
 
 def led(rig, true):
     generator = torch.Generator().manual_seed(0)
-    return lead_home(rig, ExactMaps.around(true, SIZE), 0.05, *SIGMA, generator)
+    return lead_home(rig, rig, ExactMaps.around(true, SIZE), PRIOR, 0.05, generator)
 
 
 def test_a_stray_comes_home_and_nobody_else_moves(true):
@@ -43,3 +44,7 @@ def test_where_all_agree_nobody_is_looked_for(true):
 def test_strays_are_those_with_few_residuals_within_the_noise_the_best_first():
     shares = torch.tensor([0.8, 0.3, 0.85, 0.5, float("nan"), 0.9, 0.8], dtype=torch.float64)
     assert find_strays(shares).tolist() == [3, 1]
+    alike = torch.tensor([0.8, 0.8, 0.78, 0.8, 0.8], dtype=torch.float64)
+    assert not len(find_strays(alike))  # 2.5 % below frames that are all alike is nothing
+    alike[2] = 0.7
+    assert find_strays(alike).tolist() == [2]
