@@ -4,7 +4,9 @@
 
 For every scene and seed one noisy scan is made and trained four times: as `sl-neus` does it (`refined`), with
 the starting poses kept (`unrefined`), with the true poses given (`oracle`: nobody can do much better with this
-field), and with rigid frames only (`known-rig`). Prints a table; writes benchmarks/results/accuracy.json.
+field), and with rigid frames only (`known-rig`). `--variants` names others: each part of the method left out
+(`no-pattern`, `no-annealing`, `no-direct`, `no-warm-start`, `no-coarse-to-fine`), or poses trained by the rendering
+losses instead of adjusted (`by-gradient`, `independent`). Prints a table; writes benchmarks/results/accuracy.json.
 """
 
 import argparse
@@ -20,13 +22,28 @@ from pathlib import Path
 from benchmarks.machine import describe
 
 FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 57}
-VARIANTS = {
+COMPARED = {
     "refined": (),
     "known-rig": ("--pipeline.model.refine-poses", "known-rig"),
     "unrefined": ("--pipeline.model.refine-poses", "off"),
     "oracle": ("--pipeline.model.refine-poses", "off"),
 }
-RESULT = Path("benchmarks/results/accuracy.json")
+ABLATIONS = {
+    "no-pattern": ("--pipeline.model.losses.pattern", "0"),
+    "no-annealing": ("--pipeline.model.annealing.anneal-kappa", "False"),
+    "by-gradient": ("--pipeline.model.adjust-poses", "False", "--pipeline.model.train-poses", "True"),
+    "independent": (
+        *("--pipeline.model.adjust-poses", "False", "--pipeline.model.train-poses", "True"),
+        *("--pipeline.model.pose-parameters", "independent"),
+    ),
+    "no-direct": (
+        *("--pipeline.model.losses.surface", "0", "--pipeline.model.losses.free-space", "0"),
+        *("--pipeline.model.losses.coordinates", "1", "--pipeline.model.warm-start", "0"),
+    ),
+    "no-warm-start": ("--pipeline.model.warm-start", "0"),
+    "no-coarse-to-fine": ("--pipeline.model.annealing.coarse-to-fine", "False"),
+}
+VARIANTS = {**COMPARED, **ABLATIONS}
 
 
 @dataclass(frozen=True)
@@ -110,7 +127,7 @@ def measure(scene: str, seed: int, iterations: int, folder: Path, variants: Sequ
 def row_text(row: Row) -> str:
     """One line of the table."""
     return (
-        f"{row.scene:18} {row.seed:4} {row.variant:10} rigid RMSE {row.rigid_rmse:.3f} median {row.rigid_median:.3f} "
+        f"{row.scene:18} {row.seed:4} {row.variant:17} rigid RMSE {row.rigid_rmse:.3f} median {row.rigid_median:.3f} "
         f"| similarity {row.similarity_rmse:.3f} | complete {row.completeness_rmse:.3f} "
         f"| camera {row.camera_translation_rmse:.3f} mm {row.camera_rotation_rmse_deg:.3f} deg "
         f"| {row.coordinate_px:.2f} px | {row.training_seconds:.0f} s"
@@ -122,9 +139,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(FRAMES), choices=FRAMES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS)
+    parser.add_argument("--variants", nargs="+", default=list(COMPARED), choices=VARIANTS)
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--folder", type=Path, default=Path("outputs/accuracy"), help="must not exist yet")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/accuracy.json"))
     options = parser.parse_args()
     options.folder.mkdir(parents=True)
     rows: list[Row] = []
@@ -133,8 +151,10 @@ def main() -> None:
             folder = options.folder / f"{scene}-{seed}"
             folder.mkdir()
             rows += measure(scene, seed, options.iterations, folder, options.variants)
-            RESULT.parent.mkdir(exist_ok=True)
-            RESULT.write_text(json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n")
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            options.output.write_text(
+                json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n"
+            )
 
 
 if __name__ == "__main__":
