@@ -182,7 +182,7 @@ def adjust(
     for stage in rough:
         found = _run(problem, stage, found)
     for _ in range(_SEARCHES if refine in ("free", "rigid-rig", "known-rig") else 0):
-        home = lead_home(found.state.rig, start, maps, prior, found.noise, generator)
+        home = lead_home(found.state.rig, start, maps, prior, refine, found.noise, generator)
         moved = (home.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():
             break

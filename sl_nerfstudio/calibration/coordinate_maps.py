@@ -1,7 +1,9 @@
 """Decoded coordinate images of all frames, looked up between pixels.
 
-A look-up fits a plane to the decoded pixels of a small window: this averages the decoding noise,
+A look-up fits a paraboloid to the decoded pixels of a small window: this averages the decoding noise,
 gives the derivative with respect to the pixel, and shows where the map is torn (edges, wrong cells).
+(A plane would average better, but on a curved surface it lies beside the map by the same amount
+everywhere, and joint adjustment makes poses of that.)
 """
 
 from collections.abc import Sequence
@@ -13,11 +15,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.calibration.compiled import compiled
+from sl_nerfstudio.calibration.compiled import compiled, compiled_part
 
-_HALF_WINDOW = 2  # pixels: 5 x 5 windows
-_MIN_PIXELS = 10  # decoded pixels a window must hold
-_MAX_ROUGHNESS = 2.0  # projector pixels: RMS distance of a window's pixels from their plane
+_HALF_WINDOW = 3  # pixels: 7 x 7 windows
+_MIN_PIXELS = 24  # decoded pixels a window must hold
+_DEGENERATE = 1e-3  # of a pivot, left after elimination: the window's pixels lie on a conic
+_MAX_ROUGHNESS = 2.0  # projector pixels: RMS distance of a window's pixels from their paraboloid
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class MapSample:
 
     uv_projector: Float[Tensor, "n 2"]
     jacobian: Float[Tensor, "n 2 2"]  # d uv_projector / d uv_camera
-    valid: Bool[Tensor, "n"]  # enough decoded pixels, and they lie on a plane
+    valid: Bool[Tensor, "n"]  # enough decoded pixels, and they lie on a paraboloid
 
 
 @dataclass(frozen=True)
@@ -72,21 +75,21 @@ class CoordinateMaps:
         return torch.stack([chosen % w + 0.5, chosen // w + 0.5], -1).double()
 
     def look_up(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> MapSample:
-        """Plane fits around positions in the camera images of `frame`; invalid outside the image."""
+        """Fits around positions in the camera images of `frame`; invalid outside the image."""
         n = len(frame)
-        plane = np.zeros((n, 3, 2))
+        fit = np.zeros((n, 3, 2))
         valid = np.zeros(n, dtype=np.bool_)
-        _fit_planes(
+        _fit_paraboloids(
             self.values.numpy(),
             self.offsets.numpy(),
             self.widths.numpy(),
             self.heights.numpy(),
             frame.numpy(),
             uv_camera.detach().double().numpy(),
-            plane,
+            fit,
             valid,
         )
-        fitted = torch.from_numpy(plane)
+        fitted = torch.from_numpy(fit)
         return MapSample(fitted[:, 0], fitted[:, 1:].transpose(1, 2), torch.from_numpy(valid))
 
     def decoded_at(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
@@ -99,16 +102,17 @@ class CoordinateMaps:
 
 
 @compiled
-def _fit_planes(values, offsets, widths, heights, frame, uv, plane, valid):
-    """Least-squares planes `c0 + cx dx + cy dy` around each position, from its window's decoded pixels."""
+def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, valid):
+    """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
     for k in numba.prange(len(frame)):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]
         w, h = widths[f], heights[f]
         if not (px >= 0 and py >= 0 and px < w and py < h):
             continue
         column, row = int(px), int(py)
-        n = sx = sy = sxx = sxy = syy = 0.0
-        a0 = ax = ay = aa = b0 = bx = by = bb = 0.0
+        A = np.zeros((6, 8))  # normal equations, two right-hand sides
+        basis = np.ones(6)
+        n = aa = 0.0
         origin_a = origin_b = np.nan
         for y in range(max(row - _HALF_WINDOW, 0), min(row + _HALF_WINDOW + 1, h)):
             for x in range(max(column - _HALF_WINDOW, 0), min(column + _HALF_WINDOW + 1, w)):
@@ -120,37 +124,53 @@ def _fit_planes(values, offsets, widths, heights, frame, uv, plane, valid):
                     origin_a, origin_b = a, b  # keeps the sums small
                 a, b = a - origin_a, b - origin_b
                 dx, dy = x + 0.5 - px, y + 0.5 - py
+                basis[1], basis[2], basis[3], basis[4], basis[5] = dx, dy, dx * dx, dx * dy, dy * dy
+                for i in range(6):
+                    for j in range(i + 1):
+                        A[i, j] += basis[i] * basis[j]
+                    A[i, 6] += basis[i] * a
+                    A[i, 7] += basis[i] * b
                 n += 1.0
-                sx += dx
-                sy += dy
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-                a0 += a
-                ax += a * dx
-                ay += a * dy
-                aa += a * a
-                b0 += b
-                bx += b * dx
-                by += b * dy
-                bb += b * b
-        # inverse of the symmetric [[n, sx, sy], [sx, sxx, sxy], [sy, sxy, syy]] by cofactors
-        c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
-        c11, c12, c22 = n * syy - sy * sy, sx * sy - n * sxy, n * sxx - sx * sx
-        det = n * c00 + sx * c01 + sy * c02
-        if n < _MIN_PIXELS or det < 1e-3 * n:
+                aa += a * a + b * b
+        if n < _MIN_PIXELS:
             continue
-        a_0, a_x, a_y = (
-            (c00 * a0 + c01 * ax + c02 * ay) / det,
-            (c01 * a0 + c11 * ax + c12 * ay) / det,
-            (c02 * a0 + c12 * ax + c22 * ay) / det,
-        )
-        b_0, b_x, b_y = (
-            (c00 * b0 + c01 * bx + c02 * by) / det,
-            (c01 * b0 + c11 * bx + c12 * by) / det,
-            (c02 * b0 + c12 * bx + c22 * by) / det,
-        )
-        plane[k, 0, 0], plane[k, 1, 0], plane[k, 2, 0] = a_0 + origin_a, a_x, a_y
-        plane[k, 0, 1], plane[k, 1, 1], plane[k, 2, 1] = b_0 + origin_b, b_x, b_y
-        rough2 = (aa - a_0 * a0 - a_x * ax - a_y * ay + bb - b_0 * b0 - b_x * bx - b_y * by) / n
-        valid[k] = rough2 < _MAX_ROUGHNESS * _MAX_ROUGHNESS
+        right = A[:, 6:].copy()
+        if not _solve(A):
+            continue
+        rough2 = aa
+        for i in range(6):
+            rough2 -= A[i, 6] * right[i, 0] + A[i, 7] * right[i, 1]
+        fit[k, :, :] = A[:3, 6:]
+        fit[k, 0, 0] += origin_a
+        fit[k, 0, 1] += origin_b
+        valid[k] = rough2 < _MAX_ROUGHNESS * _MAX_ROUGHNESS * n
+
+
+@compiled_part
+def _solve(A):
+    """Cholesky of the lower triangle of A[:, :6], then A[:, 6:] <- solution. False where the window is degenerate."""
+    for j in range(6):
+        d = A[j, j]
+        scale = d
+        for i in range(j):
+            d -= A[j, i] * A[j, i]
+        if not d > _DEGENERATE * scale:
+            return False
+        A[j, j] = np.sqrt(d)
+        for i in range(j + 1, 6):
+            v = A[i, j]
+            for m in range(j):
+                v -= A[i, m] * A[j, m]
+            A[i, j] = v / A[j, j]
+    for c in range(6, 8):
+        for i in range(6):
+            v = A[i, c]
+            for m in range(i):
+                v -= A[i, m] * A[m, c]
+            A[i, c] = v / A[i, i]
+        for i in range(5, -1, -1):
+            v = A[i, c]
+            for m in range(i + 1, 6):
+                v -= A[m, i] * A[m, c]
+            A[i, c] = v / A[i, i]
+    return True

@@ -13,6 +13,7 @@ from torch import Tensor
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.kernel import Kernel, frame_medians, narrowed
 from sl_nerfstudio.calibration.linearisation import Anchors, Observations, Rig, linearise, residuals_of
+from sl_nerfstudio.calibration.modes import RefinePoses
 from sl_nerfstudio.calibration.observations import observe, place_anchors
 from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations, rough_trust
 from sl_nerfstudio.calibration.steps import Descent, Pull, descend
@@ -20,8 +21,7 @@ from sl_nerfstudio.calibration.steps import Descent, Pull, descend
 _BLIND, _HAIR = 0.75, 0.95  # of the share of residuals within the noise that frames have in the middle
 _BETTER = 0.02  # more residuals within the noise, as a share: a better place
 _INLIER = 5.0  # times the noise
-_STEPS = 20
-_STEPS_AS_A_WHOLE = 8
+_STEPS_AS_A_WHOLE, _STEPS = 10, 10
 _ANCHORS = 200  # of each frame
 _ROWS = 6000  # at most, of one frame with all others
 _TRIES = 12  # places from which a frame is led home
@@ -35,6 +35,7 @@ class _Scene:
     maps: CoordinateMaps
     noise: float
     generator: torch.Generator
+    steps_with_projector: int  # after those of the frame as a whole
 
     def shares(self, rig: Rig, rows: Observations) -> Float[Tensor, "frames"]:
         """Share of residuals within the noise, of what each frame takes part in; NaN where that is nothing."""
@@ -73,14 +74,21 @@ def find_strays(shares: Float[Tensor, "frames"]) -> Int[Tensor, "strays"]:
 
 
 def lead_home(
-    rig: Rig, start: Rig, maps: CoordinateMaps, prior: PosePrior, noise: float, generator: torch.Generator
+    rig: Rig,
+    start: Rig,
+    maps: CoordinateMaps,
+    prior: PosePrior,
+    refine: RefinePoses,
+    noise: float,
+    generator: torch.Generator,
 ) -> Rig:
     """The rig with strays moved to where the other frames want them; who finds no better place stays.
 
     A stray is looked for around where it stands, as far as the prior is uncertain of frames, with the relative pose it
-    started with: what was made of that in a wrong place is worth nothing.
+    started with: what was made of that in a wrong place is worth nothing. (Where the mode leaves projectors free.)
     """
-    scene = _Scene(place_anchors(rig, maps, _ANCHORS, generator), maps, noise, generator)
+    alone = refine == "free"
+    scene = _Scene(place_anchors(rig, maps, _ANCHORS, generator), maps, noise, generator, _STEPS if alone else 0)
     shares = scene.shares(rig, scene.rows(rig))
     strays = find_strays(shares)
     settled = ~torch.isin(torch.arange(rig.frames), strays) & shares.isfinite()
@@ -93,7 +101,8 @@ def lead_home(
             if attempt:
                 delta[k] = sigma * torch.randn(6, generator=generator, dtype=torch.float64)
             relative = rig.T_camera_projector.clone()
-            relative[k] = start.T_camera_projector[k]
+            if alone:
+                relative[k] = start.T_camera_projector[k]
             there = replace(rig, T_camera_projector=relative).moved(delta, torch.zeros_like(delta))
             found, share = _settle(there, k, settled, start, prior, scene)
             if share > best_share:
@@ -116,7 +125,7 @@ def _settle(
     allowed[k] = True
     width = torch.full((n,), float("inf"), dtype=torch.float64)
     state = Descent(rig, scene.anchors)
-    for step in range(_STEPS):
+    for step in range(_STEPS_AS_A_WHOLE + scene.steps_with_projector):
         if step % 3 == 0:
             rows = _rows_of(state.rig, k, allowed, scene)
         linear = linearise(state.rig, state.anchors, rows, scene.maps)

@@ -25,9 +25,9 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
 _HELD_OUT_PER_FRAME = 300
-_GUARD_WIDTH = (
-    4.0  # times the decoding noise: beyond it a residual is a wrong decoding or something else hides the place
-)
+# times the decoding noise: beyond it a residual is a wrong decoding, or something else hides the place
+_GUARD_WIDTH = 4.0
+_GUARD_FLOOR_PX = 0.25  # where decoding is perfect, looking up between pixels is not
 
 
 @dataclass
@@ -118,7 +118,7 @@ def refine(
     found = adjust(constrained(mode, start), maps, stated, mode, settings)
     known = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
     rig = restore(start, found.rig, known)
-    verdict = compare(start, rig, held_out, maps, _GUARD_WIDTH * found.noise_px)
+    verdict = compare(start, rig, held_out, maps, max(_GUARD_WIDTH * found.noise_px, _GUARD_FLOOR_PX))
     if not verdict.better:
         return Refinement(start.T_world_camera, start.T_world_projector, _prior_sigma(stated), verdict, found.noise_px)
     sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, rig.frames, 6).transpose(0, 1)

@@ -21,16 +21,20 @@ def true():
     return rig_of(FRAMES, SIZE)
 
 
-def led(rig, true):
+def led(rig, true, mode="free"):
     generator = torch.Generator().manual_seed(0)
-    return lead_home(rig, rig, ExactMaps.around(true, SIZE), PRIOR, 0.05, generator)
+    return lead_home(rig, rig, ExactMaps.around(true, SIZE), PRIOR, mode, 0.05, generator)
 
 
-def test_a_stray_comes_home_and_nobody_else_moves(true):
+@pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig"])
+def test_a_stray_comes_home_and_nobody_else_moves(true, mode):
     away = exp_se3(torch.tensor([0.08, -0.05, 0.04, 0.06, 0.05, -0.1], dtype=torch.float64))
     cameras = true.T_world_camera.clone()
     cameras[STRAY] = away @ cameras[STRAY]
-    found = led(replace(true, T_world_camera=cameras), true).T_world_camera
+    rig = led(replace(true, T_world_camera=cameras), true, mode)
+    found = rig.T_world_camera
+    if mode != "free":
+        assert torch.equal(rig.T_camera_projector, true.T_camera_projector)
     others = torch.arange(FRAMES) != STRAY
     assert torch.equal(found[others], true.T_world_camera[others])
     off = inverse(true.T_world_camera[STRAY]) @ found[STRAY]
