@@ -12,6 +12,8 @@ BENCHMARKS: dict[str, list[str]] = {
     "iteration_time": [],
     "mesh_time": [],
     "tsdf_baseline": [str(SCAN)],
+    "decoding": [],
+    "decoding_graphs": [],
 }
 """Name of the module, and its arguments besides --output."""
 

@@ -1,0 +1,113 @@
+"""Graph network against window matching, on grid graphs of the default pattern with misread symbols and missing nodes.
+
+python -m benchmarks.decoding_graphs [--graphs 10] [--output results.json]
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from benchmarks.machine import describe
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.decoding.gcn import turned_pattern
+from sl_nerfstudio.decoding.graph import neighbourhoods
+from sl_nerfstudio.decoding.network import NetworkDecoder
+from sl_nerfstudio.decoding.window_matching import match_windows
+from sl_nerfstudio.pattern.grid import GridPattern
+from training.graphs import Damage, DamagedGraph, damage_graph
+
+
+@dataclass(frozen=True)
+class Config:
+    """Shares of nodes that find their place."""
+
+    misread: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
+    """shares of symbols misread"""
+    missing: float = 0.2
+    """share of the nodes that are not found"""
+    graphs: int = 12
+    """graphs of each kind, a random part of the pattern each"""
+    seed: int = 100
+    """of the graphs; training uses others"""
+    output: Path | None = None
+    """where to write the figures as JSON, with machine, date and commit"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Shares of all nodes: at their true place, and at another one; the rest got none."""
+
+    misread: float
+    missing: float
+    method: str
+    right: float
+    wrong: float
+
+
+METHODS = ("windows, exact", "windows, one symbol off", "graph network, each node alone", "graph network and consensus")
+
+
+def answers(decoder: NetworkDecoder, graph: DamagedGraph) -> dict[str, np.ndarray]:
+    """(turn, row, column) that each method gives every node, -1 for none."""
+    pattern = turned_pattern(np.asarray(decoder.pattern.codes))
+    around = neighbourhoods(graph.neighbour)
+    places = np.column_stack([pattern.turn, pattern.place]).astype(np.int64)
+    places = np.vstack([places, np.full((1, 3), -1)])
+    with torch.inference_mode():
+        alone = decoder.judge(torch.from_numpy(graph.score), around).argmax(1).numpy()
+    assignment = decoder.assign(graph.as_grid())
+    together = np.column_stack([np.full(len(alone), assignment.turn), assignment.place])
+    return dict(
+        zip(
+            METHODS,
+            (
+                places[match_windows(graph.score, around, pattern, 0)],
+                places[match_windows(graph.score, around, pattern, 1)],
+                places[alone],
+                np.where(assignment.known[:, None], together, -1),
+            ),
+            strict=True,
+        )
+    )
+
+
+def measure(decoder: NetworkDecoder, config: Config, misread: float) -> list[Row]:
+    """All methods on the same graphs."""
+    right, wrong, total = np.zeros(len(METHODS)), np.zeros(len(METHODS)), 0
+    codes = np.asarray(decoder.pattern.codes)
+    for index in range(config.graphs):
+        rng = np.random.default_rng([config.seed, round(100 * misread), index])
+        graph = damage_graph(rng, codes, Damage(misread, config.missing), index % 4, 0.4)
+        truth = np.column_stack([np.full(len(graph.place), graph.turn), graph.place])
+        total += len(truth)
+        for k, answer in enumerate(answers(decoder, graph).values()):
+            same = (answer == truth).all(-1)
+            right[k] += same.sum()
+            wrong[k] += (~same & (answer[:, 1] >= 0)).sum()
+    return [
+        Row(misread, config.missing, name, round(right[k] / total, 4), round(wrong[k] / total, 4))
+        for k, name in enumerate(METHODS)
+    ]
+
+
+def main() -> None:
+    """Print the table and write it to JSON."""
+    config = tyro.cli(Config, description=__doc__)
+    torch.set_num_threads(2)
+    decoder = NetworkDecoder(GridPattern())
+    rows = [row for misread in config.misread for row in measure(decoder, config, misread)]
+    print("| misread | missing | method | right | wrong |\n|---|---|---|---|---|")
+    for row in rows:
+        print(f"| {row.misread:.0%} | {row.missing:.0%} | {row.method} | {row.right:.1%} | {row.wrong:.1%} |")
+    if config.output is not None:
+        config.output.parent.mkdir(parents=True, exist_ok=True)
+        result = {"machine": describe(), "rows": [asdict(row) for row in rows]}
+        config.output.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    run(main)

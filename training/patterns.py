@@ -1,0 +1,56 @@
+"""A stock of random grid patterns, so that no network learns one code array by heart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int8
+from numpy import ndarray
+
+from sl_nerfstudio.pattern.codes import SYMBOLS
+from sl_nerfstudio.pattern.grid import GridPattern
+
+CELLS = 34  # nodes along each side
+_PERIOD = 20  # pixels, of the picture that is sampled
+
+
+@dataclass(frozen=True)
+class DrawnPattern:
+    """A random pattern as a picture; node (i, j) lies at ((j + 0.5) * period, (i + 0.5) * period)."""
+
+    picture: Float32[ndarray, "h w"]
+    codes: Int8[ndarray, "rows columns"]
+    period: float
+
+
+def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
+    """Random symbols, line width, gap and darkness."""
+    side = CELLS * _PERIOD
+    grid = GridPattern(
+        w=side,
+        h=side,
+        period=float(_PERIOD),
+        line_width=_PERIOD * rng.uniform(0.14, 0.28),
+        gap=_PERIOD * rng.uniform(0.22, 0.36),
+        dark=float(rng.uniform(0, 0.08)),
+        codes=rng.integers(0, SYMBOLS, (CELLS, CELLS)).astype(np.int8),
+    )
+    assert grid.codes is not None
+    return DrawnPattern(grid.render(supersampling=1), grid.codes, grid.period)
+
+
+class PatternStock:
+    """Patterns to draw from; one of them is replaced at every `renew`."""
+
+    def __init__(self, rng: np.random.Generator, count: int) -> None:
+        self._rng = rng
+        self._patterns = [draw_pattern(rng) for _ in range(count)]
+        self._next = 0
+
+    def pick(self) -> DrawnPattern:
+        """A random pattern of the stock."""
+        return self._patterns[self._rng.integers(len(self._patterns))]
+
+    def renew(self) -> None:
+        """Replace the oldest pattern by a new one."""
+        self._patterns[self._next] = draw_pattern(self._rng)
+        self._next = (self._next + 1) % len(self._patterns)

@@ -1,0 +1,199 @@
+"""Train the U-Net on random captures.
+
+    python -m training.unet --output outputs/training/unet
+
+writes the weights as safetensors and a log; a run that was broken off goes on from its last checkpoint.
+"""
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional as F
+
+from sl_nerfstudio.decoding.unet import Reading, UNet
+from training.captures import Capture, random_capture
+from training.patterns import PatternStock
+
+_NODE_WEIGHT = 3.0  # symbols are read at nodes: errors count more there
+_RENEWAL = 20  # steps between two new patterns
+
+
+@dataclass(frozen=True)
+class Config:
+    """Training of the U-Net."""
+
+    output: Path
+    """folder of weights, checkpoint and log"""
+    steps: int = 4000
+    """number of steps; the learning rate falls to zero over all of them, by a cosine"""
+    batch: int = 8
+    """captures a step"""
+    size: int = 160
+    """width and height of a capture, pixels"""
+    rate: float = 3e-3
+    """highest learning rate, of AdamW"""
+    seed: int = 0
+    """captures and starting weights follow from it"""
+    threads: int = 1
+    """processor threads of torch; captures are made in one more"""
+    log_every: int = 50
+    """steps between two lines of the log"""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Captures and their truth as tensors."""
+
+    channels: Float[Tensor, "b 2 s s"]
+    lit: Float[Tensor, "b h h"]
+    weight: Float[Tensor, "b h h"]  # 1 where lit and certain, else 0
+    certain: Float[Tensor, "b h h"]
+    phase: Float[Tensor, "b 4 h h"]
+    symbol: Tensor  # long, b h h
+    node: Float[Tensor, "b h h"]  # 1 within a quarter of a period of a node
+
+
+def stack(captures: list[Capture]) -> Batch:
+    """Captures of one size as a batch."""
+    lit = torch.from_numpy(np.stack([c.lit for c in captures]).astype(np.float32))
+    certain = torch.from_numpy(np.stack([c.certain for c in captures]).astype(np.float32))
+    coords = torch.from_numpy(np.stack([c.coords for c in captures]))
+    angle = 2 * math.pi * coords
+    phase = torch.stack([angle[..., 0].cos(), angle[..., 0].sin(), angle[..., 1].cos(), angle[..., 1].sin()], 1)
+    return Batch(
+        torch.from_numpy(np.stack([c.channels for c in captures])).contiguous(memory_format=torch.channels_last),
+        lit,
+        lit * certain,
+        certain,
+        phase,
+        torch.from_numpy(np.stack([c.symbol for c in captures]).astype(np.int64)),
+        ((coords - coords.round()).abs().amax(-1) < 0.25).float(),
+    )
+
+
+def losses(reading: Reading, batch: Batch) -> dict[str, Tensor]:
+    """Mask, phase and symbol; the last two where the pattern falls and is not torn."""
+    total = batch.weight.sum().clamp(min=1.0)
+    mask = F.binary_cross_entropy_with_logits(reading.mask, batch.lit, reduction="none")
+    phase = F.smooth_l1_loss(reading.phase, batch.phase, reduction="none", beta=0.2).sum(1)
+    near = batch.weight * (1 + _NODE_WEIGHT * batch.node)
+    symbol = F.cross_entropy(reading.symbol, batch.symbol, reduction="none")
+    return {
+        "mask": (mask * (0.2 + 0.8 * batch.certain)).mean(),
+        "phase": (phase * batch.weight).sum() / total,
+        "symbol": (symbol * near).sum() / near.sum().clamp(min=1.0),
+    }
+
+
+def figures(reading: Reading, batch: Batch) -> dict[str, float]:
+    """What a person wants to know: symbols misread at nodes, mask wrong (shares), phase error (periods)."""
+    with torch.no_grad():
+        at_node = (batch.weight * batch.node) > 0
+        right = reading.symbol.argmax(1) == batch.symbol
+        c, s, true_c, true_s = reading.phase[:, 0], reading.phase[:, 1], batch.phase[:, 0], batch.phase[:, 1]
+        error = torch.atan2(s * true_c - c * true_s, c * true_c + s * true_s).abs() / (2 * math.pi)
+        where = batch.weight > 0
+        return {
+            "misread": 1 - float(right[at_node].float().mean()),
+            "phase_median": float(error[where].median()),
+            "phase_90": float(error[where].quantile(0.9)),
+            "mask_wrong": float(((reading.mask > 0) != (batch.lit > 0.5)).float().mean()),
+        }
+
+
+def batches(config: Config, first: int) -> Iterator[Batch]:
+    """The batches of steps `first` to the last; the next one is made while the last one is learned from."""
+    stock = PatternStock(np.random.default_rng([config.seed, 1, first]), 24)
+
+    def make(step: int) -> Batch:
+        rng = np.random.default_rng([config.seed, 0, step])
+        if step % _RENEWAL == 0:
+            stock.renew()
+        return stack([random_capture(rng, stock, config.size) for _ in range(config.batch)])
+
+    with ThreadPoolExecutor(1) as maker:
+        coming = maker.submit(make, first)
+        for step in range(first, config.steps):
+            batch = coming.result()
+            if step + 1 < config.steps:
+                coming = maker.submit(make, step + 1)
+            yield batch
+
+
+def learning_rate(step: int, config: Config) -> float:
+    """A short warm-up, then a cosine down to zero."""
+    warm = min(1.0, (step + 1) / 100)
+    return config.rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+
+
+def train(config: Config) -> None:
+    """Train and write `unet.safetensors`, `log.jsonl` and `checkpoint.pt` into the output folder."""
+    torch.set_num_threads(config.threads)
+    cv2.setNumThreads(1)
+    config.output.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(config.seed)
+    network = UNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-3)
+    first = _resume(config, network, optimizer)
+    sums: dict[str, float] = {}
+    start = time.monotonic()
+    for step, batch in zip(range(first, config.steps), batches(config, first), strict=True):
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(step, config)
+        reading = network(batch.channels)
+        parts = losses(reading, batch)
+        optimizer.zero_grad(set_to_none=True)
+        sum(parts.values(), torch.zeros(())).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
+        optimizer.step()
+        for key, value in {**{k: float(v.detach()) for k, v in parts.items()}, **figures(reading, batch)}.items():
+            sums[key] = sums.get(key, 0.0) + value
+        if (step + 1) % config.log_every == 0:
+            row = {key: round(value / config.log_every, 5) for key, value in sums.items()}
+            _log(config, {"step": step + 1, "seconds": round(time.monotonic() - start), **row})
+            sums.clear()
+        if (step + 1) % (2 * config.log_every) == 0 or step + 1 == config.steps:
+            _save(config, step + 1, network, optimizer)
+
+
+def _log(config: Config, row: dict[str, float]) -> None:
+    line = json.dumps(row)
+    print(line, flush=True)
+    with (config.output / "log.jsonl").open("a") as stream:
+        stream.write(line + "\n")
+
+
+def _save(config: Config, step: int, network: UNet, optimizer: torch.optim.Optimizer) -> None:
+    state = {"step": step, "network": network.state_dict(), "optimizer": optimizer.state_dict()}
+    torch.save(state, config.output / "checkpoint.new")
+    (config.output / "checkpoint.new").replace(config.output / "checkpoint.pt")
+    weights = {key: value.contiguous() for key, value in network.state_dict().items()}
+    settings = {key: str(value) for key, value in asdict(config).items() if key != "output"}
+    save_file(weights, config.output / "unet.safetensors", {"step": str(step), **settings})
+
+
+def _resume(config: Config, network: UNet, optimizer: torch.optim.Optimizer) -> int:
+    """The step to begin with: 0, or where the checkpoint in the output folder stands."""
+    path = config.output / "checkpoint.pt"
+    if not path.exists():
+        return 0
+    state = torch.load(path, weights_only=True)
+    network.load_state_dict(state["network"])
+    optimizer.load_state_dict(state["optimizer"])
+    return int(state["step"])
+
+
+if __name__ == "__main__":
+    train(tyro.cli(Config, description=__doc__))
