@@ -1,0 +1,234 @@
+"""Auto-calibration and registration against the truth of synthetic scans, and on captures with known poses.
+
+    python -m benchmarks.registration [--scenes cone-and-cylinder head frog] [--scans FOLDER ...]
+
+For every scene a noisy scan is made with sl-synth (200 x 200 pixels, its default noise), its frames are calibrated one
+by one, registered without starting poses in the order of capture, and adjusted jointly. `--scans` adds existing scan
+folders, whose poses are taken for the truth where they have no ground_truth/.
+
+Printed are: the errors of rotation and baseline direction, and how often they stay within one stated sigma; rotation,
+position and scale of every frame after registration and after the joint adjustment, after one common similarity.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+
+from benchmarks.machine import describe
+from sl_nerfstudio.calibration.correspondence_rays import correspondences_of
+from sl_nerfstudio.calibration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.calibration.joint_poses import joint_poses
+from sl_nerfstudio.calibration.registration import register
+from sl_nerfstudio.calibration.relative_pose import calibrate_frame
+from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 43}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Errors of the frames' relative poses."""
+
+    rotation_deg_median: float
+    rotation_deg_max: float
+    direction_deg_median: float
+    direction_deg_max: float
+    rotation_within_sigma: float  # fraction of the frames
+    direction_within_sigma: float
+    mahalanobis: float  # mean squared error in units of the covariance over its 5 degrees of freedom: 1 is exact
+    seconds_a_frame: float
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Errors of the frames' places after one similarity; positions in mean camera distances."""
+
+    registered: int
+    rotation_deg_median: float
+    rotation_deg_max: float
+    position_max: float
+    scale_max: float  # fraction
+    within_target: int  # frames within 2 degrees and 3 %
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scan."""
+
+    scan: str
+    projector: str
+    frames: int
+    calibration: Calibration
+    registration: Poses
+    joint: Poses
+    not_registered: dict[str, str]
+    remarks: tuple[str, ...]
+
+
+def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
+    """True poses, or the ones in the file."""
+    truth = read_ground_truth(scan)
+    if truth.T_world_camera is None or truth.T_world_projector is None:
+        return scan.T_world_camera, scan.T_world_projector
+    return truth.T_world_camera, truth.T_world_projector
+
+
+def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Calibration]:
+    """All frames, one by one."""
+    from scipy.spatial.transform import Rotation
+
+    from sl_nerfstudio.calibration.epipolar_fit import direction_basis
+
+    clouds, rows = [], []
+    start = time.process_time()
+    for frame, T in zip(scan.frames, true_relative, strict=True):
+        coords = frame.read_coords()
+        pose = calibrate_frame(*correspondences_of(coords), frame.camera, scan.projector)
+        clouds.append(frame_cloud(frame.name, coords, frame.camera, scan.projector, pose))
+        found, b = pose.T_camera_projector, T[:3, 3] / np.linalg.norm(T[:3, 3])
+        w = Rotation.from_matrix(T[:3, :3] @ found[:3, :3].T).as_rotvec()
+        swing = np.cross(found[:3, 3], b)
+        e = np.concatenate([w, direction_basis(found[:3, 3]).T @ swing])
+        rows.append(
+            (
+                np.degrees(np.linalg.norm(w)),
+                np.degrees(np.arctan2(np.linalg.norm(swing), found[:3, 3] @ b)),
+                pose.sigma_rotation_deg,
+                pose.sigma_direction_deg,
+                e @ np.linalg.solve(pose.covariance, e) / 5,
+            )
+        )
+    rotation, direction, sigma_rotation, sigma_direction, distance = np.array(rows).T
+    return clouds, Calibration(
+        float(np.median(rotation)),
+        float(rotation.max()),
+        float(np.median(direction)),
+        float(direction.max()),
+        float((rotation < sigma_rotation).mean()),
+        float((direction < sigma_direction).mean()),
+        float(distance.mean()),
+        (time.process_time() - start) / len(clouds),
+    )
+
+
+def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray], seconds: float) -> Poses:
+    """Errors of registered frames after one similarity that fits cameras and the places they look at.
+
+    `truth` holds the true poses of cameras and projectors.
+    """
+    from scipy.spatial.transform import Rotation
+
+    known = np.isfinite(baseline)
+    true = truth[0][known]
+    true_baseline = np.linalg.norm(truth[0][:, :3, 3] - truth[1][:, :3, 3], axis=1)[known]
+    found, length = T_camera[known], baseline[known]
+    ahead = np.linalg.norm(true[:, :3, 3] - true[:, :3, 3].mean(0), axis=1).mean()
+    ratio = float(np.exp(np.mean(np.log(true_baseline / length))))
+    ends = [
+        np.concatenate([T[:, :3, 3], T[:, :3, 3] - unit * ahead * T[:, :3, 2]])
+        for T, unit in ((found, 1 / ratio), (true, 1.0))
+    ]
+    S = fit_similarity(ends[0], ends[1])
+    found = S.poses(found)
+    turn = np.degrees(Rotation.from_matrix(np.swapaxes(true[:, :3, :3], 1, 2) @ found[:, :3, :3]).magnitude())
+    shift = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1) / ahead
+    scale = np.abs(length * ratio / true_baseline - 1)
+    right = (turn < 2) & (scale < 0.03)
+    return Poses(
+        int(known.sum()), float(np.median(turn)), float(turn.max()), float(shift.max()), float(scale.max()),
+        int(right.sum()), seconds,
+    )  # fmt: skip
+
+
+def measure(root: Path, sequence: bool = True) -> Row:
+    """Calibrate, register, adjust."""
+    scan = read_scan(root)
+    camera, projector = truth_of(scan)
+    clouds, calibration = calibrate(scan, np.linalg.inv(camera) @ projector)
+    start = time.process_time()
+    found = register(clouds, sequence)
+    middle = time.process_time()
+    joint = joint_poses(clouds, found)
+    end = time.process_time()
+    baseline = np.linalg.norm(joint.T_world_camera[:, :3, 3] - joint.T_world_projector[:, :3, 3], axis=1)
+    return Row(
+        root.name,
+        scan.projector.model,
+        len(clouds),
+        calibration,
+        pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
+        pose_errors(joint.T_world_camera, baseline, (camera, projector), end - middle),
+        found.reasons,
+        found.remarks,
+    )
+
+
+def text_of(row: Row) -> str:
+    """A few lines."""
+    c = row.calibration
+    lines = [
+        f"{row.scan} ({row.frames} frames, {row.projector})",
+        f"  calibration   rotation {c.rotation_deg_median:.3f} deg (max {c.rotation_deg_max:.3f}), direction "
+        f"{c.direction_deg_median:.3f} deg (max {c.direction_deg_max:.3f}); within 1 sigma "
+        f"{c.rotation_within_sigma:.0%} and {c.direction_within_sigma:.0%}, squared error over "
+        f"covariance {c.mahalanobis:.2f}; {c.seconds_a_frame:.2f} s a frame",
+    ]
+    for name, p in (("registration", row.registration), ("joint", row.joint)):
+        lines.append(
+            f"  {name:13} {p.registered} registered, {p.within_target} within 2 deg and 3 %; rotation "
+            f"{p.rotation_deg_median:.3f} deg (max {p.rotation_deg_max:.3f}), position max {p.position_max:.2%}, scale "
+            f"max {p.scale_max:.2%}; {p.seconds:.0f} s"
+        )
+    lines += [f"  not registered: {name}: {why}" for name, why in row.not_registered.items()]
+    return "\n".join(lines + [f"  {remark}" for remark in row.remarks])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="*", default=list(FRAMES), choices=FRAMES)
+    parser.add_argument("--scans", nargs="*", type=Path, default=[], help="existing scan folders")
+    parser.add_argument("--projector-model", choices=["OPENCV", "DOE"], default="OPENCV")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--resolution", type=int, default=200)
+    parser.add_argument("--unordered", action="store_true", help="the order of capture is not known")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/registration"), help="for the scans that are made")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/registration.json"))
+    options = parser.parse_args(arguments)
+    roots = list(options.scans)
+    for scene in options.scenes:
+        root = options.folder / f"{scene}-{options.projector_model}-{options.resolution}-{options.seed}"
+        if not root.exists():
+            synthesise(
+                SynthConfig(
+                    scene=scene,
+                    frames=FRAMES[scene],
+                    resolution=options.resolution,
+                    supersampling=1,  # coordinates do not depend on it
+                    seed=options.seed,
+                    projector_model=options.projector_model,
+                ),
+                root,
+            )
+        roots.append(root)
+    rows: list[Row] = []
+    for root in roots:
+        rows.append(measure(root, not options.unordered))
+        print(text_of(rows[-1]), flush=True)
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        document = {"machine": describe(), "sequence": not options.unordered, "rows": [asdict(r) for r in rows]}
+        options.output.write_text(json.dumps(document, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
