@@ -14,10 +14,11 @@ from torch import Tensor
 
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.kernel import NOISE_FLOOR_PX, Kernel, frame_medians, narrowed, noise_of
-from sl_nerfstudio.calibration.linearisation import Observations, Rig, linearise, normal_equations, residuals_of
+from sl_nerfstudio.calibration.linearisation import Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.calibration.modes import RefinePoses, free_directions
 from sl_nerfstudio.calibration.observations import observe, place_anchors
 from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations, rough_trust
+from sl_nerfstudio.calibration.posterior import Evidence, gauge_free, posterior
 from sl_nerfstudio.calibration.steps import DAMPING, Descent, Pull, descend
 from sl_nerfstudio.calibration.strays import lead_home
 from sl_nerfstudio.progress import track
@@ -79,16 +80,6 @@ def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
     if refine in ("free", "rigid-rig"):  # a static projector has its place already
         found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
     return found
-
-
-def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
-    """Increments that move the whole scene by a similarity: no residual feels them."""
-    n = rig.frames
-    out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
-    out[0, :, :, :6] = torch.eye(6, dtype=torch.float64)
-    out[0, :, :3, 6] = rig.T_world_camera[:, :3, 3]
-    out[1, :, :3, 6] = rig.T_camera_projector[:, :3, 3]
-    return out.reshape(12 * n, 7)
 
 
 @dataclass(frozen=True)
@@ -193,12 +184,11 @@ def adjust(
     r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     # at the result, with every residual trusted, in whichever stage the steps ended
-    equations = normal_equations(linear, state.anchors, found.rows, *kernel.weights(r), start.frames)
-    B = free_directions(refine, state.rig)
-    H = B.T @ (equations.H + found.noise**2 * prior_equations(prior, start, state.rig)[0]) @ B
+    evidence = Evidence(state.rig, state.anchors, found.rows, linear, kernel)
+    H_prior = found.noise**2 * prior_equations(prior, start, state.rig)[0]
     return Adjustment(
         rig=state.rig,
-        covariance=_covariance(state.rig, B, H, found.noise),
+        covariance=posterior(evidence, free_directions(refine, state.rig), H_prior, found.noise),
         noise_px=found.noise,
         iterations=found.iterations,
         median_before_px=before,
@@ -210,14 +200,4 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor) -> Adjustment:
     """The starting poses, where no step is asked for or no frame sees what another decoded; known as the prior says."""
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
-    return Adjustment(start, _covariance(start, B, H, 1.0), NOISE_FLOOR_PX, 0, nan, nan)
-
-
-def _covariance(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
-    """Posterior covariance of (delta, rho) with the freedom of the whole scene projected out."""
-    if B.shape[1] == 0:
-        return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
-    C = noise**2 * B @ torch.linalg.inv(H) @ B.T
-    G = gauge_directions(rig)
-    P = torch.eye(len(C), dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)
-    return P @ C @ P.T
+    return Adjustment(start, gauge_free(start, B, H, 1.0), NOISE_FLOOR_PX, 0, nan, nan)

@@ -1,0 +1,140 @@
+"""How well refined poses are known.
+
+The inverse of the normal matrix supposes that residuals err independently. Those of one corner of one image do not: a
+lens that is modelled a little wrong, or a systematic error of the decoding, pushes all of them one way. So residuals
+are summed over blocks of each image, and the spread of those sums tells how far the poses may be off (the
+cluster-robust "sandwich" estimate: Liang and Zeger, Biometrika 1986). Whichever of the two is larger is stated.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sl_nerfstudio.calibration.kernel import Kernel
+from sl_nerfstudio.calibration.linearisation import (
+    Anchors,
+    Linearisation,
+    NormalEquations,
+    Observations,
+    Rig,
+    normal_equations,
+)
+from sl_nerfstudio.geometry.devices import project
+from sl_nerfstudio.geometry.se3 import inverse, transform
+
+_BLOCKS = 4  # to a side of the decoded part of an image
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Residuals at the result, with their derivatives and weights."""
+
+    rig: Rig
+    anchors: Anchors
+    rows: Observations
+    linear: Linearisation
+    kernel: Kernel
+
+
+def posterior(
+    evidence: Evidence,
+    B: Float[Tensor, "unknowns k"],
+    H_prior: Float[Tensor, "unknowns unknowns"],
+    noise: float,
+) -> Float[Tensor, "unknowns unknowns"]:
+    """Covariance of (delta, rho); the freedom of the whole scene takes no part in the variances.
+
+    `B` spans what was refined; `H_prior` is the prior's information in the weight of residuals of `noise` px.
+    """
+    e = evidence
+    weights = e.kernel.weights(e.linear.residuals)
+    equations = normal_equations(e.linear, e.anchors, e.rows, *weights, e.rig.frames)
+    H = B.T @ (equations.H + H_prior) @ B
+    formal = gauge_free(e.rig, B, H, noise)
+    if B.shape[1] == 0:
+        return formal
+    sums = _block_sums(e, equations, *weights) @ B
+    blocks = int((sums != 0).any(1).sum())
+    free = max(blocks - B.shape[1], blocks / 4)  # blocks that the fit of the poses has not used up
+    spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
+    half = torch.linalg.solve(H, spread)
+    robust = _project(e.rig, B @ torch.linalg.solve(H, half.T) @ B.T)
+    larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
+    return larger[:, None] * formal * larger
+
+
+def _block_sums(
+    e: Evidence,
+    equations: NormalEquations,
+    own_weight: Float[Tensor, "anchors"],
+    cross_weight: Float[Tensor, "rows"],
+) -> Float[Tensor, "blocks unknowns"]:
+    """Gradient of the poses from each block of each image, depths eliminated."""
+    n, columns = e.rig.frames, torch.arange(6)
+    i, j, r = e.anchors.frame[e.rows.anchor], e.rows.frame, e.linear.residuals
+    own_block, cross_block = _blocks_of(e)
+    out = torch.zeros(n * _BLOCKS**2 * 12 * n, dtype=torch.float64)
+    pull = torch.zeros(n * _BLOCKS**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
+    own_columns = 6 * n + 6 * e.anchors.frame[:, None] + columns
+    cross_columns = torch.cat([6 * i[:, None] + columns, 6 * j[:, None] + columns, 6 * (n + j[:, None]) + columns], -1)
+    every = torch.arange(len(e.anchors.frame))
+    for block, J, J_depth, wr, cols, anchor in (
+        (own_block, e.linear.own_rho, e.linear.own_depth, own_weight[:, None] * r.own, own_columns, every),
+        (
+            cross_block,
+            e.linear.cross_pose,
+            e.linear.cross_depth,
+            cross_weight[:, None] * r.cross,
+            cross_columns,
+            e.rows.anchor,
+        ),
+    ):
+        out.index_add_(0, (block[:, None] * 12 * n + cols).reshape(-1), (J * wr[..., None]).sum(1).reshape(-1))
+        pull.view(-1).index_add_(0, block * pull.shape[1] + anchor, (J_depth * wr).sum(-1))
+    return out.reshape(-1, 12 * n) - pull @ (equations.depth_by_pose / equations.H_depth[:, None])
+
+
+def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
+    """The block of its own image in which an anchor lies, and that of the other image in which it is looked up."""
+    rig, p_camera = e.rig, e.anchors.depth[:, None] * e.anchors.d_camera
+    at = project(rig.camera[e.anchors.frame], p_camera)[0]
+    p_world = transform(rig.T_world_camera[e.anchors.frame], p_camera)[e.rows.anchor]
+    seen_at = project(rig.camera[e.rows.frame], transform(inverse(rig.T_world_camera)[e.rows.frame], p_world))[0]
+    low, high = torch.zeros(rig.frames, 2).double(), torch.ones(rig.frames, 2).double()
+    for k in range(rig.frames):
+        mine = at[e.anchors.frame == k]
+        if len(mine):
+            low[k], high[k] = mine.amin(0), mine.amax(0)
+
+    def block(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
+        share = (uv - low[frame]) / (high - low).clamp_min(1e-9)[frame]
+        cell = (share * _BLOCKS).nan_to_num().clamp(0, _BLOCKS - 1).long()
+        return (frame * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1]
+
+    return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
+
+
+def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
+    """Increments that move the whole scene by a similarity: no residual feels them."""
+    n = rig.frames
+    out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
+    out[0, :, :, :6] = torch.eye(6, dtype=torch.float64)
+    out[0, :, :3, 6] = rig.T_world_camera[:, :3, 3]
+    out[1, :, :3, 6] = rig.T_camera_projector[:, :3, 3]
+    return out.reshape(12 * n, 7)
+
+
+def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
+    """`noise^2 / H`, with the freedom of the whole scene projected out: right if residuals err independently."""
+    if B.shape[1] == 0:
+        return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
+    C = noise**2 * B @ torch.linalg.inv(H) @ B.T
+    return _project(rig, C)
+
+
+def _project(rig: Rig, C: Float[Tensor, "unknowns unknowns"]) -> Float[Tensor, "unknowns unknowns"]:
+    G = gauge_directions(rig)
+    P = torch.eye(len(C), dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)
+    return P @ C @ P.T
