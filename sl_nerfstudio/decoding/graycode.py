@@ -95,14 +95,19 @@ def separate(images: Sequence[Image], layout: GrayCode) -> Light:
     return Light(highest - lowest, ambient, signal / sum(layout.bits), noise)
 
 
-def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
-    if len(images) != layout.images:
+def check_count(count: int, layout: GrayCode) -> None:
+    """Raise DecodingError unless `count` images are one for each pattern of the sequence."""
+    if count != layout.images:
         raise DecodingError(
-            f"holds {len(images)} images, the sequence of the pattern has {layout.images}",
+            f"holds {count} images, the sequence of the pattern has {layout.images}",
             "images are missing or too many, or the pattern file describes another sequence "
             f"({layout.w} x {layout.h} pixels in cells of {layout.cell})",
             f"give one image of each of the {layout.images} patterns, or the pattern file that they were made with",
         )
+
+
+def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
+    check_count(len(images), layout)
     sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
     if len(sizes) > 1:
         raise DecodingError(

@@ -1,0 +1,50 @@
+"""sl-process: from photographs to a scan folder."""
+
+import sys
+from typing import TYPE_CHECKING
+
+import tyro
+
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.processing.config import ProcessConfig
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.processing.result import ProcessResult
+
+
+def main() -> None:
+    """Entry point of the command."""
+    run(_process)
+
+
+def _process() -> None:
+    config = tyro.cli(ProcessConfig, prog="sl-process", config=(tyro.conf.FlagCreatePairsOff,))
+    config.check()
+    from sl_nerfstudio.evaluation.processing_report import render_processing_report  # slow to import: torch, open3d
+    from sl_nerfstudio.processing.pipeline import process
+
+    result = process(config, render_processing_report, tell)
+    sys.stdout.write(closing_words(result))
+
+
+def tell(text: str) -> None:
+    """Say how far the work is, at once also where the output is a file."""
+    print(text, flush=True)
+
+
+def closing_words(result: "ProcessResult") -> str:
+    """What a person wants to know at the end."""
+    from sl_nerfstudio.processing.advice import first_line
+
+    output = result.config.output
+    lost = [f"  left out: {f.name}: {first_line(f.reason)}\n" for f in result.frames if not f.in_scan]
+    scale = f"lengths in {result.units} ({result.scale_source})" if result.scale_source else "no length is known"
+    return (
+        f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
+        f"report: {output / 'processing.html'}\n"
+        f"decoded frames are kept in {result.config.work_folder} for another run; remove it when you are content\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

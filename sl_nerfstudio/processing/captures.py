@@ -1,0 +1,110 @@
+"""Which photographs make up which frame."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.images import read_header
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """One frame: one photograph, or those of a whole sequence in the order in which it was projected."""
+
+    name: str
+    images: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class Captures:
+    """All frames, and those among them that cannot be used as they are."""
+
+    frames: tuple[CapturedFrame, ...]  # in the order of their names, numbers counted as numbers
+    size: tuple[int, int]  # (w, h) of the images
+    faults: dict[str, FileError]  # by name of the frame
+
+
+def find_captures(root: Path, sequences: bool) -> Captures:
+    """Frames below a folder: one image each, or, with `sequences`, one sub-folder of images each.
+
+    The size of most images is taken to be right; images that are of another one, or cannot be read, are faults of their
+    frames. Raises FileError if there are fewer than two frames.
+    """
+    if not root.is_dir():
+        raise FileError(root, "is no folder", "a slip in --images", "give the folder that holds the captures")
+    frames = _folders(root) if sequences else _single_images(root)
+    if len(frames) < 2:
+        what = "folders with images" if sequences else "images"
+        other = _single_images(root) if sequences else _folders(root)
+        cause = (
+            "the captures are of the other kind: one image a frame for a coded grid, one folder a frame for Gray code"
+            if len(other) > 1
+            else "a slip in --images, or images of another format"
+        )
+        raise FileError(
+            root, f"holds {len(frames)} {what}; a scan needs at least 2 frames", cause,
+            f"give a folder of {'sub-folders, one for each frame' if sequences else ', '.join(ENDINGS) + ' files'}",
+        )  # fmt: skip
+    duplicates = [name for name, count in Counter(f.name for f in frames).items() if count > 1]
+    if duplicates:
+        raise FileError(
+            root, f"holds several images named {duplicates[0]}", "the same capture in two formats", "keep one of them"
+        )
+    return _checked(frames)
+
+
+def _checked(frames: Sequence[CapturedFrame]) -> Captures:
+    sizes: dict[Path, tuple[int, int]] = {}
+    faults: dict[str, FileError] = {}
+    for frame in frames:
+        for path in frame.images:
+            try:
+                header = read_header(path)
+                sizes[path] = (header.w, header.h)
+            except FileError as error:
+                faults.setdefault(frame.name, error)
+    if not sizes:
+        raise next(iter(faults.values()))
+    usual = Counter(sizes.values()).most_common(1)[0][0]
+    for frame in frames:
+        for path in frame.images:
+            if path in sizes and sizes[path] != usual:
+                faults.setdefault(frame.name, _other_size(path, sizes[path], usual))
+    return Captures(tuple(frames), usual, faults)
+
+
+def _other_size(path: Path, size: tuple[int, int], usual: tuple[int, int]) -> FileError:
+    turned = size == usual[::-1]
+    return FileError(
+        path,
+        f"is {size[0]} x {size[1]} pixels, most images are {usual[0]} x {usual[1]}",
+        "the camera was turned on its side and the picture turned back"
+        if turned
+        else "resized, cropped, or taken by another camera or with another setting",
+        "give all images as the camera took them; intrinsics hold for one size only",
+    )
+
+
+def _single_images(root: Path) -> list[CapturedFrame]:
+    return [CapturedFrame(path.stem, (path,)) for path in _images(root)]
+
+
+def _folders(root: Path) -> list[CapturedFrame]:
+    folders = sorted((p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".")), key=_natural)
+    return [CapturedFrame(folder.name, images) for folder in folders if (images := tuple(_images(folder)))]
+
+
+def _images(folder: Path) -> list[Path]:
+    found = (p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, int | str]]:
+    """Order of names in which image 10 comes after image 9."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]

@@ -1,0 +1,43 @@
+"""Small pictures of a frame for the report."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, UInt8, UInt16
+from numpy import ndarray
+
+from sl_nerfstudio.scan.images import as_grey
+
+_SIDE = 170
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What was captured and what was decoded from it, RGB in [0, 1]; None where there is nothing to show."""
+
+    image: Float32[ndarray, "h w 3"] | None
+    coords: Float32[ndarray, "h w 3"] | None
+
+
+def make_preview(
+    image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None,
+    coords: Float32[ndarray, "_h _w 2"] | None,
+    size: tuple[int, int],
+) -> Preview:
+    """Thinned pictures. `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded."""
+    picture = colours = None
+    if image is not None:
+        step = _step(image.shape)
+        grey = as_grey(image[::step, ::step])
+        picture = np.repeat((grey / max(float(grey.max()), 1e-6))[..., None], 3, -1)
+    if coords is not None:
+        step = _step(coords.shape)
+        thin = coords[::step, ::step]
+        place = np.nan_to_num(thin) / np.array(size, dtype=np.float32)
+        colours = np.stack([place[..., 0], np.full(thin.shape[:2], 0.35), place[..., 1]], -1).astype(np.float32)
+        colours[np.isnan(thin).any(-1)] = 0.85
+    return Preview(picture, colours)
+
+
+def _step(shape: tuple[int, ...]) -> int:
+    return max(1, -(-max(shape[:2]) // _SIDE))

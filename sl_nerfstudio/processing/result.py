@@ -1,0 +1,73 @@
+"""What `sl-process` found, for the report and for programs."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from sl_nerfstudio.processing.config import ProcessConfig
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One frame: its figures, and why it was left out if it was. Figures that do not exist are None."""
+
+    name: str
+    in_scan: bool
+    stage: str  # at which it failed: reading, decoding, calibrating, registering; "" if it did not
+    reason: str  # problem, cause and remedy
+    decode_rate: float | None = None
+    mask_share: float | None = None
+    epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
+    sigma_rotation_deg: float | None = None
+    sigma_direction_deg: float | None = None
+    fitness: float | None = None  # share of the judged points that agree with the frames they overlap
+    baseline: float | None = None  # camera to projector, in the scan's unit
+    weaknesses: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class EdgeRecord:
+    """Two frames that were registered with each other."""
+
+    frames: tuple[str, str]
+    overlap: float
+    fitness: float
+    used: bool
+    undecided: bool
+
+
+@dataclass(frozen=True)
+class ProcessResult:
+    """Everything the report shows."""
+
+    config: ProcessConfig
+    decoder: str
+    units: str
+    scale_source: str  # "": not known
+    frames: tuple[FrameRecord, ...]
+    edges: tuple[EdgeRecord, ...]
+    remarks: tuple[str, ...]
+    recapture: tuple[str, ...]  # what to take again or in addition, and why
+    joint_px: tuple[float, float] | None  # cross-frame residual before and after the joint adjustment
+    versions: dict[str, str]
+
+    @property
+    def registered(self) -> int:
+        """Number of frames in the scan."""
+        return sum(frame.in_scan for frame in self.frames)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "decoder": self.decoder,
+            "units": self.units,
+            "scale": self.scale_source or None,
+            "frames": [
+                {key: value for key, value in vars(frame).items() if value not in (None, "", ())}
+                for frame in self.frames
+            ],
+            "overlaps": [vars(edge) for edge in self.edges],
+            "remarks": list(self.remarks),
+            "recapture": list(self.recapture),
+            "joint_adjustment_px": self.joint_px,
+            "versions": self.versions,
+        }

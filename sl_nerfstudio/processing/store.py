@@ -1,0 +1,79 @@
+"""Decoded frames kept between runs: a frame is decoded again only if its images, pattern or decoder changed."""
+
+import hashlib
+import json
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sl_nerfstudio.decoding.types import Decoded
+from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.scan.atomic import write_atomic
+from sl_nerfstudio.scan.file_error import read_bytes
+from sl_nerfstudio.scan.writing import encode_json
+
+_KEY_LENGTH = 24
+MANIFEST = "manifest.json"
+
+
+class DecodedStore:
+    """A folder of decoded frames; the name of each file says what it was decoded from."""
+
+    def __init__(self, root: Path, decoder_key: str) -> None:
+        self.root = root
+        self._decoder_key = decoder_key
+
+    def key(self, frame: CapturedFrame) -> str:
+        """Digest of the images' contents and of what decodes them. Raises FileError if one cannot be read."""
+        digest = hashlib.sha256(self._decoder_key.encode())
+        for path in frame.images:
+            digest.update(hashlib.sha256(read_bytes(path)).digest())
+        return digest.hexdigest()[:_KEY_LENGTH]
+
+    def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
+        """A frame decoded before; None if it was not, or if the file is damaged."""
+        path = self._path(frame, key)
+        try:
+            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as stored:
+                coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
+            return None
+        return Decoded(coords, mask, pattern.astype(np.float32) / np.float32(65535))
+
+    def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
+        """Keep a frame; gives it as `load` will, so that a resumed run comes to the same result."""
+        buffer = BytesIO()
+        pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
+        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern)
+        write_atomic(self._path(frame, key), buffer.getvalue())
+        return Decoded(decoded.coords, decoded.mask, pattern.astype(np.float32) / np.float32(65535))
+
+    def _path(self, frame: CapturedFrame, key: str) -> Path:
+        return self.root / "decoded" / f"{frame.name}-{key}.npz"
+
+
+class Manifest:
+    """What was done with each frame, in words, beside the decoded frames; written after every frame."""
+
+    def __init__(self, root: Path, settings: dict[str, Any]) -> None:
+        self._path = root / MANIFEST
+        self._settings = settings
+        self._frames = self._known()
+
+    def note(self, frame: str, key: str, status: str, reason: str = "") -> None:
+        """Note what came of a frame."""
+        self._frames[frame] = {"key": key, "status": status, **({"reason": reason} if reason else {})}
+        write_atomic(self._path, encode_json({"settings": self._settings, "frames": self._frames}))
+
+    def _known(self) -> dict[str, Any]:
+        """What an earlier run noted; nothing if it noted nothing that can be read."""
+        try:
+            frames = json.loads(self._path.read_text(encoding="utf-8"))["frames"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return {}
+        return dict(frames) if isinstance(frames, dict) else {}

@@ -1,0 +1,81 @@
+"""From what the stages left to what the report shows."""
+
+import importlib.metadata
+from collections.abc import Sequence
+
+import numpy as np
+
+from sl_nerfstudio import __version__
+from sl_nerfstudio.calibration.joint_poses import JointPoses
+from sl_nerfstudio.calibration.registration import Registration
+from sl_nerfstudio.processing.advice import what_to_recapture
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.frame_stage import FrameOutcome
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
+from sl_nerfstudio.scan.types import Scale
+
+
+def summarise(
+    config: ProcessConfig,
+    decoder: str,
+    outcomes: Sequence[FrameOutcome],
+    registration: Registration | None,
+    joint: JointPoses | None,
+    units: str,
+    scale: Scale,
+) -> ProcessResult:
+    """The result of a run; without `joint` no frame is in a scan."""
+    row = {name: k for k, name in enumerate(registration.names)} if registration is not None else {}
+    frames = tuple(_record(o, registration, joint, row.get(o.name)) for o in outcomes)
+    edges = () if registration is None else registration.edges
+    records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
+    return ProcessResult(
+        config=config,
+        decoder=decoder,
+        units=units,
+        scale_source=scale.source if scale.known else "",
+        frames=frames,
+        edges=records,
+        remarks=() if registration is None else tuple(registration.remarks),
+        recapture=what_to_recapture(frames, records, not config.unordered),
+        joint_px=None if joint is None else _both_known(joint.median_before_px, joint.median_after_px),
+        versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
+    )
+
+
+def _both_known(before: float, after: float) -> tuple[float, float] | None:
+    """None where no point of one frame was seen by another: there is nothing to compare."""
+    return (float(before), float(after)) if np.isfinite([before, after]).all() else None
+
+
+def _record(
+    outcome: FrameOutcome, registration: Registration | None, joint: JointPoses | None, k: int | None
+) -> FrameRecord:
+    cloud = outcome.cloud
+    known = outcome.stage not in ("reading", "decoding")
+    rate, share = (outcome.decode_rate, outcome.mask_share) if known else (None, None)
+    if cloud is None:
+        return FrameRecord(outcome.name, False, outcome.stage, outcome.reason, rate, share)
+    pose = cloud.pose
+    placed = registration is not None and k is not None and bool(registration.registered[k])
+    reason = ""
+    if not placed:
+        reason = "too few other frames could be used" if registration is None else registration.reasons[outcome.name]
+    baseline = fitness = None
+    if placed and joint is not None and registration is not None and k is not None:
+        baseline = float(np.linalg.norm(joint.T_world_camera[k, :3, 3] - joint.T_world_projector[k, :3, 3]))
+        fitness = float(np.nan_to_num(registration.fitness[k]))
+    return FrameRecord(
+        name=outcome.name,
+        in_scan=placed and joint is not None,
+        stage="" if placed else "registering",
+        reason=reason,
+        decode_rate=rate,
+        mask_share=share,
+        epipolar_px=float(pose.residual_px),
+        sigma_rotation_deg=pose.sigma_rotation_deg,
+        sigma_direction_deg=pose.sigma_direction_deg,
+        fitness=fitness,
+        baseline=baseline,
+        weaknesses=tuple(weakness.message for weakness in pose.weaknesses),
+    )

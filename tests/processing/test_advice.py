@@ -1,0 +1,40 @@
+"""What is to be taken again is said, with the reason."""
+
+from sl_nerfstudio.processing.advice import what_to_recapture
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
+
+
+def _frame(name, **values):
+    return FrameRecord(name, **{"in_scan": True, "stage": "", "reason": "", **values})
+
+
+def _edge(a, b, used=True):
+    return EdgeRecord((a, b), 0.5, 0.9, used, False)
+
+
+def test_nothing_to_do_for_a_good_scan():
+    frames = [_frame(n, decode_rate=0.9, mask_share=0.4, fitness=0.95) for n in "abc"]
+    assert what_to_recapture(frames, [_edge("a", "b"), _edge("b", "c")], ordered=True) == ()
+
+
+def test_every_reason_is_named():
+    frames = [
+        _frame("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
+        _frame("b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"),
+        _frame("c", decode_rate=0.9, mask_share=0.01, weaknesses=("all points lie in one plane",)),
+        _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
+    ]
+    said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)
+    assert said[0] == "b: take it again; it was left out (b.png: is black)"
+    assert said[1].startswith("between c and d: add a view")
+    text = "\n".join(said)
+    assert "a: only 30% of the pattern was decoded" in text
+    assert "c: all points lie in one plane" in text and "c: the pattern fills 1.0% of the image" in text
+    assert "d: 40% of its points agree" in text
+
+
+def test_unordered_frames_that_hang_by_one_other():
+    frames = [_frame(n) for n in "abcd"]
+    edges = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a"), _edge("c", "d")]
+    said = what_to_recapture(frames, edges, ordered=False)
+    assert said == ("near d: add a view; only one other frame overlaps it",)
