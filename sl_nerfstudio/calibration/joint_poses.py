@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.bundle_adjustment import Adjustment, AdjustmentSettings, PosePrior, adjust
+from sl_nerfstudio.calibration.bundle_adjustment import Adjustment, AdjustmentSettings, adjust
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud
 from sl_nerfstudio.calibration.gauge import restore
 from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.calibration.registration import Registration
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Intrinsics
@@ -22,9 +23,8 @@ from sl_nerfstudio.scan.types import PoseSigma
 # What registration by surfaces leaves, 1 sigma per axis: turns in radian, shifts in radii of the object.
 _FRAME_ROTATION, _FRAME_TRANSLATION = np.radians(1.0), 0.03
 _BASELINE_LENGTH = 0.02  # of the logarithm
-# Neighbouring look-ups share pixels, cells and edges: on synthetic scans poses err by about ten times what independent
-# residuals would leave.
-_DEPENDENCE = 10.0
+# Neighbouring look-ups share pixels, cells and edges: on synthetic scans poses err by about twice what is stated.
+_DEPENDENCE = 2.0
 _LEAST_ROTATION = np.radians(0.02)  # of the projector: wrong intrinsics are not in the covariance of a frame
 
 
