@@ -33,6 +33,7 @@ from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.scan.images import as_grey
 
 _LEAST_NODES = 12
+_MOST_NODES = 1.5  # of those that the pattern has: some are seen twice at the borders of surfaces
 _LEAST_KNOWN = 0.2  # share of the crossings that must find their place, else the pattern is another one
 _SCALE_RANGE = (0.75, 1.3)  # of the view's period, within which it is not made anew
 _ROLL_RANGE = np.radians(15.0)
@@ -74,12 +75,18 @@ class NetworkDecoder:
         """
         grey = as_grey(image)
         sight = self._look(grey)
+        seen = len(sight.graph.place)
+        if seen > _MOST_NODES * self.pattern.rows * self.pattern.columns:
+            raise DecodingError(
+                f"shows {seen} crossings of lines, and the pattern has only {self.pattern.rows * self.pattern.columns}",
+                "the image is mostly noise, or it shows another pattern",
+                "give the pattern.json of the pattern that was projected; capture again with more light",
+            )
         assignment = self.assign(sight.graph)
         known = assignment.known
-        if known.sum() < max(_LEAST_NODES, _LEAST_KNOWN * len(known)):
+        if known.sum() < max(_LEAST_NODES, _LEAST_KNOWN * seen):
             raise DecodingError(
-                f"shows a grid of {len(known)} crossings, but only {int(known.sum())} of them find their place in "
-                "the pattern",
+                f"shows a grid of {seen} crossings, but only {int(known.sum())} of them fit the pattern",
                 "the pattern's description belongs to another pattern, the image is mirrored, or it is too blurred "
                 "or noisy to tell the symbols apart",
                 "give the pattern.json of the pattern that was projected; capture again in focus, or from nearer by",
