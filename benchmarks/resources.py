@@ -93,7 +93,7 @@ def measure_here(scan: Path, steps: int) -> dict[str, float]:
     times.append(time.monotonic())
     with tempfile.TemporaryDirectory() as folder:
         config = replace(sl_neus.config, data=scan, output_dir=Path(folder), max_num_iterations=1000)
-        config.pipeline.model.warm_start = 0.0  # rendering from the first step on
+        config.pipeline.model.warm_start = 0.0  # type: ignore[attr-defined]  # rendering from the first step on
         config.set_timestamp()
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
