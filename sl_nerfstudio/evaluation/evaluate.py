@@ -47,6 +47,11 @@ class Evaluation:
     initial_pose_errors: PoseErrors | None  # of the scan's own poses, where they are others
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
 
+    @property
+    def alignment(self) -> str:
+        """The alignment to judge by: rigid, but where nothing says how long a unit is, with scale."""
+        return "similarity" if self.units == "arbitrary" else "rigid"
+
 
 def evaluate(
     mesh: Mesh,

@@ -106,11 +106,11 @@ def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
 def _errors(
     report: ReportInput, surface: Surface, points: Float[ndarray, "n 3"]
 ) -> tuple[Float[ndarray, "n"] | None, ColourScale | None]:
-    """Signed errors of points of the result after rigid alignment, and their colour scale; None without reference."""
+    """Signed errors of points of the result after alignment, and their colour scale; None without reference."""
     reference = report.evaluation.reference
     if reference is None:
         return None, None
-    score = report.evaluation.surface["rigid"]
+    score = report.evaluation.surface[report.evaluation.alignment]
     exact = isinstance(reference, MeshReference)
     limit = charts.nice_limit((score.accuracy if exact else score.completeness).p95)
     return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)

@@ -8,6 +8,7 @@ from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.reference import MeshReference
 
 Band = Literal["good", "acceptable", "poor", "unknown"]
+ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
 _ORDER: dict[str, int] = {"good": 0, "unknown": 0, "acceptable": 1, "poor": 2}
 
 
@@ -71,7 +72,7 @@ def judge(evaluation: Evaluation) -> Verdict:
         _worst_frame(evaluation),
         _geometry(evaluation),
     ]  # fmt: skip
-    if evaluation.reference is not None and "rigid" in evaluation.surface:
+    if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         checks.insert(0, _accuracy(evaluation))
     band: Band = max((c.band for c in checks), key=lambda b: _ORDER[b])
     return Verdict(band, _sentence(band, evaluation), tuple(checks), _hints(evaluation, band))
@@ -95,7 +96,7 @@ def _check(
 
 def _accuracy(evaluation: Evaluation) -> Check:
     reference = evaluation.reference
-    score = evaluation.surface["rigid"]
+    score = evaluation.surface[evaluation.alignment]
     exact = isinstance(reference, MeshReference)
     rmse = score.accuracy.rmse if exact else score.completeness.rmse
     percent = 100 * rmse / reference.size if reference is not None else math.nan
@@ -103,7 +104,7 @@ def _accuracy(evaluation: Evaluation) -> Check:
     return _check(
         "Accuracy" if exact else "Distance from reference", percent,
         f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.units})", 0.25, 1.0,
-        "≤ {} %", f"RMS distance {way} after rigid alignment, in percent of the size of the reference.",
+        "≤ {} %", f"RMS distance {way} after {ALIGNED[evaluation.alignment]}, in percent of the size of the reference.",
         "see where the error colours are strong: all over means poses or scale, patches mean too few frames there",
     )  # fmt: skip
 

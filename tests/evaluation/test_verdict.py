@@ -45,3 +45,8 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
         assert verdict.next_steps[1].startswith(check)
     if check == "Worst frame":
         assert "frame_00007" in judged[check].text and "frame_00007" in judged[check].advice
+
+
+def test_without_a_unit_the_scale_is_no_error() -> None:
+    assert GOOD.alignment == "rigid"
+    assert replace(GOOD, units="arbitrary").alignment == "similarity"
