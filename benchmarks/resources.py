@@ -92,7 +92,8 @@ def measure_here(scan: Path, steps: int) -> dict[str, float]:
     load_scan(scan)
     times.append(time.monotonic())
     with tempfile.TemporaryDirectory() as folder:
-        config = replace(sl_neus.config, data=scan, output_dir=Path(folder), max_num_iterations=1000)
+        config = replace(sl_neus.config, output_dir=Path(folder), max_num_iterations=1000)
+        config.pipeline.datamanager.data = scan
         config.pipeline.model.warm_start = 0.0  # type: ignore[attr-defined]  # rendering from the first step on
         config.set_timestamp()
         trainer = config.setup(local_rank=0, world_size=1)
