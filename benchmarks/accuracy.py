@@ -16,10 +16,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 
 FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 57}
 COMPARED = {
@@ -151,10 +151,7 @@ def main() -> None:
             folder = options.folder / f"{scene}-{seed}"
             folder.mkdir()
             rows += measure(scene, seed, options.iterations, folder, options.variants)
-            options.output.parent.mkdir(parents=True, exist_ok=True)
-            options.output.write_text(
-                json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n"
-            )
+            write_rows(options.output, rows)
 
 
 if __name__ == "__main__":

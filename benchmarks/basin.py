@@ -9,14 +9,13 @@ sl-neus` does before its first step.
 """
 
 import argparse
-import json
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan, load_scan
 from sl_nerfstudio.evaluation.poses import compare_poses
@@ -111,8 +110,7 @@ def main() -> None:
         for level in LEVELS:
             rows.append(measure(loaded, make_setup(replace(config, pose_error=level)), seed, level))
             print(text(rows[-1]), flush=True)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n")
+    write_rows(options.output, rows)
 
 
 def text(r: Row) -> str:

@@ -15,14 +15,14 @@ import tyro
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.network import NetworkDecoder
 from sl_nerfstudio.decoding.types import DecodingError
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.noise import disturb_image
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
-from sl_nerfstudio.synthesis.synthesise import _GAIN
+from sl_nerfstudio.synthesis.synthesise import GAIN
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def measure(config: Config, conditions: Conditions, scene: str, resolution: int)
     for index in range(config.frames):
         truth = setup.render(index, 2)
         noise = random_stream(config.seed, Stream.SENSOR, index)
-        image = disturb_image(truth.radiance, _GAIN, conditions.sensor_noise, noise)
+        image = disturb_image(truth.radiance, GAIN, conditions.sensor_noise, noise)
         periods.append(_period(truth.coords, setup.grid.period))
         try:
             frames.append(_decode(decoder, image, truth.coords, truth.mask))
@@ -172,9 +172,7 @@ def main() -> None:
                 rows.append(measure(config, conditions, scene, resolution))
                 print(json.dumps(asdict(rows[-1])), flush=True)
     if config.output is not None:
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        result = {"machine": describe(), "rows": [asdict(row) for row in rows]}
-        config.output.write_text(json.dumps(result, indent=1) + "\n")
+        write_rows(config.output, rows)
 
 
 if __name__ == "__main__":

@@ -3,15 +3,14 @@
 python -m benchmarks.decoding_graphs [--graphs 10] [--output results.json]
 """
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.gcn import turned_pattern
 from sl_nerfstudio.decoding.graph import neighbourhoods
@@ -104,9 +103,7 @@ def main() -> None:
     for row in rows:
         print(f"| {row.misread:.0%} | {row.missing:.0%} | {row.method} | {row.right:.1%} | {row.wrong:.1%} |")
     if config.output is not None:
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        result = {"machine": describe(), "rows": [asdict(row) for row in rows]}
-        config.output.write_text(json.dumps(result, indent=1) + "\n")
+        write_rows(config.output, rows)
 
 
 if __name__ == "__main__":

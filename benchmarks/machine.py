@@ -1,10 +1,14 @@
 """What a figure was measured on."""
 
+import json
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 
 def describe() -> dict[str, str | int]:
@@ -20,6 +24,13 @@ def describe() -> dict[str, str | int]:
         "date": date.today().isoformat(),
         "commit": commit,
     }
+
+
+def write_rows(output: Path, rows: Sequence[Any], **settings: Any) -> None:
+    """The rows of a benchmark (dataclasses) as JSON, with the machine and the settings; makes the folder."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    document = {"machine": describe(), **settings, "rows": [asdict(row) for row in rows]}
+    output.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _processor() -> str:

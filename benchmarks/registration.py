@@ -11,16 +11,15 @@ position and scale of every frame after registration and after the joint adjustm
 """
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 from sl_nerfstudio.calibration.correspondence_rays import correspondences_of
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.calibration.joint_poses import joint_poses
@@ -225,9 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for root in roots:
         rows.append(measure(root, not options.unordered))
         print(text_of(rows[-1]), flush=True)
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        document = {"machine": describe(), "sequence": not options.unordered, "rows": [asdict(r) for r in rows]}
-        options.output.write_text(json.dumps(document, indent=1) + "\n")
+        write_rows(options.output, rows, sequence=not options.unordered)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import write_rows
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.writing import ScanWriter
@@ -150,8 +150,7 @@ def main() -> None:
                 make_scan(source, frames, size // BASE, scan)
             rows.append(Row(frames, size, **measure(scan, options.steps)))
             print(rows[-1], flush=True)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps({"machine": describe(), "rows": [asdict(r) for r in rows]}, indent=1) + "\n")
+    write_rows(options.output, rows)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ SCRIPTS: dict[str, str] = PROJECT["scripts"]
 
 # Folders in the order in which data walks through them: each imports only from itself and from those before it.
 LAYERS = (
-    "errors", "progress", "geometry", "scan", "pattern", "synthesis", "decoding", "calibration", "processing",
-    "dataparser", "model", "meshing", "evaluation", "cli", "methods",
+    "errors", "progress", "compiled", "geometry", "scan", "pattern", "synthesis", "decoding", "calibration",
+    "processing", "dataparser", "model", "meshing", "evaluation", "cli", "methods",
 )  # fmt: skip
 
 # A dependency whose import is not called as its distribution is.

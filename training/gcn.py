@@ -3,20 +3,18 @@
 python -m training.gcn --output outputs/training/gcn
 """
 
-import json
-import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
-from safetensors.torch import save_file
 
 from sl_nerfstudio.decoding.gcn import GraphNetwork, TurnedPattern, one_hot, turned_pattern
 from sl_nerfstudio.decoding.graph import neighbourhoods
 from training.graphs import DamagedGraph, damage_graph, random_codes, random_damage
+from training.records import cosine_rate, log_row, save_weights
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def train(config: Config) -> None:
         if len(graph.place) < 9:
             continue
         for group in optimizer.param_groups:
-            group["lr"] = config.rate * min(1, (step + 1) / 50) * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+            group["lr"] = cosine_rate(config.rate, step, config.steps, 50)
         loss, right = step_loss(network, graph, turned_pattern(codes), config, rng)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -106,12 +104,9 @@ def train(config: Config) -> None:
                 "loss": round(total / config.log_every, 4),
                 "recognised": round(recognised / config.log_every, 4),
             }
-            print(json.dumps(row), flush=True)
-            with (config.output / "log.jsonl").open("a") as stream:
-                stream.write(json.dumps(row) + "\n")
+            log_row(config.output, row)
             total, recognised = 0.0, 0.0
-    settings = {key: str(value) for key, value in asdict(config).items() if key != "output"}
-    save_file({k: v.contiguous() for k, v in network.state_dict().items()}, config.output / "gcn.safetensors", settings)
+    save_weights(network, config.output / "gcn.safetensors", config)
 
 
 if __name__ == "__main__":

@@ -5,12 +5,11 @@
 writes the weights as safetensors and a log; a run that was broken off goes on from its last checkpoint.
 """
 
-import json
 import math
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,13 +17,13 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn import functional as F
 
 from sl_nerfstudio.decoding.unet import Reading, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
+from training.records import cosine_rate, log_row, save_weights
 
 _NODE_WEIGHT = 3.0  # symbols are read at nodes: errors count more there
 _RENEWAL = 20  # steps between two new patterns
@@ -132,12 +131,6 @@ def batches(config: Config, first: int) -> Iterator[Batch]:
             yield batch
 
 
-def learning_rate(step: int, config: Config) -> float:
-    """A short warm-up, then a cosine down to zero."""
-    warm = min(1.0, (step + 1) / 100)
-    return config.rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
-
-
 def train(config: Config) -> None:
     """Train and write `unet.safetensors`, `log.jsonl` and `checkpoint.pt` into the output folder."""
     torch.set_num_threads(config.threads)
@@ -151,7 +144,7 @@ def train(config: Config) -> None:
     start = time.monotonic()
     for step, batch in zip(range(first, config.steps), batches(config, first), strict=True):
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step, config)
+            group["lr"] = cosine_rate(config.rate, step, config.steps, 100)
         reading = network(batch.channels)
         parts = losses(reading, batch)
         optimizer.zero_grad(set_to_none=True)
@@ -162,26 +155,17 @@ def train(config: Config) -> None:
             sums[key] = sums.get(key, 0.0) + value
         if (step + 1) % config.log_every == 0:
             row = {key: round(value / config.log_every, 5) for key, value in sums.items()}
-            _log(config, {"step": step + 1, "seconds": round(time.monotonic() - start), **row})
+            log_row(config.output, {"step": step + 1, "seconds": round(time.monotonic() - start), **row})
             sums.clear()
         if (step + 1) % (2 * config.log_every) == 0 or step + 1 == config.steps:
             _save(config, step + 1, network, optimizer)
-
-
-def _log(config: Config, row: dict[str, float]) -> None:
-    line = json.dumps(row)
-    print(line, flush=True)
-    with (config.output / "log.jsonl").open("a") as stream:
-        stream.write(line + "\n")
 
 
 def _save(config: Config, step: int, network: UNet, optimizer: torch.optim.Optimizer) -> None:
     state = {"step": step, "network": network.state_dict(), "optimizer": optimizer.state_dict()}
     torch.save(state, config.output / "checkpoint.new")
     (config.output / "checkpoint.new").replace(config.output / "checkpoint.pt")
-    weights = {key: value.contiguous() for key, value in network.state_dict().items()}
-    settings = {key: str(value) for key, value in asdict(config).items() if key != "output"}
-    save_file(weights, config.output / "unet.safetensors", {"step": str(step), **settings})
+    save_weights(network, config.output / "unet.safetensors", config, step=str(step))
 
 
 def _resume(config: Config, network: UNet, optimizer: torch.optim.Optimizer) -> int:

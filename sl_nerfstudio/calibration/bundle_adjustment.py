@@ -59,6 +59,12 @@ class Adjustment:
     median_before_px: float
     median_after_px: float
 
+    @property
+    def sigma(self) -> Float[Tensor, "frames 12"]:
+        """Posterior 1 sigma of each frame's delta and rho: translation xyz, rotation xyz each."""
+        sigma = self.covariance.diagonal().clamp_min(0).sqrt()
+        return sigma.reshape(2, self.rig.frames, 6).transpose(0, 1).flatten(1)
+
 
 @dataclass(frozen=True)
 class _Stage:
@@ -112,7 +118,7 @@ class _Found:
     @property
     def pairs(self) -> Int[Tensor, "2 rows"]:
         """Frame of the anchor, frame that looks for it."""
-        return torch.stack([self.state.anchors.frame[self.rows.anchor], self.rows.frame])
+        return self.rows.pairs(self.state.anchors)
 
     def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "_Found":
         """The same with some frames elsewhere: their kernels open again."""
@@ -122,8 +128,8 @@ class _Found:
 
 def _run(problem: _Problem, stage: _Stage, found: _Found) -> _Found:
     """Steps of one stage, until nothing moves any more."""
-    state, start, maps = replace(found.state, damping=DAMPING), problem.start, problem.maps
-    found = replace(found, state=state)
+    start, maps = problem.start, problem.maps
+    found = replace(found, state=replace(found.state, damping=DAMPING))
     for iteration in track(range(stage.iterations), "Adjusting poses"):
         if stage.rough and iteration % _OBSERVE_EVERY == 0:
             found = replace(found, rows=problem.observe(found.state))

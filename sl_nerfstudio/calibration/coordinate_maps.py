@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.calibration.compiled import compiled, compiled_part
+from sl_nerfstudio.compiled import compiled, compiled_parallel
 
 _HALF_WINDOW = 3  # pixels: 7 x 7 windows
 _MIN_PIXELS = 24  # decoded pixels a window must hold
@@ -101,7 +101,7 @@ class CoordinateMaps:
         return torch.where(inside[:, None], found, torch.full_like(found, float("nan")))
 
 
-@compiled
+@compiled_parallel
 def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, valid):
     """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
     for k in numba.prange(len(frame)):
@@ -146,7 +146,7 @@ def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, valid):
         valid[k] = rough2 < _MAX_ROUGHNESS * _MAX_ROUGHNESS * n
 
 
-@compiled_part
+@compiled
 def _solve(A):
     """Cholesky of the lower triangle of A[:, :6], then A[:, 6:] <- solution. False where the window is degenerate."""
     for j in range(6):

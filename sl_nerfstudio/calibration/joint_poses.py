@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.bundle_adjustment import Adjustment, AdjustmentSettings, adjust
+from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adjust
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud
 from sl_nerfstudio.calibration.gauge import restore
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.pose_prior import PosePrior
+from sl_nerfstudio.calibration.posterior import frame_sigmas
 from sl_nerfstudio.calibration.registration import Registration
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Intrinsics
@@ -25,6 +26,7 @@ _FRAME_ROTATION, _FRAME_TRANSLATION = np.radians(1.0), 0.03
 _BASELINE_LENGTH = 0.02  # of the logarithm
 # Neighbouring look-ups share pixels, cells and edges: on synthetic scans poses err by about twice what is stated.
 _DEPENDENCE = 2.0
+_LEAST_SIGMA = 1e-9  # scene units and radian: a scan states no sigma of zero
 _LEAST_ROTATION = np.radians(0.02)  # of the projector: wrong intrinsics are not in the covariance of a frame
 
 
@@ -89,7 +91,8 @@ def joint_poses(
     T_camera[index] = S_world_scene.poses(rig.T_world_camera.numpy())
     T_projector[index] = S_world_scene.poses(rig.T_world_projector.numpy())
     sigma: list[PoseSigma | None] = [None] * n
-    for k, values in zip(index, _sigmas(found, S_world_scene.scale), strict=True):
+    stated = _DEPENDENCE * frame_sigmas(found.sigma.clamp_min(_LEAST_SIGMA), S_world_scene.scale)
+    for k, values in zip(index, stated, strict=True):
         sigma[k] = PoseSigma(*values.tolist())
     return JointPoses(
         T_camera, T_projector, tuple(sigma), found.noise_px, found.median_before_px, found.median_after_px
@@ -129,11 +132,3 @@ def _prior(clouds: Sequence[FrameCloud], registration: Registration, index: Sequ
             )
         )
     return PosePrior(*torch.tensor(rows, dtype=torch.float64).unbind(1))
-
-
-def _sigmas(found: Adjustment, unit: float) -> Float64[ndarray, "m 4"]:
-    """Per frame: translation and rotation (degrees) of the whole, the same of the relative pose; RMS over the axes."""
-    n = found.rig.frames
-    variance = found.covariance.diagonal().clamp_min(0).reshape(2, n, 2, 3).mean(-1)
-    sigma = _DEPENDENCE * variance.sqrt().permute(1, 0, 2).reshape(n, 4).numpy()
-    return np.maximum(sigma, 1e-9) * np.array([unit, 180 / np.pi, unit, 180 / np.pi])

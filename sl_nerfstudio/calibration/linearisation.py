@@ -23,8 +23,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.calibration.compiled import compiled
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.compiled import compiled_parallel
 from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.se3 import exp_se3, hat, inverse, rotate, transform
 
@@ -83,6 +83,10 @@ class Observations:
 
     anchor: Int[Tensor, "rows"]
     frame: Int[Tensor, "rows"]
+
+    def pairs(self, anchors: Anchors) -> Int[Tensor, "2 rows"]:
+        """Frame of the anchor, frame that looks for it."""
+        return torch.stack([anchors.frame[self.anchor], self.frame])
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,16 @@ class NormalEquations:
         return -(self.g_depth + self.depth_by_pose @ step) / self.H_depth
 
 
+def pose_columns(
+    anchors: Anchors, observations: Observations, frames: int
+) -> tuple[Int[Tensor, "anchors 6"], Int[Tensor, "rows 18"]]:
+    """The unknowns (delta of all frames, then rho of all frames) that own and cross residuals depend on."""
+    n, columns = frames, torch.arange(6)
+    i, j = observations.pairs(anchors)[..., None]
+    own = 6 * n + 6 * anchors.frame[:, None] + columns
+    return own, torch.cat([6 * i + columns, 6 * j + columns, 6 * (n + j) + columns], -1)
+
+
 def normal_equations(
     linear: Linearisation,
     anchors: Anchors,
@@ -179,15 +193,13 @@ def normal_equations(
     frames: int,
 ) -> NormalEquations:
     """Weighted normal equations with the Schur complement of the depths."""
-    n, columns = frames, torch.arange(6)
+    n = frames
     H = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
     g = torch.zeros(12 * n, dtype=torch.float64)
     depth_by_pose = torch.zeros(len(anchors.frame) * 12 * n, dtype=torch.float64)
     H_depth = own_weight * (linear.own_depth**2).sum(-1)
     g_depth = own_weight * (linear.own_depth * linear.residuals.own).sum(-1)
-    i, j = anchors.frame[observations.anchor], observations.frame
-    own_columns = 6 * n + 6 * anchors.frame[:, None] + columns
-    cross_columns = torch.cat([6 * i[:, None] + columns, 6 * j[:, None] + columns, 6 * (n + j[:, None]) + columns], -1)
+    own_columns, cross_columns = pose_columns(anchors, observations, n)
     each, several, r_of = torch.arange(len(own_weight)), observations.anchor, linear.residuals
     groups = (
         (linear.own_rho, linear.own_depth, r_of.own, own_weight, own_columns, each),
@@ -212,7 +224,7 @@ def normal_equations(
     return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
 
 
-@compiled
+@compiled_parallel
 def _accumulate(J, weight, columns, partial):
     """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
     threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]

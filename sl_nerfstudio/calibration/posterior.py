@@ -8,8 +8,10 @@ cluster-robust "sandwich" estimate: Liang and Zeger, Biometrika 1986). Whichever
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.calibration.kernel import Kernel
@@ -20,6 +22,7 @@ from sl_nerfstudio.calibration.linearisation import (
     Observations,
     Rig,
     normal_equations,
+    pose_columns,
 )
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.se3 import inverse, transform
@@ -72,13 +75,11 @@ def _block_sums(
     cross_weight: Float[Tensor, "rows"],
 ) -> Float[Tensor, "blocks unknowns"]:
     """Gradient of the poses from each block of each image, depths eliminated."""
-    n, columns = e.rig.frames, torch.arange(6)
-    i, j, r = e.anchors.frame[e.rows.anchor], e.rows.frame, e.linear.residuals
+    n, r = e.rig.frames, e.linear.residuals
     own_block, cross_block = _blocks_of(e)
     out = torch.zeros(n * _BLOCKS**2 * 12 * n, dtype=torch.float64)
     pull = torch.zeros(n * _BLOCKS**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
-    own_columns = 6 * n + 6 * e.anchors.frame[:, None] + columns
-    cross_columns = torch.cat([6 * i[:, None] + columns, 6 * j[:, None] + columns, 6 * (n + j[:, None]) + columns], -1)
+    own_columns, cross_columns = pose_columns(e.anchors, e.rows, n)
     every = torch.arange(len(e.anchors.frame))
     for block, J, J_depth, wr, cols, anchor in (
         (own_block, e.linear.own_rho, e.linear.own_depth, own_weight[:, None] * r.own, own_columns, every),
@@ -114,6 +115,12 @@ def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]
         return (frame * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1]
 
     return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
+
+
+def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndarray, "frames 4"]:
+    """RMS per axis: frame translation (scene units times `unit`), frame rotation (degree), the same relative."""
+    parts = sigma.reshape(-1, 4, 3).pow(2).mean(-1).sqrt().cpu().numpy()
+    return parts * np.array([unit, 180 / np.pi, unit, 180 / np.pi])
 
 
 def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:

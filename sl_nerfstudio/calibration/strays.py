@@ -131,7 +131,7 @@ def _settle(
         linear = linearise(state.rig, state.anchors, rows, scene.maps)
         if not linear.residuals.cross_valid.any():
             return rig, 0.0
-        pair = torch.stack([scene.anchors.frame[rows.anchor], rows.frame])
+        pair = rows.pairs(scene.anchors)
         median = frame_medians(linear.residuals, pair, n)[k]
         width = narrowed(width, torch.full_like(width, 2 * float(median))).clamp_min(3 * scene.noise)
         H, g = prior_equations(prior, start, state.rig)

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.compiled import compiled
 from sl_nerfstudio.calibration.surface_map import SurfaceMap
+from sl_nerfstudio.compiled import compiled_parallel
 
 _HIDDEN = 0.35  # radii behind a surface: farther back a point is hidden by it, nearer it contradicts it
 _FACING = 0.3  # cosine between normals of places that may be the same
@@ -76,7 +76,7 @@ def agreement(
     return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares)
 
 
-@compiled
+@compiled_parallel
 def _sums(points, normals, scale, R, t, reverse, map_point, map_normal, valid, camera, c, tolerances, H, g, counts):
     """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
     h, w = valid.shape

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.compiled import compiled
 from sl_nerfstudio.calibration.correspondence_rays import directions
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud, well_known
+from sl_nerfstudio.compiled import compiled_parallel
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.plane_fit import solve_plane
 
 _SIDE = 200  # of the map, at most: registration by surfaces needs no more, and poses are refined from coordinates later
 _WINDOW = 2  # map pixels around each, of a plane fit
@@ -97,7 +98,7 @@ def _normals(
     return n / np.linalg.norm(n, axis=-1, keepdims=True).clip(1e-300)
 
 
-@compiled
+@compiled_parallel
 def _fit_inverse_depth(q, fitted):
     """Planes `q = c + u du + v dv` in windows around every pixel that has a value; NaN where torn or too sparse."""
     h, w = q.shape
@@ -122,14 +123,11 @@ def _fit_inverse_depth(q, fitted):
                     s1 += d * dx
                     s2 += d * dy
                     ss += d * d
-            c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
-            c11, c12, c22 = n * syy - sy * sy, sx * sy - n * sxy, n * sxx - sx * sx
-            det = n * c00 + sx * c01 + sy * c02
-            if n < _LEAST or det < 1e-3 * n:
+            if n < _LEAST:
                 continue
-            c = (c00 * s0 + c01 * s1 + c02 * s2) / det
-            u = (c01 * s0 + c11 * s1 + c12 * s2) / det
-            v = (c02 * s0 + c12 * s1 + c22 * s2) / det
+            solvable, c, u, v = solve_plane(n, sx, sy, sxx, sxy, syy, s0, s1, s2, 1e-3 * n)
+            if not solvable:
+                continue
             rough2 = (ss - c * s0 - u * s1 - v * s2) / n
             if rough2 < (_TORN * origin) ** 2:
                 fitted[row, column, 0] = c + origin

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 from scipy.ndimage import find_objects
 
-from sl_nerfstudio.decoding.compiled import compiled
+from sl_nerfstudio.compiled import compiled
 
 _BLURS = (0.045, 0.1, 0.18)  # of the drawn pattern, periods
 _SMOOTHING = 0.3  # window over which coordinates are taken for linear, periods

@@ -5,26 +5,20 @@ the border, whatever albedo and shading: borders are found to a fraction of a ca
 around a pixel gives its coordinate.
 """
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Float32, Int8, Int16, Int32
 from numpy import ndarray
+
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.geometry.plane_fit import solve_plane
 
 _LEAST_BORDERS = 4
 _SMALLEST_WINDOW, _LARGEST_WINDOW = 2, 10  # pixels to each side
 _INLIER = 0.5  # cells
 _MISREAD = 1.0  # cells: a pixel whose own cell ends farther than this from the plane was misread
 LEVELS = 3  # a pixel is used if at most this number minus one of its finest bits are in doubt
-
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as machine code; without the run-time type checks that tests wrap it in."""
-    return numba.njit(cache=True)(inspect.unwrap(function))
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ def refine(cells: Cells, count: int) -> Float32[ndarray, "h w"]:
     return np.clip(out, 0, count)
 
 
-@_compiled
+@compiled
 def _borders(cell: ndarray, level: ndarray, difference: ndarray) -> tuple[ndarray, ndarray]:
     """Where, between a pixel's centre (0) and that of its right or lower neighbour (1), a border lies; -1: nowhere."""
     bits, h, w = difference.shape
@@ -85,7 +79,7 @@ def _borders(cell: ndarray, level: ndarray, difference: ndarray) -> tuple[ndarra
     return right, down
 
 
-@_compiled
+@compiled
 def _fit(cell: ndarray, level: ndarray, right: ndarray, down: ndarray, half: int, reach: float, out: ndarray) -> None:
     h, w = cell.shape
     for y in range(h):
@@ -105,7 +99,7 @@ def _fit(cell: ndarray, level: ndarray, right: ndarray, down: ndarray, half: int
                 out[y, x] = value
 
 
-@_compiled
+@compiled
 def _plane(cell, level, right, down, y, x, half, reach, near, tolerance):
     """The plane through the borders around a pixel: whether there is one, its value there, its slopes in x and y.
 
@@ -140,19 +134,13 @@ def _plane(cell, level, right, down, y, x, half, reach, near, tolerance):
                 sys += dy * value
     if n < _LEAST_BORDERS:
         return False, centre, 0.0, 0.0
-    # inverse of the symmetric [[n, sx, sy], [sx, sxx, sxy], [sy, sxy, syy]] by cofactors
-    c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
-    c11, c12, c22 = n * syy - sy * sy, sx * sy - n * sxy, n * sxx - sx * sx
-    det = n * c00 + sx * c01 + sy * c02
-    if det < 1e-2 * n * n * n:
+    solvable, value, fx, fy = solve_plane(n, sx, sy, sxx, sxy, syy, s, sxs, sys, 1e-2 * n * n * n)
+    if not solvable:
         return False, centre, 0.0, 0.0
-    value = (c00 * s + c01 * sxs + c02 * sys) / det
-    fx = (c01 * s + c11 * sxs + c12 * sys) / det
-    fy = (c02 * s + c12 * sxs + c22 * sys) / det
     return True, centre + value, fx, fy
 
 
-@_compiled
+@compiled
 def _mean_cell(cell, level, y, x, half, reach):
     """Mean of the cells' centres in a window that lies evenly about the pixel."""
     h, w = cell.shape

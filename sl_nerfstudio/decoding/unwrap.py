@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.compiled import compiled
+from sl_nerfstudio.compiled import compiled
 
 _LARGEST_STEP = 0.3  # periods between two neighbouring pixels
 _FARTHEST = 2.0  # periods from the node

@@ -18,6 +18,7 @@ from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import RefinePoses, constrained
 from sl_nerfstudio.calibration.pose_prior import PosePrior
+from sl_nerfstudio.calibration.posterior import frame_sigmas
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.se3 import inverse
@@ -121,8 +122,7 @@ def refine(
     verdict = compare(start, rig, held_out, maps, max(_GUARD_WIDTH * found.noise_px, _GUARD_FLOOR_PX))
     if not verdict.better:
         return Refinement(start.T_world_camera, start.T_world_projector, _prior_sigma(stated), verdict, found.noise_px)
-    sigma = found.covariance.diagonal().clamp_min(0).sqrt().reshape(2, rig.frames, 6).transpose(0, 1)
-    return Refinement(rig.T_world_camera, rig.T_world_projector, sigma.flatten(1), verdict, found.noise_px)
+    return Refinement(rig.T_world_camera, rig.T_world_projector, found.sigma, verdict, found.noise_px)
 
 
 def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:
@@ -156,5 +156,4 @@ def _evenly(index: Tensor, count: int) -> Tensor:
 
 def sigmas_in_scan_units(sigma: Float[Tensor, "frames 12"], S_scene_world: Similarity) -> Float[ndarray, "frames 4"]:
     """RMS per axis: frame translation (scan units), frame rotation (degree), the same for the relative pose."""
-    parts = sigma.reshape(-1, 4, 3).pow(2).mean(-1).sqrt().cpu().numpy()
-    return parts * np.array([1 / S_scene_world.scale, 180 / np.pi, 1 / S_scene_world.scale, 180 / np.pi])
+    return frame_sigmas(sigma, 1 / S_scene_world.scale)

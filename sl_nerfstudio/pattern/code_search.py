@@ -6,23 +6,15 @@ Hamming balls around it. Cells of windows in conflict are re-sampled with the sy
 fewest conflicts (min-conflicts heuristic).
 """
 
-import inspect
-from collections.abc import Callable
-from typing import Any
-
-import numba
 import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
+
 _SYMBOLS, _CELLS = 5, 9
 _MOVES_PER_CELL = 3  # beyond that a margin counts as out of reach
 _RANDOM_MOVES = 0.1
-
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as machine code; without the run-time type checks that tests wrap it in."""
-    return numba.njit(cache=True)(inspect.unwrap(function))
 
 
 def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_margin: int, seed: int) -> bool:
@@ -34,7 +26,7 @@ def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_m
     return bool(_search(codes, margin - 1, turned_margin - 1, seed, _MOVES_PER_CELL * codes.size))
 
 
-@_compiled
+@compiled
 def _count(tables: ndarray, codes: ndarray, row: int, column: int, amount: int) -> None:
     """Enter (or take out) the window at (row, column): upright in one table, its turns in the other."""
     turn = (0, 3, 4, 1, 2)
@@ -51,7 +43,7 @@ def _count(tables: ndarray, codes: ndarray, row: int, column: int, amount: int) 
     tables[1, d] += amount
 
 
-@_compiled
+@compiled
 def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
     """Sum of the table over the Hamming ball around `key`; `change[k, s]` alters cell k."""
     if radius < 0:
@@ -69,7 +61,7 @@ def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
     return total
 
 
-@_compiled
+@compiled
 def _conflicts(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> int:
     """Occurrences near the window at (row, column), itself left out."""
     change = np.empty((_CELLS, _SYMBOLS - 1), dtype=np.int64)
@@ -83,7 +75,7 @@ def _conflicts(tables: ndarray, codes: ndarray, row: int, column: int, radius: i
     return _in_ball(tables[0], key, change, radius) - 1 + _in_ball(tables[1], key, change, turned_radius)
 
 
-@_compiled
+@compiled
 def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: int) -> bool:
     np.random.seed(seed)
     rows, columns = codes.shape[0] - 2, codes.shape[1] - 2
@@ -105,7 +97,7 @@ def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: i
     return True
 
 
-@_compiled
+@compiled
 def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> None:
     """Re-sample the one cell of a window that leaves the fewest conflicts in all windows around that cell."""
     best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(_SYMBOLS), 2**30
@@ -128,7 +120,7 @@ def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius:
     _replace(tables, codes, row + best_cell // 3, column + best_cell % 3, best_symbol)
 
 
-@_compiled
+@compiled
 def _cost(tables: ndarray, codes: ndarray, i: int, j: int, radius: int, turned_radius: int, limit: int) -> int:
     """Conflicts of the windows that hold cell (i, j); counting stops at `limit`."""
     cost = 0
@@ -140,7 +132,7 @@ def _cost(tables: ndarray, codes: ndarray, i: int, j: int, radius: int, turned_r
     return cost
 
 
-@_compiled
+@compiled
 def _replace(tables: ndarray, codes: ndarray, i: int, j: int, symbol: int) -> None:
     for amount in (-1, 1):
         for row in range(max(i - 2, 0), min(i, codes.shape[0] - 3) + 1):

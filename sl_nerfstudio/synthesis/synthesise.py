@@ -26,7 +26,7 @@ from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
-_GAIN = 1.05  # exposure: a surface of mean albedo, perpendicular, in full light, comes to 0.82 of full scale
+GAIN = 1.05  # exposure: a surface of mean albedo, perpendicular, in full light, comes to 0.82 of full scale
 _WINDOW = 0.8  # of local normalisation, in periods of the pattern
 
 
@@ -93,7 +93,7 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
     for index in track(range(config.frames), "rendering", config.frames):
         rendered = setup.render(index, config.supersampling)
         sensor, decoder = (random_stream(config.seed, stream, index) for stream in (Stream.SENSOR, Stream.COORDS))
-        image = disturb_image(rendered.radiance, _GAIN, config.sensor_noise, sensor)
+        image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
         coords = disturb_coords(rendered.coords, rendered.mask, setup.cells, noise, decoder)
         pattern = _pattern_image(image, rendered.mask, setup)
         yield SyntheticFrame(f"frame_{index:05d}", image, pattern, coords, rendered.mask)

@@ -1,0 +1,17 @@
+"""Machine code for loops that numpy cannot express; kept on disk, so that it is made once."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function compiled for one thread; without the run-time type checks that tests wrap it in."""
+    return numba.njit(cache=True)(inspect.unwrap(function))
+
+
+def compiled_parallel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, with `numba.prange` over all threads."""
+    return numba.njit(parallel=True, cache=True)(inspect.unwrap(function))
