@@ -16,6 +16,9 @@ from sl_nerfstudio.scan.types import Scan
 HOLE_SHARE, SILENT_SHARE, SPECK_SHARE = 2e-3, 2e-2, 1e-4
 """Of the kept area: smaller gaps inside the observed surface stay closed (larger ones where the pattern was seen but
 not decoded), smaller pieces apart from it are dropped."""
+SILENT_MEMBERS, CONTRADICTED = 0.75, 0.25
+"""Such a gap counts as seen but not decoded if this share of its vertices fell into masks, and frames spoke against
+fewer vertices than this share of those: what closes a real gap between two surfaces is seen through by some frames."""
 TINY = 3  # vertices: so small a gap is closed whatever frames say, wrong decodings meet by chance
 BADLY_DECODED = 0.25  # share of undecoded sightings above which a mask counts as evidence
 _LEAST_SHARE = 0.1  # observed vertices, of those seen: with fewer, the agreement is chance
@@ -126,8 +129,10 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], votes: Votes) -> Bool[
     beside[label[mixed[gap[mixed]]]] = True
     members = np.bincount(label[gap], minlength=count)
     several = np.bincount(label[gap], (votes.denied[gap] > 1).astype(float), count)
-    silent = np.bincount(label[gap], (votes.silent[gap] > 0).astype(float), count)
-    share = np.where(silent > 0.5 * members, SILENT_SHARE, HOLE_SHARE)
+    in_mask = np.bincount(label[gap], (votes.silent[gap] > 0).astype(float), count)
+    silent, denied = (np.bincount(label[gap], v[gap].astype(float), count) for v in (votes.silent, votes.denied))
+    undecoded = (in_mask > SILENT_MEMBERS * members) & (denied < CONTRADICTED * silent)
+    share = np.where(undecoded, SILENT_SHARE, HOLE_SHARE)
     allowed = (several <= 0.5 * members) | (members <= TINY)
     good = beside & (area < share * areas[~touched].sum()) & allowed
     return gap & good[label]

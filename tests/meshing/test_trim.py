@@ -111,6 +111,26 @@ def test_a_bulge_on_the_surface_goes(truth, scan):
     assert kept[(angle > 20) & (angle_beyond_horizon_deg(truth.vertices) > 18)].all()
 
 
+def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode_nothing_there(truth, tmp_path):
+    """A bulge over a patch that two of three frames do not decode, and one decodes where the object really is."""
+    towards, poses = np.array([0.0, 0.0, 1.0]), POSES[::2]
+    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
+    bulged = Mesh(truth.vertices * (1 + 5 / RADIUS * np.clip((8 - angle) / 2, 0, 1))[:, None], truth.faces)
+
+    def undecoded(number: int, coords: np.ndarray) -> np.ndarray:
+        if number == 1:
+            return coords
+        row, column = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
+        x, y, z = np.linalg.solve(poses[number][0], [*(RADIUS * towards), 1.0])[:3]
+        u, v = CAMERA.cx - CAMERA.fl_x * x / z, CAMERA.cy + CAMERA.fl_y * y / z
+        return np.where((np.hypot(column - u, row - v) < 7)[..., None], np.float32(np.nan), coords)
+
+    result = trim_to_observed(bulged, scan_of(truth, poses, tmp_path / "scan", undecoded))
+    kept = contains(result.mesh, bulged.vertices)
+    assert not kept[angle < 6].any()
+    assert kept[(angle > 15) & (angle < 40)].all()
+
+
 def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndarray:
     """A share of the cells of size x size camera pixels, another one in each frame."""
     chosen = np.random.default_rng(number).random((across, across)) < share
