@@ -10,16 +10,12 @@ losses instead of adjusted (`by-gradient`, `independent`). Prints a table; write
 """
 
 import argparse
-import json
-import shutil
-import subprocess
-import sys
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from benchmarks.machine import write_rows
+from benchmarks.whole_runs import Score, run, train_and_score, with_true_poses
 
 FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 57}
 COMPARED = {
@@ -47,48 +43,12 @@ VARIANTS = {**COMPARED, **ABLATIONS}
 
 
 @dataclass(frozen=True)
-class Row:
-    """One run; lengths in mm."""
+class Row(Score):
+    """One run."""
 
     scene: str
     seed: int
     variant: str
-    rigid_rmse: float
-    rigid_median: float
-    similarity_rmse: float
-    completeness_rmse: float
-    camera_translation_rmse: float
-    camera_rotation_rmse_deg: float
-    coordinate_px: float
-    training_seconds: float
-
-
-def run(*command: str) -> None:
-    """A command of this environment; its output only if it fails."""
-    program = Path(sys.executable).parent / command[0]
-    done = subprocess.run([str(program), *command[1:]], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
-
-
-def with_true_poses(scan: Path, to: Path) -> Path:
-    """A copy of a scan whose starting poses are the true ones."""
-    shutil.copytree(scan, to)
-    truth = json.loads((scan / "ground_truth/transforms.json").read_text())["frames"]
-    document = json.loads((scan / "transforms.json").read_text())
-    for frame, true in zip(document["frames"], truth, strict=True):
-        for key in ("transform_matrix", "projector_transform_matrix"):
-            frame[key] = true[key]
-    (to / "transforms.json").write_text(json.dumps(document, indent=1))
-    return to
-
-
-def train(scan: Path, folder: Path, variant: str, iterations: int, options: Sequence[str]) -> tuple[Path, float]:
-    """Train one variant; its config file and the seconds the whole command took."""
-    start = time.monotonic()
-    fixed = ("--output-dir", str(folder), "--experiment-name", "run", "--timestamp", variant)
-    run("ns-train", "sl-neus", "--data", str(scan), *fixed, "--max-num-iterations", str(iterations), *options)
-    return folder / "run/sl-neus" / variant / "config.yml", time.monotonic() - start
 
 
 def measure(scene: str, seed: int, iterations: int, folder: Path, variants: Sequence[str]) -> list[Row]:
@@ -98,40 +58,11 @@ def measure(scene: str, seed: int, iterations: int, folder: Path, variants: Sequ
     rows = []
     for variant in variants:
         data = with_true_poses(scan, folder / "true") if variant == "oracle" else scan
-        config, seconds = train(data, folder, variant, iterations, VARIANTS[variant])
-        mesh, poses, result = folder / f"{variant}.ply", folder / variant, folder / f"{variant}.json"
-        run("sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(poses))
-        run("sl-eval", "--mesh", str(mesh), "--data", str(data), "--poses", str(poses / "transforms.json"),
-            "--json", str(result))  # fmt: skip
-        found = json.loads(result.read_text())
-        rigid, similarity, camera = found["rigid"], found["similarity"], found["camera"]
-        rows.append(
-            Row(
-                scene,
-                seed,
-                variant,
-                rigid["accuracy"]["rmse"],
-                rigid["accuracy"]["median"],
-                similarity["accuracy"]["rmse"],
-                rigid["completeness"]["rmse"],
-                camera["translation_rmse"],
-                camera["rotation_rmse_deg"],
-                found["fit"]["coordinate_px_median"],
-                seconds,
-            )
-        )
-        print(row_text(rows[-1]), flush=True)
+        options = ("--max-num-iterations", str(iterations), *VARIANTS[variant])
+        score = train_and_score(data, folder, variant, options)
+        print(f"{scene:18} {seed:4} {variant:17} {score.text()}", flush=True)
+        rows.append(Row(**asdict(score), scene=scene, seed=seed, variant=variant))
     return rows
-
-
-def row_text(row: Row) -> str:
-    """One line of the table."""
-    return (
-        f"{row.scene:18} {row.seed:4} {row.variant:17} rigid RMSE {row.rigid_rmse:.3f} median {row.rigid_median:.3f} "
-        f"| similarity {row.similarity_rmse:.3f} | complete {row.completeness_rmse:.3f} "
-        f"| camera {row.camera_translation_rmse:.3f} mm {row.camera_rotation_rmse_deg:.3f} deg "
-        f"| {row.coordinate_px:.2f} px | {row.training_seconds:.0f} s"
-    )
 
 
 def main() -> None:

@@ -102,15 +102,22 @@ def _sigma_of_pose(
     slopes = []
     for k in range(5):
         step = _STEP * np.eye(5)[k]
-        ahead, behind = (_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
+        ahead, behind = (camera_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
         slopes.append((ahead - behind) / (2 * _STEP))
     J = np.stack(slopes, 1)
     return np.sqrt(np.einsum("ni,ij,nj->n", J, pose.covariance, J).clip(0))
 
 
-def _depth(
-    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], d_camera: ndarray, d_projector: ndarray
+def camera_depth(
+    R: Float64[ndarray, "3 3"],
+    t: Float64[ndarray, "3"],
+    d_camera: Float64[ndarray, "n 3"],
+    d_projector: Float64[ndarray, "n 3"],
 ) -> Float64[ndarray, "n"]:
+    """Depth along camera rays where they come nearest to projector rays, each in its device's axes.
+
+    `R`, `t` lead from the projector to the camera.
+    """
     d_p = d_projector @ R.T
     normal = np.cross(d_camera, d_p)
     return (np.cross(t, d_p) * normal).sum(-1) / (normal * normal).sum(-1).clip(1e-300)

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.calibration.correspondence_rays import directions
-from sl_nerfstudio.calibration.frame_cloud import FrameCloud
+from sl_nerfstudio.calibration.frame_cloud import FrameCloud, camera_depth
 from sl_nerfstudio.errors import UserError
 
 _NEAR = 3.0  # pixels around a picked one whose points are averaged
@@ -117,9 +117,7 @@ def _point_at(
     # The cloud's points have baseline one; the adjusted one may point elsewhere by a little, which depth feels.
     T = np.linalg.inv(T_world_camera) @ T_world_projector
     row, column = np.floor(cloud.uv_camera[near]).astype(int).T[::-1]
-    d_p = directions(cloud.projector, cloud.coords[row, column].astype(np.float64)) @ T[:3, :3].T
-    d_c = directions(cloud.camera, cloud.uv_camera[near])
-    normal = np.cross(d_c, d_p)
-    depth = (np.cross(T[:3, 3], d_p) * normal).sum(-1) / (normal * normal).sum(-1)
+    d_projector = directions(cloud.projector, cloud.coords[row, column].astype(np.float64))
+    depth = camera_depth(T[:3, :3], T[:3, 3], directions(cloud.camera, cloud.uv_camera[near]), d_projector)
     ray = directions(cloud.camera, np.array([pixel], dtype=np.float64))[0]
     return T_world_camera[:3, :3] @ (float(np.median(depth)) * ray) + T_world_camera[:3, 3]

@@ -110,7 +110,7 @@ class _State:
         self.anchoring = anchoring
         self.rng = rng
         self.tried: dict[tuple[int, int], PairMatch | None] = {}
-        self.searched: set[tuple[int, int]] = set()  # without a guess
+        self.searched: set[tuple[tuple[int, int], Search]] = set()
 
     @property
     def edges(self) -> list[PairMatch]:
@@ -119,8 +119,8 @@ class _State:
 
     def try_pairs(self, pairs: Sequence[tuple[int, int]], search: Search) -> None:
         """Register pairs without a guess."""
-        for pair in track([p for p in pairs if p not in self.searched], "registering pairs"):
-            self.searched.add(pair)
+        for pair in track([p for p in pairs if (p, search) not in self.searched], "registering pairs"):
+            self.searched.add((pair, search))
             self._keep(pair, register_pair((self.maps[pair[0]], self.maps[pair[1]]), pair, search, self.rng))
 
     def pairs_near(self, S_world_camera: Sequence[Similarity | None], partners: int) -> None:
@@ -166,17 +166,16 @@ class _State:
         return np.array([5.0 * s + _worth(e) for s, e in zip(support, edges, strict=True)], dtype=np.float64)
 
     def bridge(self) -> None:
-        """Where groups of frames hang apart, search between them everywhere."""
+        """Where groups of frames hang apart, search between them everywhere: one may stand on its head."""
         groups = _groups(self.edges, len(self.maps))
         if len(groups) < 2:
             return
         main = groups[0]
         outside = [k for group in groups[1:] for k in group]
-        pairs = []
+        pairs = set()
         for k in outside:
-            nearest = sorted(main, key=lambda m: abs(m - k))[:4]
-            pairs += [(min(k, m), max(k, m)) for m in nearest]
-        self.try_pairs([p for p in sorted(set(pairs)) if p not in self.searched or self.tried[p] is None], ANYWHERE)
+            pairs |= {(min(k, m), max(k, m)) for m in sorted(main, key=lambda m: abs(m - k))[:4]}
+        self.try_pairs(sorted(pairs), ANYWHERE)
 
 
 def _worth(e: PairMatch) -> float:

@@ -71,11 +71,13 @@ def evaluate(
     """
     surface = Surface(mesh)
     fit = _fit(surface, scan, poses, on_frame)
-    scores: dict[str, SurfaceScore] = {}
-    if reference is not None:
-        scores = score_alignments(surface, reference, poses, true_poses, f_distances, samples, seed)
     initial = Poses(scan.T_world_camera, scan.T_world_projector)
     moved = not np.array_equal(initial.stacked(), poses.stacked())
+    scores: dict[str, SurfaceScore] = {}
+    if reference is not None:
+        # Without true poses the scan's own ones tell where the reference lies: ICP starts from there, too.
+        towards = true_poses or (initial if moved else None)
+        scores = score_alignments(surface, reference, poses, towards, f_distances, samples, seed)
     return Evaluation(
         units=scan.units,
         fit=fit,
@@ -98,8 +100,8 @@ def score_alignments(
 ) -> dict[str, SurfaceScore]:
     """Scores under rigid ICP, under ICP with scale, and as is.
 
-    ICP starts from where the result lies and, with true poses, from the map that brings the estimated
-    devices onto the true ones; the better end counts.
+    ICP starts from where the result lies and, with true poses (or others in the reference's world), from the map
+    that brings the estimated devices onto those; the better end counts.
     """
     points, _ = surface.sample(samples, seed)
     distances = tuple(f_distances) or default_f_distances(reference.size)

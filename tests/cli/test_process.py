@@ -119,23 +119,20 @@ def test_fewer_than_two_frames_is_an_error_that_names_them_all(monkeypatch, copy
     assert not out.exists() and (tmp_path / "w" / "processing.html").is_file()
 
 
-def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path, capsys):
+def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path):
     _spoil(copy.root / "images" / "pose 0", lambda image: np.repeat(image[..., None], 3, -1))
     _spoil(copy.root / "images" / "pose 1", lambda image: image.astype(np.uint16) * np.uint16(257))
     _spoil(copy.root / "images" / "pose 2", lambda image: np.rot90(image, 2))
     shutil.rmtree(copy.root / "images" / "pose 3")
-    for order, frames in (("--unordered", 3), ("", 2)):  # in a sequence, neighbours are held alike
-        out = tmp_path / f"scan{order}"
-        flags = [*copy.flags, "--output", out, "--jobs", 1, "--work", tmp_path / "w", *filter(None, [order])]
-        _run(monkeypatch, *flags)
+    for order in ([], ["--unordered"]):
+        out = tmp_path / f"scan{len(order)}"
+        _run(monkeypatch, *copy.flags, "--output", out, "--jobs", 1, "--work", tmp_path / "w", *order)
         scan = read_scan(out)
-        assert len(scan.frames) == frames and check_scan(out) == []
+        assert len(scan.frames) == 3 and check_scan(out) == []
         assert scan.frames[0].read_image().ndim == 3 and scan.frames[1].read_image().dtype == np.uint16
         up = scan.T_world_camera[:, :3, 1]
         assert up[0] @ up[1] > 0.5
-        if order:
-            assert up[0] @ up[2] < -0.5  # the third camera stands on its head
-    assert "left out: pose 2: its best partner" in capsys.readouterr().out
+        assert up[0] @ up[2] < -0.5  # the third camera stands on its head
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Poses, evaluate, mesh_reference
+from sl_nerfstudio.evaluation.reference import PointReference
 from sl_nerfstudio.evaluation.result_json import to_json
+from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
@@ -41,6 +43,18 @@ def test_a_result_in_another_gauge_is_perfect_once_aligned(clean_scan: Path) -> 
     assert result.pose_errors.scale_error == pytest.approx(0.03, rel=1e-9)
     assert result.initial_pose_errors.scale_error == pytest.approx(0.0, abs=1e-12)
     assert result.fit.coordinate_px_median < 1e-2
+
+
+def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_gauge(clean_scan: Path) -> None:
+    """No true poses: the scan's own ones lead to the reference, though the result is 60 times smaller and far away."""
+    made, scan = FacetedScan(), read_scan(clean_scan)
+    S = Similarity(1 / 60, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
+    points = Surface(made.truth()).sample(20 * SAMPLES, 3)[0]
+    poses = Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
+    result = evaluate(made.truth().mapped(S), scan, poses, PointReference(points, "points"), samples=SAMPLES)
+    assert result.surface["similarity"].scale == pytest.approx(60, rel=1e-3)
+    assert result.surface["similarity"].accuracy.p95 < 0.5  # distances between 100,000 points on 100 mm
+    assert result.pose_errors is None
 
 
 def test_json_has_what_the_command_promises(clean_scan: Path) -> None:

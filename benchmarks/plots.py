@@ -1,0 +1,137 @@
+"""Draws the curves of the documentation from benchmarks/results: accuracy, basin, sweeps.
+
+    python -m benchmarks.plots [--results benchmarks/results] [--output docs/pictures]
+
+Every result file that is there gives its picture.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+INK, MUTED, GRID = "#1d2733", "#66727f", "#dfe4e9"
+COLOURS = ("#2563a8", "#c2571a", "#3c8d5a", "#7a4fa3", "#8a8f98")
+Rows = list[dict[str, Any]]
+
+
+def panels(count: int, height: float = 3.0) -> tuple[Figure, list[Any]]:
+    """A figure of some panels in a row, in the colours of the reports."""
+    figure = Figure(figsize=(3.6 * count, height), dpi=130, layout="constrained")
+    axes = [figure.add_subplot(1, count, k + 1) for k in range(count)]
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(colors=MUTED)
+        ax.grid(color=GRID, linewidth=0.7)
+        ax.set_axisbelow(True)
+    return figure, axes
+
+
+def series(rows: Rows, key: str, value: str) -> tuple[list[float], list[float]]:
+    """Values by a key, in its order."""
+    ordered = sorted(rows, key=lambda row: row[key])
+    return [row[key] for row in ordered], [row[value] for row in ordered]
+
+
+def accuracy(rows: Rows) -> Figure:
+    """Surface error of every scene: refined and unrefined poses against the oracle's."""
+    shown = [v for v in ("refined", "oracle", "unrefined") if any(row["variant"] == v for row in rows)]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, (ax,) = panels(1)
+    figure.set_size_inches(5.2, 3.2)
+    for k, variant in enumerate(shown):
+        found = [[r["rigid_rmse"] for r in rows if r["scene"] == s and r["variant"] == variant] for s in scenes]
+        middle = [float(np.median(f)) if f else np.nan for f in found]
+        x = np.arange(len(scenes)) + (k - (len(shown) - 1) / 2) * 0.26
+        ax.bar(x, middle, 0.24, color=COLOURS[k], label=variant)
+        for at, values in zip(x, found, strict=True):
+            ax.plot([at] * len(values), values, ".", color=INK, markersize=4)
+    ax.set_xticks(range(len(scenes)), scenes)
+    ax.set_yscale("log")
+    ax.set_ylabel("rigid RMSE of the surface, mm", color=INK)
+    ax.set_title("bars: median; dots: scans", fontsize=9, color=MUTED)
+    ax.legend(frameon=False)
+    return figure
+
+
+def basin(rows: Rows) -> Figure:
+    """Camera rotation before and after joint adjustment."""
+    figure, (ax,) = panels(1)
+    figure.set_size_inches(5.2, 3.2)
+    for k, seed in enumerate(sorted({row["seed"] for row in rows})):
+        x, y = series([row for row in rows if row["seed"] == seed], "start_deg", "end_deg")
+        ax.plot(x, y, "o-", color=COLOURS[k], markersize=4, label=f"seed {seed}")
+    ax.set_yscale("log")
+    ax.set_xlabel("starting poses: camera rotation error, degrees RMS", color=INK)
+    ax.set_ylabel("after adjustment, degrees RMS", color=INK)
+    ax.legend(frameon=False)
+    return figure
+
+
+def sweeps(rows: Rows) -> Figure:
+    """Surface error against quality of decoding, number of frames and size of images."""
+    titles = {
+        "noise": "noise, pattern pixels",
+        "missing": "share of cells missing",
+        "wrong": "share of cells wrong",
+        "frames": "frames",
+        "resolution": "image width, pixels",
+    }
+    shown = [name for name in titles if any(row["sweep"] == name for row in rows)]
+    figure, axes = panels(len(shown))
+    for ax, name in zip(axes, shown, strict=True):
+        mine = [row for row in rows if row["sweep"] == name]
+        for k, (key, label) in enumerate((("rigid_rmse", "RMSE"), ("rigid_median", "median"))):
+            ax.plot(*series(mine, "value", key), "o-", color=COLOURS[k], markersize=4, label=label)
+        ax.set_xlabel(titles[name], color=INK)
+        ax.set_ylim(bottom=0)
+    axes[0].set_ylabel("surface, mm", color=INK)
+    axes[0].legend(frameon=False)
+    return figure
+
+
+def error_over_time(rows: Rows) -> Figure:
+    """Surface error against the seconds of the whole training command."""
+    figure, (ax,) = panels(1)
+    figure.set_size_inches(5.2, 3.4)
+    mine = [row for row in rows if row["sweep"] == "time"]
+    for k, variant in enumerate(dict.fromkeys(row["variant"] for row in mine)):
+        some = [row for row in mine if row["variant"] == variant]
+        ax.plot(*series(some, "training_seconds", "rigid_rmse"), "o-", color=COLOURS[k], markersize=4, label=variant)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("seconds of ns-train, start and adjustment included", color=INK)
+    ax.set_ylabel("rigid RMSE of the surface, mm", color=INK)
+    ax.legend(frameon=False)
+    return figure
+
+
+PICTURES: dict[str, tuple[str, Callable[[Rows], Figure]]] = {
+    "accuracy.png": ("accuracy.json", accuracy),
+    "basin.png": ("basin.json", basin),
+    "sweeps.png": ("sweeps.json", sweeps),
+    "error_over_time.png": ("sweeps.json", error_over_time),
+}
+
+
+def main() -> None:
+    """Draw all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=Path("benchmarks/results"))
+    parser.add_argument("--output", type=Path, default=Path("docs/pictures"))
+    options = parser.parse_args()
+    for name, (source, draw) in PICTURES.items():
+        path = options.results / source
+        if path.exists():
+            figure = draw(json.loads(path.read_text())["rows"])
+            FigureCanvasAgg(figure).print_png(str(options.output / name))
+            print(options.output / name)
+
+
+if __name__ == "__main__":
+    main()
