@@ -24,7 +24,6 @@ _FINE_WIDTHS = (0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
 _SCALES = (0.87, 1.0, 1.15)
 _SCALE_SIGMA = 0.2  # of the logarithm: how far the visible parts' sizes may differ
 LARGEST_LOG_SCALE = 0.6
-_BACK = 0.4  # radii from the visible points' centroid to about the middle of the object
 _INDEPENDENT = 40  # of the points of a pair: a surface's errors go together
 _LEAST_RMS = 0.015  # radii: no pair is believed to fit better, bent as surfaces are by calibration errors
 _SAME_ANGLE, _SAME_SHIFT = np.radians(6.0), 0.12  # results closer than this (radian, radii) are one
@@ -42,6 +41,7 @@ class Search:
 NEIGHBOURS = Search(50.0, 17.0)
 ANYWHERE = Search(75.0, 20.0, all_rolls=True)
 NEARBY = Search(20.0, 10.0)
+ROUGHLY = Search(30.0, 12.0)
 NONE = Search(0.0, 1.0)
 
 
@@ -115,21 +115,16 @@ def _starts(source: SurfaceMap, target: SurfaceMap, search: Search, guess: Simil
     turn = rotations(search)
     if guess is not None:
         R = turn @ guess.R
-        pivot = _middle(target)
+        pivot = target.middle
         t = pivot + np.einsum("kij,j->ki", turn, guess.t - pivot)
         return np.full(len(R), guess.scale), R, t
     size = target.radius / source.radius
     parts = []
     for factor in _SCALES:
-        t = _middle(target) - factor * size * turn @ _middle(source)
+        t = target.middle - factor * size * turn @ source.middle
         parts.append((np.full(len(turn), factor * size), turn, t))
     scale, R, t = (np.concatenate(p) for p in zip(*parts, strict=True))
     return scale, R, t
-
-
-def _middle(m: SurfaceMap) -> Float64[ndarray, "3"]:
-    """About the middle of the object, which lies behind what is seen of it."""
-    return m.centroid * (1 + _BACK * m.radius / np.linalg.norm(m.centroid))
 
 
 def _best(

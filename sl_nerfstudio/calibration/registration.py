@@ -16,13 +16,14 @@ from sl_nerfstudio.calibration.pair_registration import (
     ANYWHERE,
     NEARBY,
     NEIGHBOURS,
+    ROUGHLY,
     PairMatch,
     Search,
     agreement_at,
     register_pair,
 )
 from sl_nerfstudio.calibration.similarity_graph import Anchoring, Placement, at, loop_support, place
-from sl_nerfstudio.calibration.starting_poses import starting_similarities
+from sl_nerfstudio.calibration.starting_poses import about_one_middle, starting_similarities
 from sl_nerfstudio.calibration.surface_map import SurfaceMap, surface_map
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.progress import track
@@ -85,10 +86,13 @@ def register(
     rng = np.random.default_rng(seed)
     maps = [surface_map(c) for c in track(clouds, "averaging surfaces")]
     anchoring = Anchoring(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
-    state = _State(maps, anchoring, rng)
+    rough = [None] * len(maps) if start is None else starting_similarities(start, maps)
+    middled = about_one_middle(rough, maps)
+    state = _State(maps, anchoring, rng, middled)
     tell("registering pairs")
     if start is not None:
-        state.pairs_near(starting_similarities(start, maps), _PARTNERS)
+        state.pairs_near(rough, _PARTNERS)
+        state.pairs_near(middled, _PARTNERS)
     elif sequence:
         for gap in _NEIGHBOURS:
             state.try_pairs([(k, k + gap) for k in range(len(maps) - gap)], NEIGHBOURS)
@@ -105,10 +109,17 @@ def register(
 class _State:
     """Pairs tried so far, and what came of them."""
 
-    def __init__(self, maps: list[SurfaceMap], anchoring: Anchoring, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        maps: list[SurfaceMap],
+        anchoring: Anchoring,
+        rng: np.random.Generator,
+        start: Sequence[Similarity | None],
+    ) -> None:
         self.maps = maps
         self.anchoring = anchoring
         self.rng = rng
+        self.start = start  # rough placement of frames where one is known
         self.tried: dict[tuple[int, int], PairMatch | None] = {}
         self.searched: set[tuple[tuple[int, int], Search]] = set()
 
@@ -118,10 +129,13 @@ class _State:
         return [e for e in self.tried.values() if e is not None and e.fitness > _FITNESS and e.agreeing > _AGREEING]
 
     def try_pairs(self, pairs: Sequence[tuple[int, int]], search: Search) -> None:
-        """Register pairs without a guess."""
+        """Register pairs without a guess, or from about where both are known to be."""
         for pair in track([p for p in pairs if (p, search) not in self.searched], "registering pairs"):
             self.searched.add((pair, search))
-            self._keep(pair, register_pair((self.maps[pair[0]], self.maps[pair[1]]), pair, search, self.rng))
+            a, b = self.start[pair[0]], self.start[pair[1]]
+            guess = None if a is None or b is None else b.inverse() @ a
+            how = search if guess is None else ROUGHLY
+            self._keep(pair, register_pair((self.maps[pair[0]], self.maps[pair[1]]), pair, how, self.rng, guess))
 
     def pairs_near(self, S_world_camera: Sequence[Similarity | None], partners: int) -> None:
         """Register pairs that overlap as placed, starting from there."""

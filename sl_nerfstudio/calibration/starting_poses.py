@@ -38,3 +38,20 @@ def starting_similarities(
         T = T_world_camera[k]
         out[k] = Similarity(float(distance / np.linalg.norm(maps[k].centroid)), T[:3, :3], T[:3, 3])
     return out
+
+
+def about_one_middle(
+    S_world_camera: Sequence[Similarity | None], maps: Sequence[SurfaceMap]
+) -> list[Similarity | None]:
+    """The same, each moved until the middles of what the frames see lie in one place.
+
+    A camera that is turned wrongly by a few degrees looks past the object by more than the object's size. Its rotation
+    is still a good start.
+    """
+    middles = [None if S is None else S.points(m.middle[None])[0] for S, m in zip(S_world_camera, maps, strict=True)]
+    known = [p for p in middles if p is not None]
+    centre = np.median(known, axis=0) if known else np.zeros(3)
+    return [
+        None if S is None or p is None else Similarity(S.scale, S.R, S.t + centre - p)
+        for S, p in zip(S_world_camera, middles, strict=True)
+    ]

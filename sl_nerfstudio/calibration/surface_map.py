@@ -17,6 +17,7 @@ _SIDE = 200  # of the map, at most: registration by surfaces needs no more, and 
 _WINDOW = 2  # map pixels around each, of a plane fit
 _LEAST = 8  # pixels in a fit
 _TORN = 0.03  # of the depth: a window that departs more from its plane holds an edge
+_BEHIND = 0.4  # radii from the visible points' centroid to about the middle of the object
 _STEEP = 0.15  # cosine between ray and normal, below which a surface is seen too obliquely
 
 
@@ -38,6 +39,11 @@ class SurfaceMap:
         """fl_x, fl_y, cx, cy, k1, k2, p1, p2 of the map's camera."""
         c = self.camera
         return np.array([c.fl_x, c.fl_y, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2])
+
+    @property
+    def middle(self) -> Float64[ndarray, "3"]:
+        """About the middle of the object, which lies behind what is seen of it."""
+        return self.centroid * (1 + _BEHIND * self.radius / np.linalg.norm(self.centroid))
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
         """Points and normals of about `count` places spread evenly over the image."""

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
 from sl_nerfstudio.calibration.joint_poses import joint_poses
@@ -194,6 +195,20 @@ def test_rough_camera_poses_are_a_start(clouds):
     turn[:3, :3] = _roll(8)
     start[1] = turn @ start[1]
     start[2, :3, 3] *= 1.05
+    found = register([clouds[k] for k in order], start=start)
+    assert found.registered.all()
+    rotation, _, scale = errors_against(rig, found.T_world_camera, found.baseline)
+    assert rotation.max() < 1
+    assert np.abs(scale).max() < 0.02
+
+
+def test_rough_cameras_may_look_past_the_object(clouds):
+    """Each turned by 8 degrees about itself, one to the left and one to the right: nothing overlaps as given."""
+    order = [0, 1, 2, 3]
+    rig = part_of(RIG, order)
+    start = rig.T_world_camera.numpy().copy()
+    for k, sign in enumerate((1, -1, 1, -1)):
+        start[k, :3, :3] = start[k, :3, :3] @ Rotation.from_rotvec([0, sign * np.radians(8), 0]).as_matrix()
     found = register([clouds[k] for k in order], start=start)
     assert found.registered.all()
     rotation, _, scale = errors_against(rig, found.T_world_camera, found.baseline)

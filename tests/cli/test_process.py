@@ -6,8 +6,10 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from sl_nerfstudio.cli.process import main
+from sl_nerfstudio.geometry.se3 import exp_se3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
@@ -133,6 +135,27 @@ def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path
         up = scan.T_world_camera[:, :3, 1]
         assert up[0] @ up[1] > 0.5
         assert up[0] @ up[2] < -0.5  # the third camera stands on its head
+
+
+def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_found(
+    monkeypatch, captures, tmp_path, capsys
+):
+    rng, exact = np.random.default_rng(1), json.loads((captures.root / "intrinsics.json").read_text())
+    rough = [T @ exp_se3(torch.from_numpy(rng.normal(0, [5, 5, 5, 0.05, 0.05, 0.05]))).numpy()
+             for T in captures.T_world_camera]  # 5 mm, 3 degrees  # fmt: skip
+    frames = [{"file_path": f"images/pose {k}.png", "transform_matrix": T.tolist()} for k, T in enumerate(rough)]
+    (tmp_path / "rough.json").write_text(json.dumps({"units": "mm", "frames": frames}))
+    wrong = json.loads(json.dumps(exact))
+    wrong["projector"] |= {key: 1.04 * exact["projector"][key] for key in ("fl_x", "fl_y")}
+    (tmp_path / "wrong.json").write_text(json.dumps(wrong))
+    flags = [*captures.flags[:4], "--intrinsics", tmp_path / "wrong.json", "--poses", tmp_path / "rough.json"]
+    _run(monkeypatch, *flags, "--refine-projector-focal", "--output", tmp_path / "scan", "--jobs", 1)
+    assert "projector's focal length: 0.9" in capsys.readouterr().out
+    scan = read_scan(tmp_path / "scan")
+    assert scan.units == "mm" and scan.scale.source == "given camera poses"
+    assert scan.projector.fl_x == pytest.approx(exact["projector"]["fl_x"], rel=0.01)
+    away = np.linalg.norm(scan.T_world_camera[:, :3, 3] - captures.T_world_camera[:, :3, 3], axis=1)
+    assert away.max() < 15  # as the mean of the rough ones, though no alignment was made here
 
 
 @pytest.mark.parametrize(
