@@ -31,6 +31,7 @@ from sl_nerfstudio.progress import track
 _FITNESS = 0.6  # of a pair, below which it is not believed
 _AGREEING = 0.15
 _UNDECIDED = 0.85  # score of the second best placement, relative to the best
+_DOUBTFUL, _LEAST_TRUST = 0.05, 0.02  # fitness below that of good pairs, and what a pair weighs at least
 _SLACK_DEG = 3.0  # a rotation known worse than this is not known
 _NEIGHBOURS = (1, 2)  # of a sequence: frame n with n + 1 and n + 2
 _OVERLAP = 0.25  # expected share of common surface that makes a pair worth registering
@@ -172,12 +173,10 @@ class _State:
         """The largest group of frames that believed pairs hold together."""
         edges = self.edges
         root = _best_root(edges, len(self.maps))
-        return place(edges, self.anchoring, root, self.strength(edges))
-
-    def strength(self, edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
-        """What a spanning tree should prefer: loops that close, then surfaces that agree without a rival."""
-        support = loop_support(edges, self.anchoring)
-        return np.array([5.0 * s + _worth(e) for s, e in zip(support, edges, strict=True)], dtype=np.float64)
+        trust = trust_in(edges)
+        # A spanning tree should prefer loops that close, then surfaces that agree without a rival.
+        strength = 5 * loop_support(edges, self.anchoring, trust) + np.array([_worth(e) for e in edges])
+        return place(edges, self.anchoring, root, strength, trust)
 
     def bridge(self) -> None:
         """Where groups of frames hang apart, search between them everywhere: one may stand on its head."""
@@ -190,6 +189,20 @@ class _State:
         for k in outside:
             pairs |= {(min(k, m), max(k, m)) for m in sorted(main, key=lambda m: abs(m - k))[:4]}
         self.try_pairs(sorted(pairs), ANYWHERE)
+
+
+def trust_in(edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
+    """What each pair weighs: less where its surfaces agree less than those of the scan's good pairs do.
+
+    On smooth surfaces frames slide: neighbours that are placed wrongly all in the same way support each other in loops,
+    and outnumber the right pairs. But they fit a little worse.
+    """
+    fitness = np.array([e.fitness for e in edges])
+    if not len(fitness):
+        return fitness
+    doubt = np.maximum(np.quantile(fitness, 0.75) - fitness, 0) / _DOUBTFUL
+    undecided = np.array([0.5 if e.rival > _UNDECIDED else 1.0 for e in edges])
+    return np.maximum(np.exp(-(doubt**2)) * undecided, _LEAST_TRUST)
 
 
 def _worth(e: PairMatch) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
@@ -50,17 +50,20 @@ def at(nodes: Sequence[Similarity | None], k: int) -> Similarity:
     return S
 
 
-def loop_support(edges: Sequence[PairMatch], anchoring: Anchoring) -> Int64[ndarray, "edges"]:
-    """For every edge the number of triangles it closes, less those it fails to close."""
+def loop_support(
+    edges: Sequence[PairMatch], anchoring: Anchoring, trust: Float64[ndarray, "edges"]
+) -> Float64[ndarray, "edges"]:
+    """For every edge the number of triangles it closes, less those it fails to close; each as good as its others."""
     by_pair = {frozenset((e.source, e.target)): k for k, e in enumerate(edges)}
-    support = np.zeros(len(edges), dtype=np.int64)
+    support = np.zeros(len(edges))
     for k, e in enumerate(edges):
         for third in {n for pair in by_pair for n in pair} - {e.source, e.target}:
             a, b = by_pair.get(frozenset((e.source, third))), by_pair.get(frozenset((third, e.target)))
             if a is None or b is None:
                 continue
             around = oriented(edges[b], third, e.target) @ oriented(edges[a], e.source, third)
-            support[k] += 1 if _close(around, e.S_target_source, e.target, anchoring) else -1
+            closes = _close(around, e.S_target_source, e.target, anchoring)
+            support[k] += trust[a] * trust[b] * (1 if closes else -1)
     return support
 
 
@@ -78,23 +81,31 @@ def _close(a: Similarity, b: Similarity, target: int, anchoring: Anchoring) -> b
 
 
 def place(
-    edges: Sequence[PairMatch], anchoring: Anchoring, root: int, strength: Float64[ndarray, "edges"]
+    edges: Sequence[PairMatch],
+    anchoring: Anchoring,
+    root: int,
+    strength: Float64[ndarray, "edges"],
+    trust: Float64[ndarray, "edges"],
 ) -> Placement:
     """The spanning tree from `root` that most edges agree with, then all edges together, robustly.
 
-    The root's similarity is the identity.
+    `strength` is what a tree prefers, `trust` what each edge weighs. The root's similarity is the identity.
     """
-    nodes = _best_tree(edges, anchoring, root, strength)
+    nodes = _best_tree(edges, anchoring, root, strength, trust)
     inside = np.array([nodes[e.source] is not None and nodes[e.target] is not None for e in edges], dtype=bool)
     graph = [e for e, here in zip(edges, inside, strict=True) if here]
     chi2 = np.full(len(edges), np.inf)
     if graph:
-        nodes, chi2[inside] = _optimised(graph, nodes, anchoring, root)
+        nodes, chi2[inside] = _optimised(graph, nodes, anchoring, root, trust[inside])
     return Placement(nodes, chi2 < _WRONG * _WIDTH2, chi2)
 
 
 def _best_tree(
-    edges: Sequence[PairMatch], anchoring: Anchoring, root: int, strength: Float64[ndarray, "edges"]
+    edges: Sequence[PairMatch],
+    anchoring: Anchoring,
+    root: int,
+    strength: Float64[ndarray, "edges"],
+    trust: Float64[ndarray, "edges"],
 ) -> list[Similarity | None]:
     """Of the tree of strongest edges and some others, drawn at random with a preference for strong edges, the best."""
     rng = np.random.default_rng(0)
@@ -102,10 +113,10 @@ def _best_tree(
     for attempt in range(_TREES if len(edges) else 0):
         draw = strength if attempt == 0 else strength + rng.gumbel(0, max(float(strength.std()), 1e-3), len(edges))
         nodes = _along_the_tree(edges, len(anchoring.radius), root, draw)
-        graph = [e for e in edges if nodes[e.source] is not None and nodes[e.target] is not None]
-        errors = [_error(e, nodes, anchoring) for e in graph]
-        chi2 = np.array([x @ e.information @ x for x, e in zip(errors, graph, strict=True)])
-        cost = float((chi2 / (chi2 + _WIDEST * _WIDTH2)).sum())
+        graph = [k for k, e in enumerate(edges) if nodes[e.source] is not None and nodes[e.target] is not None]
+        errors = [_error(edges[k], nodes, anchoring) for k in graph]
+        chi2 = np.array([x @ edges[k].information @ x for x, k in zip(errors, graph, strict=True)])
+        cost = float((trust[graph] * chi2 / (chi2 + _WIDEST * _WIDTH2)).sum())
         if cost < least:
             best, least = nodes, cost
     return best
@@ -126,7 +137,11 @@ def _along_the_tree(
 
 
 def _optimised(
-    edges: Sequence[PairMatch], nodes: list[Similarity | None], anchoring: Anchoring, root: int
+    edges: Sequence[PairMatch],
+    nodes: list[Similarity | None],
+    anchoring: Anchoring,
+    root: int,
+    trust: Float64[ndarray, "edges"],
 ) -> tuple[list[Similarity | None], Float64[ndarray, "edges"]]:
     """Gauss-Newton; increments of a node act in its own axes, about its centre."""
     placed = [k for k, S in enumerate(nodes) if S is not None]
@@ -138,8 +153,8 @@ def _optimised(
         errors = np.stack([_error(e, nodes, anchoring) for e in edges])
         chi2 = np.array([x @ e.information @ x for x, e in zip(errors, edges, strict=True)])
         H, g = 1e-9 * np.eye(size), np.zeros(size)
-        for edge, x, c2 in zip(edges, errors, chi2, strict=True):
-            W = edge.information / (1 + c2 / width2) ** 2
+        for edge, x, c2, weight in zip(edges, errors, chi2, trust, strict=True):
+            W = weight * edge.information / (1 + c2 / width2) ** 2
             parts = [(edge.source, _adjoint(edge, anchoring)), (edge.target, -np.eye(7))]
             for a, J_a in parts:
                 if a == root:

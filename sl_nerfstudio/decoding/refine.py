@@ -17,9 +17,11 @@ from scipy.ndimage import find_objects
 from sl_nerfstudio.compiled import compiled
 
 _BLURS = (0.045, 0.1, 0.18)  # of the drawn pattern, periods
-_SMOOTHING = 0.3  # window over which coordinates are taken for linear, periods
+_SMOOTHING = 0.35  # window over which coordinates are taken for linear, periods
 _WINDOW = 0.42  # of the fit, periods
-_ROUNDS = 3
+_LIGHT = 0.38  # window over which the light is taken for even, periods
+_OF_LIGHT = [0, 1, 4, 10, 11]  # moments that contrast and brightness follow from
+_ROUNDS = 4
 _LARGEST_SHIFT = 0.25  # periods, of all rounds together
 _PRIOR = 0.02  # a shift of one period weighs as much as this share of the window's contrast
 _TEAR = 0.35  # periods between neighbouring pixels
@@ -39,6 +41,28 @@ class DrawnGrid:
         """Bilinear look-up at pattern pixels."""
         place = np.nan_to_num(coords) - np.float32(0.5)
         return cv2.remap(self.layers, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@dataclass(frozen=True)
+class Light:
+    """What a pattern value of one adds to a pixel, and what is there without it.
+
+    A line on a surface that darkens to one side would seem shifted to the other, were it compared with an even one.
+    """
+
+    contrast: Float32[ndarray, "h w"]
+    brightness: Float32[ndarray, "h w"]
+
+    @staticmethod
+    def even(shape: tuple[int, ...]) -> "Light":
+        """One everywhere, nothing without the pattern."""
+        return Light(np.ones(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32))
+
+    def on(self, drawn: Float32[ndarray, "h w 3"]) -> Float32[ndarray, "h w 3"]:
+        """The drawn pattern and its derivatives as the image should show them."""
+        lit = drawn * self.contrast[..., None]
+        lit[..., 0] += self.brightness
+        return lit
 
 
 def draw_sharpnesses(picture: Float32[ndarray, "h w"], period: float) -> tuple[DrawnGrid, ...]:
@@ -189,18 +213,19 @@ def _sharpen(
     if not inside.any():
         return np.full_like(coords, np.nan), np.zeros_like(image)
     coords, period = _linear_fit(coords, inside, _SMOOTHING * pixels_a_period), grids[0].period
-    start = coords
-    fits = [_fit_shift(image, coords, inside, grid, pixels_a_period) for grid in grids]
+    start, even = coords, Light.even(image.shape)
+    fits = [_fit_shift(image, coords, inside, grid, even, pixels_a_period) for grid in grids]
     best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
-    shift, agreement = fits[best]
+    shift, agreement, light = fits[best]
     for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)
         if index == 0:  # what is left of the network's noise; smoothing after every round would flatten the surface
             coords = _linear_fit(coords, inside, _SMOOTHING * pixels_a_period)
-        shift, agreement = _fit_shift(image, coords, inside, grids[best], pixels_a_period)
-    return coords, agreement
+        shift, _, _ = _fit_shift(image, coords, inside, grids[best], light, pixels_a_period)
+    # Judged in even light: what the light was bent to explain must not count as agreement.
+    return coords, _fit_shift(image, coords, inside, grids[best], even, pixels_a_period)[1]
 
 
 def _fit_shift(
@@ -208,11 +233,15 @@ def _fit_shift(
     coords: Float32[ndarray, "h w 2"],
     inside: Bool[ndarray, "h w"],
     grid: DrawnGrid,
+    light: Light,
     pixels_a_period: float,
-) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
-    """Shift of the coordinates, in periods, that brings the drawn pattern onto the image; and their correlation."""
+) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"], Light]:
+    """Shift of the coordinates, in periods, that brings the drawn and lit pattern onto the image.
+
+    Also their correlation, and the light that the image shows.
+    """
     h, w = image.shape
-    drawn = grid.at(coords)
+    drawn = light.on(grid.at(coords))
     weight = inside.astype(np.float32)
     p, px, py = (drawn[..., k] * weight for k in range(3))
     i = image * weight
@@ -222,12 +251,13 @@ def _fit_shift(
     step = max(1, round(pixels_a_period / _PLACES))
     size = (-(-w // step), -(-h // step))
     m = np.concatenate([_shrink(products[..., k : k + 4], size, step) for k in range(0, 15, 4)], -1)
-    m = _blur(m, _WINDOW * pixels_a_period / step)
-    shift, agreement = _solve(m)
+    shift, agreement = _solve(_blur(m, _WINDOW * pixels_a_period / step))
+    contrast, brightness = _seen_light(_blur(m[..., _OF_LIGHT], _LIGHT * pixels_a_period / step))
     affine = np.array([[1 / step, 0, 0.5 / step - 0.5], [0, 1 / step, 0.5 / step - 0.5]])
-    back = cv2.warpAffine(np.dstack([shift, agreement]), affine, (w, h), borderMode=cv2.BORDER_REPLICATE,
-                          flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # fmt: skip
-    return back[..., :2], back[..., 2]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    layers = (np.dstack([shift, agreement]), np.dstack([contrast, brightness]))
+    fit, seen = (cv2.warpAffine(x, affine, (w, h), borderMode=cv2.BORDER_REPLICATE, flags=flags) for x in layers)
+    return fit[..., :2], fit[..., 2], Light(seen[..., 0], seen[..., 1])
 
 
 def _shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) -> Float32[ndarray, "a b k"]:
@@ -238,8 +268,17 @@ def _shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) 
     return np.atleast_3d(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
 
 
+def _seen_light(m: Float32[ndarray, "h w 5"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """Contrast and brightness by least squares; the contrast is kept from falling below a part of what is seen."""
+    n = np.maximum(m[..., 0], 1e-6)
+    mp, pp, mi, ip = (m[..., k] / n for k in range(1, 5))
+    variance = np.maximum(pp - mp * mp, 1e-6)
+    contrast = np.maximum((ip - mi * mp) / variance, 0.2)
+    return contrast, mi - contrast * mp
+
+
 def _solve(m: Float32[ndarray, "h w 15"]) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
-    """Least squares for the shift; brightness and contrast are eliminated with the moments."""
+    """Least squares for the shift; brightness and contrast are eliminated with the moments. Also the correlation."""
     n = np.maximum(m[..., 0], 1e-6)
     mp, mx, my, mi = (m[..., k] / n for k in (1, 2, 3, 10))
     pp, xp, yp = m[..., 4] / n - mp * mp, m[..., 5] / n - mp * mx, m[..., 6] / n - mp * my
@@ -257,4 +296,5 @@ def _solve(m: Float32[ndarray, "h w 15"]) -> tuple[Float32[ndarray, "h w 2"], Fl
     contrast = np.maximum(ip / pp, 0.05 * np.sqrt(np.maximum(ii, 0) / pp) + 1e-6)
     shift = np.stack([yy * ix - xy * iy, xx * iy - xy * ix], -1) / (determinant * contrast)[..., None]
     trusted = np.clip(agreement, 0, 1)[..., None]  # where the two do not agree, their difference tells nothing
-    return (np.clip(shift, -0.2, 0.2) * trusted).astype(np.float32), agreement.astype(np.float32)
+    shift = np.clip(shift, -0.2, 0.2) * trusted
+    return shift.astype(np.float32), agreement.astype(np.float32)

@@ -60,7 +60,7 @@ class PointReference:
 
     def distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Distance from the nearest reference point: never below the points' own spacing between them."""
-        return np.asarray(self._tree.query(points)[0], np.float64)
+        return np.asarray(self._tree.query(points, workers=-1)[0], np.float64)
 
     def surface_errors(
         self, result: Surface, S_truth_result: Similarity, points: Float[ndarray, "n 3"]

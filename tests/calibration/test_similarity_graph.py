@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.calibration.pair_registration import PairMatch
+from sl_nerfstudio.calibration.registration import trust_in
 from sl_nerfstudio.calibration.similarity_graph import Anchoring, loop_support, oriented, place
 from sl_nerfstudio.geometry.similarity import Similarity
 
@@ -52,7 +53,7 @@ def largest_error(found, nodes) -> float:
 def test_exact_edges_give_the_exact_placement(seed, n):
     nodes = random_nodes(n, np.random.default_rng(seed))
     edges = [edge(nodes, i, j) for i, j in ring(n)]
-    placement = place(edges, anchoring_of(nodes), 0, np.full(len(edges), 1.0))
+    placement = place(edges, anchoring_of(nodes), 0, *2 * [np.ones(len(edges))])
     assert largest_error(placement.S_world_camera, nodes) < 1e-6
     assert placement.used.all()
 
@@ -64,7 +65,7 @@ def test_closing_loops_averages_errors():
     edges = [edge(nodes, i, j, 0.01, rng) for i, j in ring(12)]
     chain = edges[:11]
     errors = [
-        largest_error(place(some, anchoring_of(nodes), 0, np.full(len(some), 1.0)).S_world_camera, nodes)
+        largest_error(place(some, anchoring_of(nodes), 0, *2 * [np.ones(len(some))]).S_world_camera, nodes)
         for some in (chain, edges)
     ]
     assert errors[1] < 0.6 * errors[0]
@@ -83,19 +84,36 @@ def test_wrong_pairs_are_rejected_and_do_no_harm(wrong):
             edges[k], S_target_source=Similarity(1.1, turn, rng.normal(size=3)) @ edges[k].S_target_source
         )
     anchoring = anchoring_of(nodes)
-    support = loop_support(edges, anchoring)
+    trust = np.ones(len(edges))
+    support = loop_support(edges, anchoring, trust)
     good = np.setdiff1d(np.arange(len(edges)), bad)
     assert support[bad].max() < support[good].max()
-    placement = place(edges, anchoring, 0, support.astype(float))
+    placement = place(edges, anchoring, 0, support, trust)
     assert not placement.used[bad].any()
     assert placement.used[good].all()
     assert largest_error(placement.S_world_camera, nodes) < 0.05
 
 
+def test_a_few_good_pairs_outweigh_many_that_agree_with_each_other_and_fit_worse():
+    """Frames slide on a smooth surface: five pairs put frame 4 to one wrong place, two to the right one."""
+    rng = np.random.default_rng(5)
+    nodes = random_nodes(8, rng)
+    slid = list(nodes)
+    slid[4] = Similarity(1.0, Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix(), np.zeros(3)) @ nodes[4]
+    right = [edge(nodes, i, j, 0.005, rng) for i, j in ring(8) if 4 not in (i, j)]
+    right += [replace(edge(nodes, i, j, 0.005, rng), fitness=0.99) for i, j in ((3, 4), (4, 5))]
+    wrong = [replace(edge(slid, i, j, 0.005, rng), fitness=0.87) for i, j in ((0, 4), (1, 4), (2, 4), (4, 6), (4, 7))]
+    edges, anchoring = right + wrong, anchoring_of(nodes)
+    trust = trust_in(edges)
+    placement = place(edges, anchoring, 0, loop_support(edges, anchoring, trust), trust)
+    assert largest_error(placement.S_world_camera, nodes) < 0.05
+    assert placement.used.tolist() == [True] * len(right) + [False] * len(wrong)
+
+
 def test_frames_without_an_edge_are_not_placed():
     nodes = random_nodes(5, np.random.default_rng(0))
     edges = [edge(nodes, 0, 1), edge(nodes, 1, 2), edge(nodes, 3, 4)]
-    placement = place(edges, anchoring_of(nodes), 0, np.full(3, 1.0))
+    placement = place(edges, anchoring_of(nodes), 0, np.ones(3), np.ones(3))
     assert [S is None for S in placement.S_world_camera] == [False, False, False, True, True]
     assert placement.used.tolist() == [True, True, False]
 
