@@ -7,7 +7,7 @@ everywhere, and joint adjustment makes poses of that.)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -21,6 +21,8 @@ _HALF_WINDOW = 3  # pixels: 7 x 7 windows
 _MIN_PIXELS = 24  # decoded pixels a window must hold
 _DEGENERATE = 1e-3  # of a pivot, left after elimination: the window's pixels lie on a conic
 _MAX_ROUGHNESS = 2.0  # projector pixels: RMS distance of a window's pixels from their paraboloid
+_USUAL_ROUGHNESS = 3.0  # or this many times the median window's: maps may be noisy all over
+_SAMPLED = 200  # windows a frame, for that median
 
 
 @dataclass(frozen=True)
@@ -40,17 +42,19 @@ class CoordinateMaps:
     offsets: Int[Tensor, "frames"]
     widths: Int[Tensor, "frames"]
     heights: Int[Tensor, "frames"]
+    max_roughness: float = _MAX_ROUGHNESS  # projector pixels; rougher windows are torn
 
     @staticmethod
     def of(images: Sequence[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
         """From one image per frame; sizes may differ."""
         sizes = torch.tensor([i.shape[0] * i.shape[1] for i in images])
-        return CoordinateMaps(
+        maps = CoordinateMaps(
             values=torch.cat([i.reshape(-1, 2) for i in images]).float(),
             offsets=torch.cumsum(sizes, 0) - sizes,
             widths=torch.tensor([i.shape[1] for i in images]),
             heights=torch.tensor([i.shape[0] for i in images]),
         )
+        return replace(maps, max_roughness=max(_MAX_ROUGHNESS, _USUAL_ROUGHNESS * maps._median_roughness()))
 
     @property
     def frames(self) -> int:
@@ -76,9 +80,15 @@ class CoordinateMaps:
 
     def look_up(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> MapSample:
         """Fits around positions in the camera images of `frame`; invalid outside the image."""
+        fit, roughness = self._fit(frame, uv_camera)
+        return MapSample(fit[:, 0], fit[:, 1:].transpose(1, 2), roughness < self.max_roughness)
+
+    def _fit(
+        self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]
+    ) -> tuple[Float[Tensor, "n 3 2"], Float[Tensor, "n"]]:
+        """Value and derivatives by x and y, and the window's RMS distance from the paraboloid: infinite where none."""
         n = len(frame)
-        fit = np.zeros((n, 3, 2))
-        valid = np.zeros(n, dtype=np.bool_)
+        fit, roughness = np.zeros((n, 3, 2)), np.full(n, np.inf)
         _fit_paraboloids(
             self.values.numpy(),
             self.offsets.numpy(),
@@ -87,10 +97,18 @@ class CoordinateMaps:
             frame.numpy(),
             uv_camera.detach().double().numpy(),
             fit,
-            valid,
+            roughness,
         )
-        fitted = torch.from_numpy(fit)
-        return MapSample(fitted[:, 0], fitted[:, 1:].transpose(1, 2), torch.from_numpy(valid))
+        return torch.from_numpy(fit), torch.from_numpy(roughness)
+
+    def _median_roughness(self) -> float:
+        """Of windows all over the frames; 0 where nothing is decoded."""
+        generator = torch.Generator().manual_seed(0)
+        drawn = [self.draw(k, _SAMPLED, generator) for k in range(self.frames)]
+        frame = torch.repeat_interleave(torch.arange(self.frames), torch.tensor([len(d) for d in drawn]))
+        _, roughness = self._fit(frame, torch.cat(drawn))
+        found = roughness[torch.isfinite(roughness)]
+        return float(found.median()) if len(found) else 0.0
 
     def decoded_at(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
         """The decoded coordinate of the pixel under each position; NaN outside the image."""
@@ -102,7 +120,7 @@ class CoordinateMaps:
 
 
 @compiled_parallel
-def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, valid):
+def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, roughness):
     """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
     for k in numba.prange(len(frame)):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]
@@ -143,7 +161,7 @@ def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, valid):
         fit[k, :, :] = A[:3, 6:]
         fit[k, 0, 0] += origin_a
         fit[k, 0, 1] += origin_b
-        valid[k] = rough2 < _MAX_ROUGHNESS * _MAX_ROUGHNESS * n
+        roughness[k] = np.sqrt(max(rough2, 0.0) / n)
 
 
 @compiled

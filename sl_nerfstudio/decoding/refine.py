@@ -216,7 +216,7 @@ def _sharpen(
     start, even = coords, Light.even(image.shape)
     fits = [_fit_shift(image, coords, inside, grid, even, pixels_a_period) for grid in grids]
     best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
-    shift, agreement, light = fits[best]
+    shift, _, light = fits[best]
     for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)

@@ -1,5 +1,6 @@
 """Look-ups between pixels: exact where a map is plane, refused where it is torn, undecoded or not there."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -137,3 +138,16 @@ def test_drawn_pixels_are_decoded_spread_out_and_the_same_for_one_seed():
     assert len(few) == 400
     images[0][:] = NAN
     assert maps.__class__.of(images).draw(0, 40, torch.Generator()).shape == (0, 2)
+
+
+def test_maps_that_are_noisy_all_over_are_used_and_their_tears_still_found():
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[:80, :80]
+    image = np.stack([2.0 * x + 0.01 * x * y, 2.0 * y], -1) + rng.normal(0, 2.0, (80, 80, 2))
+    image[:, 40:] += 60  # a tear
+    maps = CoordinateMaps.of([torch.from_numpy(image)])
+    uv = torch.from_numpy(rng.uniform(5, 75, (500, 2)))
+    valid = maps.look_up(torch.zeros(500, dtype=torch.int64), uv).valid
+    torn = (uv[:, 0] - 40).abs() < 2
+    assert valid[(uv[:, 0] - 40).abs() > 5].float().mean() > 0.99
+    assert not valid[torn].any()
