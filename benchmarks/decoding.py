@@ -1,6 +1,6 @@
 """The network decoder on rendered captures of objects that it was not trained on, with exact truth.
 
-python -m benchmarks.decoding [--scenes head frog] [--resolutions 400 800] [--frames 4] [--output results.json]
+python -m benchmarks.decoding [--scenes head frog] [--resolutions 400 800] [--frames 8] [--output results.json]
 """
 
 import json
@@ -50,8 +50,8 @@ class Config:
     """scenes of sl-synth"""
     resolutions: tuple[int, ...] = (400, 800)
     """widths of the images, pixels"""
-    frames: int = 3
-    """captures of each scene and resolution"""
+    frames: int = 8
+    """captures of each scene and resolution, from all around"""
     doe: bool = False
     """a diffractive projector instead of a pinhole"""
     seed: int = 5
