@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 INK, MUTED, GRID = "#1d2733", "#66727f", "#dfe4e9"
 COLOURS = ("#2563a8", "#c2571a", "#3c8d5a", "#7a4fa3", "#8a8f98")
@@ -30,6 +32,11 @@ def panels(count: int, height: float = 3.0) -> tuple[Figure, list[Any]]:
         ax.grid(color=GRID, linewidth=0.7)
         ax.set_axisbelow(True)
     return figure, axes
+
+
+def plain_decades(axis: Axis) -> None:
+    """0.1 in place of a power of ten."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def series(rows: Rows, key: str, value: str) -> tuple[list[float], list[float]]:
@@ -54,8 +61,8 @@ def accuracy(rows: Rows) -> Figure:
     ax.set_xticks(range(len(scenes)), scenes)
     ax.set_yscale("log")
     ax.set_ylabel("rigid RMSE of the surface, mm", color=INK)
-    ax.set_title("bars: median; dots: scans", fontsize=9, color=MUTED)
-    ax.legend(frameon=False)
+    plain_decades(ax.yaxis)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, title="bars: median; dots: each scan")
     return figure
 
 
@@ -67,6 +74,7 @@ def basin(rows: Rows) -> Figure:
         x, y = series([row for row in rows if row["seed"] == seed], "start_deg", "end_deg")
         ax.plot(x, y, "o-", color=COLOURS[k], markersize=4, label=f"seed {seed}")
     ax.set_yscale("log")
+    plain_decades(ax.yaxis)
     ax.set_xlabel("starting poses: camera rotation error, degrees RMS", color=INK)
     ax.set_ylabel("after adjustment, degrees RMS", color=INK)
     ax.legend(frameon=False)
@@ -105,6 +113,8 @@ def error_over_time(rows: Rows) -> Figure:
         ax.plot(*series(some, "training_seconds", "rigid_rmse"), "o-", color=COLOURS[k], markersize=4, label=variant)
     ax.set_xscale("log")
     ax.set_yscale("log")
+    plain_decades(ax.xaxis)
+    plain_decades(ax.yaxis)
     ax.set_xlabel("seconds of ns-train, start and adjustment included", color=INK)
     ax.set_ylabel("rigid RMSE of the surface, mm", color=INK)
     ax.legend(frameon=False)
