@@ -42,7 +42,7 @@ class CoordinateMaps:
     offsets: Int[Tensor, "frames"]
     widths: Int[Tensor, "frames"]
     heights: Int[Tensor, "frames"]
-    max_roughness: float = _MAX_ROUGHNESS  # projector pixels; rougher windows are torn
+    max_roughness: float  # projector pixels; rougher windows are torn
 
     @staticmethod
     def of(images: Sequence[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
@@ -53,6 +53,7 @@ class CoordinateMaps:
             offsets=torch.cumsum(sizes, 0) - sizes,
             widths=torch.tensor([i.shape[1] for i in images]),
             heights=torch.tensor([i.shape[0] for i in images]),
+            max_roughness=_MAX_ROUGHNESS,
         )
         return replace(maps, max_roughness=max(_MAX_ROUGHNESS, _USUAL_ROUGHNESS * maps._median_roughness()))
 

@@ -108,7 +108,7 @@ class ExactMaps(CoordinateMaps):
     def around(rig: Rig, size: int) -> "ExactMaps":
         """Maps that know the true poses."""
         m = CoordinateMaps.of(images_of(rig, size))
-        return ExactMaps(m.values, m.offsets, m.widths, m.heights, rig)
+        return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.max_roughness, rig)
 
     def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
         uv, part = seen(self.rig, frame, uv_camera)
