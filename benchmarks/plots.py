@@ -2,7 +2,7 @@
 
     python -m benchmarks.plots [--results benchmarks/results] [--output docs/pictures]
 
-Every result file that is there gives its picture.
+Every result that is there gives its picture.
 """
 
 import argparse
@@ -107,9 +107,8 @@ def error_over_time(rows: Rows) -> Figure:
     """Surface error against the seconds of the whole training command."""
     figure, (ax,) = panels(1)
     figure.set_size_inches(5.2, 3.4)
-    mine = [row for row in rows if row["sweep"] == "time"]
-    for k, variant in enumerate(dict.fromkeys(row["variant"] for row in mine)):
-        some = [row for row in mine if row["variant"] == variant]
+    for k, variant in enumerate(dict.fromkeys(row["variant"] for row in rows)):
+        some = [row for row in rows if row["variant"] == variant]
         ax.plot(*series(some, "training_seconds", "rigid_rmse"), "o-", color=COLOURS[k], markersize=4, label=variant)
     ax.set_xscale("log")
     ax.set_yscale("log")
@@ -129,6 +128,12 @@ PICTURES: dict[str, tuple[str, Callable[[Rows], Figure]]] = {
 }
 
 
+def rows_of(name: str, rows: Rows) -> Rows:
+    """Those that a picture is about: the sweeps over time have one of their own."""
+    timed = name == "error_over_time.png"
+    return [row for row in rows if (row.get("sweep") == "time") == timed]
+
+
 def main() -> None:
     """Draw all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -137,8 +142,9 @@ def main() -> None:
     options = parser.parse_args()
     for name, (source, draw) in PICTURES.items():
         path = options.results / source
-        if path.exists():
-            figure = draw(json.loads(path.read_text())["rows"])
+        rows = rows_of(name, json.loads(path.read_text())["rows"]) if path.exists() else []
+        if rows:
+            figure = draw(rows)
             FigureCanvasAgg(figure).print_png(str(options.output / name))
             print(options.output / name)
 
