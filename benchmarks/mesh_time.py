@@ -1,23 +1,20 @@
 """Time and memory of surface extraction, beside dense marching cubes over the whole box.
 
-python benchmarks/mesh_time.py [--resolutions 128 256 512 1024] [--load-config RUN/config.yml] [--output results.json]
+python -m benchmarks.mesh_time [--resolutions 128 256 512 1024] [--load-config RUN/config.yml] [--output results.json]
 """
 
-import json
-import platform
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import tyro
 from torch import Tensor
 
+from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.meshing.extract import extract_mesh
 
@@ -131,16 +128,7 @@ def main() -> None:
             flush=True,
         )
     if config.output:
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-        result = {
-            "machine": f"{platform.processor() or platform.machine()}, {platform.system()}",
-            "threads": torch.get_num_threads(),
-            "date": datetime.now(timezone.utc).date().isoformat(),
-            "commit": commit,
-            "rows": [asdict(row) for row in rows],
-        }
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        config.output.write_text(json.dumps(result, indent=2) + "\n")
+        write_rows(config.output, rows, threads=torch.get_num_threads())
 
 
 if __name__ == "__main__":

@@ -1,19 +1,16 @@
 """What classical fusion reaches: Open3D TSDF with initial, ICP-registered and true poses, on scans with truth.
 
-python benchmarks/tsdf_baseline.py SCAN [SCAN ...] [--output results.json]
+python -m benchmarks.tsdf_baseline SCAN [SCAN ...] [--output results.json]
 """
 
-import json
-import platform
-import subprocess
 import time
-from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
@@ -112,15 +109,7 @@ def main() -> None:
                 flush=True,
             )
     if config.output:
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-        result = {
-            "machine": f"{platform.processor() or platform.machine()}, {platform.system()}",
-            "date": datetime.now(timezone.utc).date().isoformat(),
-            "commit": commit,
-            "rows": [asdict(row) for row in rows],
-        }
-        config.output.parent.mkdir(parents=True, exist_ok=True)
-        config.output.write_text(json.dumps(result, indent=2) + "\n")
+        write_rows(config.output, rows)
 
 
 if __name__ == "__main__":

@@ -216,14 +216,14 @@ def _sharpen(
     start, even = coords, Light.even(image.shape)
     fits = [_fit_shift(image, coords, inside, grid, even, pixels_a_period) for grid in grids]
     best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
-    shift, _, light = fits[best]
+    shift, light = fits[best][0], _see_light(image, coords, inside, grids[best], pixels_a_period)
     for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)
         if index == 0:  # what is left of the network's noise; smoothing after every round would flatten the surface
             coords = _linear_fit(coords, inside, _SMOOTHING * pixels_a_period)
-        shift, _, _ = _fit_shift(image, coords, inside, grids[best], light, pixels_a_period)
+        shift, _ = _fit_shift(image, coords, inside, grids[best], light, pixels_a_period)
     # Judged in even light: what the light was bent to explain must not count as agreement.
     return coords, _fit_shift(image, coords, inside, grids[best], even, pixels_a_period)[1]
 
@@ -235,29 +235,55 @@ def _fit_shift(
     grid: DrawnGrid,
     light: Light,
     pixels_a_period: float,
-) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"], Light]:
-    """Shift of the coordinates, in periods, that brings the drawn and lit pattern onto the image.
+) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
+    """Shift of the coordinates, in periods, that brings the drawn and lit pattern onto the image; their correlation."""
+    step = _step(pixels_a_period)
+    m = _moments(image, light.on(grid.at(coords)), inside, step)
+    shift, agreement = _solve(_blur(m, _WINDOW * pixels_a_period / step))
+    fit = _back(np.dstack([shift, agreement]), image.shape, step)
+    return fit[..., :2], fit[..., 2]
 
-    Also their correlation, and the light that the image shows.
-    """
+
+def _see_light(
+    image: Float32[ndarray, "h w"],
+    coords: Float32[ndarray, "h w 2"],
+    inside: Bool[ndarray, "h w"],
+    grid: DrawnGrid,
+    pixels_a_period: float,
+) -> Light:
+    """The light that the image shows where the coordinates are nearly right."""
+    step = _step(pixels_a_period)
+    m = _moments(image, grid.at(coords), inside, step)
+    contrast, brightness = _contrast_and_brightness(_blur(m[..., _OF_LIGHT], _LIGHT * pixels_a_period / step))
+    seen = _back(np.dstack([contrast, brightness]), image.shape, step)
+    return Light(seen[..., 0], seen[..., 1])
+
+
+def _step(pixels_a_period: float) -> int:
+    """Pixels between the places where fits are made."""
+    return max(1, round(pixels_a_period / _PLACES))
+
+
+def _moments(
+    image: Float32[ndarray, "h w"], drawn: Float32[ndarray, "h w 3"], inside: Bool[ndarray, "h w"], step: int
+) -> Float32[ndarray, "a b 15"]:
+    """Products of pattern, its derivatives and image, averaged over squares of `step` pixels."""
     h, w = image.shape
-    drawn = light.on(grid.at(coords))
     weight = inside.astype(np.float32)
     p, px, py = (drawn[..., k] * weight for k in range(3))
     i = image * weight
     products = np.stack(
         [weight, p, px, py, p * p, p * px, p * py, px * px, px * py, py * py, i, i * p, i * px, i * py, i * i], -1
     )
-    step = max(1, round(pixels_a_period / _PLACES))
     size = (-(-w // step), -(-h // step))
-    m = np.concatenate([_shrink(products[..., k : k + 4], size, step) for k in range(0, 15, 4)], -1)
-    shift, agreement = _solve(_blur(m, _WINDOW * pixels_a_period / step))
-    contrast, brightness = _seen_light(_blur(m[..., _OF_LIGHT], _LIGHT * pixels_a_period / step))
+    return np.concatenate([_shrink(products[..., k : k + 4], size, step) for k in range(0, 15, 4)], -1)
+
+
+def _back(stack: Float32[ndarray, "a b k"], shape: tuple[int, ...], step: int) -> Float32[ndarray, "h w k"]:
+    """Bilinear values at the image's pixels of what was found for squares of `step` pixels."""
     affine = np.array([[1 / step, 0, 0.5 / step - 0.5], [0, 1 / step, 0.5 / step - 0.5]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    layers = (np.dstack([shift, agreement]), np.dstack([contrast, brightness]))
-    fit, seen = (cv2.warpAffine(x, affine, (w, h), borderMode=cv2.BORDER_REPLICATE, flags=flags) for x in layers)
-    return fit[..., :2], fit[..., 2], Light(seen[..., 0], seen[..., 1])
+    return cv2.warpAffine(stack, affine, (shape[1], shape[0]), borderMode=cv2.BORDER_REPLICATE, flags=flags)
 
 
 def _shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) -> Float32[ndarray, "a b k"]:
@@ -268,8 +294,8 @@ def _shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) 
     return np.atleast_3d(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
 
 
-def _seen_light(m: Float32[ndarray, "h w 5"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Contrast and brightness by least squares; the contrast is kept from falling below a part of what is seen."""
+def _contrast_and_brightness(m: Float32[ndarray, "h w 5"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """By least squares; the contrast is kept above a fifth of the image's full scale."""
     n = np.maximum(m[..., 0], 1e-6)
     mp, pp, mi, ip = (m[..., k] / n for k in range(1, 5))
     variance = np.maximum(pp - mp * mp, 1e-6)
