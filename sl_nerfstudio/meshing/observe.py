@@ -21,7 +21,8 @@ LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""
 
 OFF_MASK_PX = 3
-"""Farther than this beside the mask, in camera pixels, a vertex that should be lit is none of the object's."""
+"""Farther than this beside the mask, in camera pixels, a vertex that should be lit is none of the object's. Nearer,
+poses and the mask's border may be to blame, and a frame's word against the vertex counts half."""
 
 ENOUGH = 3  # confirmations more than denials: further frames are not asked about the vertex
 
@@ -33,7 +34,17 @@ class Votes:
     confirmed: Int64[ndarray, "v"]  # the decoded coordinate is the one that the vertex predicts
     silent: Int64[ndarray, "v"]  # the pattern falls there, but what was decoded nearby, if anything, proves nothing
     denied: Int64[ndarray, "v"]  # another coordinate was decoded, or the pattern does not fall there although it should
+    beside: Int64[ndarray, "v"]  # the pattern does not fall there, but it does within OFF_MASK_PX
     residual_px: Float[ndarray, "n"]  # median of each frame; NaN where nothing was decoded on the mesh
+
+    @property
+    def against(self) -> Float[ndarray, "v"]:
+        """What speaks against each vertex, in denials.
+
+        Frames that look along a surface cannot tell how far it reaches: at the lower edge of a plate they confirm what
+        lies a pixel below it, which is a millimetre there, while those that face it see the vertex beside the mask.
+        """
+        return self.denied + 0.5 * self.beside
 
 
 class Occluder:
@@ -73,14 +84,14 @@ def collect_votes(
     T_world_projector: Float[ndarray, "n 4 4"],
 ) -> Votes:
     """Ask every frame about every undecided vertex; one frame's mask and coordinates are in memory at a time."""
-    confirmed, silent, denied = (np.zeros(len(mesh.vertices), dtype=np.int64) for _ in range(3))
+    confirmed, silent, denied, beside = (np.zeros(len(mesh.vertices), dtype=np.int64) for _ in range(4))
     normals = mesh.vertex_normals()
     medians: list[float] = []
     # A frame's median must not come from disputed vertices alone: some are asked to the end.
     always = np.arange(len(mesh.vertices)) % 8 == 0
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
-        asked = np.flatnonzero(always | (confirmed - denied < ENOUGH))
+        asked = np.flatnonzero(always | (confirmed - denied - 0.5 * beside < ENOUGH))
         view = look(mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector)
         vertex = asked[view.vertex]
         known = view.most[always[vertex] & np.isfinite(view.most)]
@@ -89,8 +100,9 @@ def collect_votes(
         agrees, differs = view.most <= threshold, (view.least > threshold) | view.off_mask
         confirmed[vertex] += agrees
         denied[vertex] += differs
-        silent[vertex] += ~agrees & ~differs
-    return Votes(confirmed, silent, denied, np.array(medians))
+        beside[vertex] += view.beside
+        silent[vertex] += ~agrees & ~differs & ~view.beside
+    return Votes(confirmed, silent, denied, beside, np.array(medians))
 
 
 @dataclass(frozen=True)
@@ -99,6 +111,7 @@ class View:
 
     vertex: Int64[ndarray, "m"]
     off_mask: Bool[ndarray, "m"]  # the pattern does not fall there, nor within OFF_MASK_PX
+    beside: Bool[ndarray, "m"]  # it does not fall there, but within OFF_MASK_PX
     least: Float[ndarray, "m"]  # distance of the decoded from the predicted coordinate: at least; NaN if not known
     most: Float[ndarray, "m"]  # at most
 
@@ -114,8 +127,7 @@ def look(
 ) -> View:
     """What a frame says about the vertices that it should see and light.
 
-    They face camera and projector, fall inside image and pattern, and the mesh hides them from neither. Those that fall
-    just beside the mask are left out: the mask's border is as uncertain as the poses are.
+    They face camera and projector, fall inside image and pattern, and the mesh hides them from neither.
     """
     vertex = np.arange(len(vertices), dtype=np.int64)
     for T in (T_world_camera, T_world_projector):
@@ -125,18 +137,16 @@ def look(
     uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
     vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
     mask = frame.read_mask()
-    # No margin inside: one pixel of it let the sides of a 6 mm plate grow far beyond their lower edge.
-    on_mask, near_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
-    said = on_mask | ~near_mask
-    vertex, uv_camera, uv_projector, on_mask = vertex[said], uv_camera[said], uv_projector[said], on_mask[said]
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
-        vertex, uv_camera, uv_projector, on_mask = vertex[free], uv_camera[free], uv_projector[free], on_mask[free]
+        vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
+    on_mask, near_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
     jacobian = _jacobian(
         vertices[vertex], normals[vertex], uv_camera, frame.camera, T_world_camera, projector, T_world_projector
     )
     least, most = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
-    return View(vertex, ~on_mask, np.where(on_mask, least, np.nan), np.where(on_mask, most, np.nan))
+    least, most = (np.where(on_mask, distance, np.nan) for distance in (least, most))
+    return View(vertex, ~near_mask, near_mask & ~on_mask, least, most)
 
 
 def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:

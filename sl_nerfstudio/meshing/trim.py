@@ -48,7 +48,8 @@ def trim_to_observed(
 
     A frame observes a vertex that faces its camera and its projector, is hidden from neither, falls inside the mask and
     inside the pattern, and whose predicted pattern coordinate is the decoded one. Frames that decoded another one, or
-    where the pattern should fall on the vertex and does not, speak against it: the majority counts.
+    where the pattern should fall on the vertex and does not, speak against it: the majority counts. Frames that see it
+    just beside their mask have half a voice against it.
     Poses default to the scan's own; give the refined ones, in the order of the frames, if the mesh was made with them.
     Raises UserError if nothing was observed.
     """
@@ -86,8 +87,8 @@ def _observed(votes: Votes) -> Bool[ndarray, "v"]:
     and what falls into masks without ever being confirmed is the invented continuation of a visible side; what little
     real surface is undecoded there is a gap, which `_small_gaps` closes.
     """
-    by_code = (votes.confirmed > 0) & (votes.confirmed >= votes.denied)
-    by_mask = (votes.confirmed == 0) & (votes.silent > votes.denied)
+    by_code = (votes.confirmed > 0) & (votes.confirmed >= votes.against)
+    by_mask = (votes.confirmed == 0) & (votes.silent > votes.against)
     silent, confirmed = int(votes.silent.sum()), int(votes.confirmed.sum())
     return by_code | by_mask if silent > BADLY_DECODED * (silent + confirmed) else by_code
 
