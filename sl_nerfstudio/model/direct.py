@@ -13,7 +13,7 @@ from sl_nerfstudio.geometry.devices import Intrinsics, project_jacobian, unproje
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
-from sl_nerfstudio.model.losses import behind_loss, eikonal_loss, free_space_loss, surface_loss
+from sl_nerfstudio.model.losses import behind_loss, eikonal_loss, facing_loss, free_space_loss, surface_loss
 from sl_nerfstudio.model.sampling import sphere_interval
 from sl_nerfstudio.scan import Scan
 
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel
 
 _GATE = 4.0  # sigmas of the epipolar residual beyond which a decoding counts as wrong
-_BAND = 0.03  # scene units: nearer to the measured surface than this, signs are not asked for
+_BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = 4.0, 0.006, 0.03
+"""Nearer to the measured surface than this, in sigmas of its depth and within bounds in scene units, signs are not asked
+for. A wider band leaves room for a surface that is folded within it, and meets the points with the inside out."""
+_NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # of the points in front, this share within so many bands of the surface
 _WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
 _PER_FRAME = 2000
 
@@ -65,12 +68,11 @@ def direct_losses(model: "SLModel", outputs: dict[str, Any], batch: dict[str, Te
     decoded = batch["decoded"][:, 0]
     o, d = outputs["origins"][decoded], outputs["directions"][decoded]
     T_scene_projector, uv = outputs["T_scene_projector"][decoded], batch["coords"][decoded]
-    depth, weight = _measured(model, o, d, T_scene_projector, uv)
+    depth, sigma, weight = _measured(model, o, d, T_scene_projector, uv)
     p = o + depth[:, None] * d
-    near, _, _ = sphere_interval(o.detach(), d.detach())
     with torch.no_grad():
-        before = near + (depth - _BAND - near).clamp_min(0) * torch.rand_like(depth)
-        after = depth + _BAND * (0.5 + torch.rand_like(depth))
+        near, _, _ = sphere_interval(o, d)
+        before, after = _either_side(near, depth, (_BAND_SIGMAS * sigma).clamp(_LEAST_BAND, _MOST_BAND))
         gap = (depth - before).clamp_min(0)
     inside = (p.detach().norm(dim=-1) < 1) & (weight > 0)
     n = len(p)
@@ -87,17 +89,28 @@ def direct_losses(model: "SLModel", outputs: dict[str, Any], batch: dict[str, Te
         "surface": w.surface * surface_loss(at_surface, counts, width),
         "free_space": w.free_space
         * (
-            free_space_loss(signs[:n][inside], (0.3 * gap[inside]).clamp_max(_BAND))
+            free_space_loss(signs[:n][inside], (0.3 * gap[inside]).clamp_max(_MOST_BAND))
             + 0.3 * behind_loss(signs[n:][inside])
+            + 0.1 * facing_loss(gradient[:n], d.detach(), counts)
         ),
         "eikonal": w.eikonal * eikonal_loss(gradient),
     }
 
 
+def _either_side(
+    near: Float[Tensor, "n"], depth: Float[Tensor, "n"], band: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Random distances along rays: anywhere before the band around a measured depth, and just behind it."""
+    u, v = torch.rand(2, *depth.shape, device=depth.device)
+    anywhere = near + (depth - band - near).clamp_min(0) * u
+    close = (depth - band * (1 + (_NEAR_BANDS - 1) * u)).maximum(near)
+    return torch.where(torch.rand_like(depth) < _NEAR_SHARE, close, anywhere), depth + band * (1 + v)
+
+
 def _measured(
     model: "SLModel", o: Tensor, d: Tensor, T_scene_projector: Tensor, uv: Tensor
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Distance along camera rays at which the projector rays meet them; weight 0 for wrong decodings."""
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Distance along camera rays at which the projector rays meet them, its sigma, and a weight: 0 if decoded wrongly."""
     projector = model.projector
     d_projector = rotate(T_scene_projector, unproject(projector, uv))
     o_projector = T_scene_projector[:, :3, 3]
@@ -111,7 +124,8 @@ def _measured(
         slope = (J * rotate(T, d)[:, None, :]).sum(-1).norm(dim=-1)  # pixels per length
         good = (gap_px < _GATE * model.noise_px) & (depth > 0) & (depth_projector > 0)
         weight = good * (slope / model.px_per_length).clamp(0.1, 2.0)
-    return torch.nan_to_num(depth, nan=1.0), torch.nan_to_num(weight)
+        sigma = model.noise_px / slope.clamp_min(1e-9)
+    return torch.nan_to_num(depth, nan=1.0), torch.nan_to_num(sigma), torch.nan_to_num(weight)
 
 
 def _ball(count: int, like: Tensor) -> Float[Tensor, "n 3"]:

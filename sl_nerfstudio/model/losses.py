@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+_LEAST_DESCENT = 0.05  # cosine between ray and surface normal that even grazing rays have
 
 def coordinate_loss(
     rendered: Float[Tensor, "rays 2"], measured: Float[Tensor, "rays 2"], counts: Bool[Tensor, "rays"]
@@ -46,3 +47,15 @@ def free_space_loss(sdf: Float[Tensor, "n"], at_least: Float[Tensor, "n"]) -> Fl
 def behind_loss(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Mean excess over zero just behind the surface."""
     return sdf.clamp_min(0).mean()
+
+
+def facing_loss(
+    gradient: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"], weight: Float[Tensor, "n"]
+) -> Float[Tensor, ""]:
+    """Weighted mean by which the field rises along rays at points where they meet the surface.
+
+    A camera sees surfaces from outside only. Without this term a narrow valley can end as three sheets, the middle one
+    through the measured points with its inside out: |f| and the Eikonal term have nothing against it.
+    """
+    rise = (gradient * direction).sum(-1)
+    return (weight * (rise + _LEAST_DESCENT).clamp_min(0)).sum() / weight.sum().clamp_min(1e-9)
