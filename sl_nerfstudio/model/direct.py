@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _GATE = 4.0  # sigmas of the epipolar residual beyond which a decoding counts as wrong
 _BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = 4.0, 0.006, 0.03
-"""Nearer to the measured surface than this, in sigmas of its depth and within bounds in scene units, signs are not asked
+"""Nearer to the measured surface than this, in sigmas of its depth and within bounds in scene units, no sign is asked
 for. A wider band leaves room for a surface that is folded within it, and meets the points with the inside out."""
 _NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # of the points in front, this share within so many bands of the surface
 _WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
@@ -110,7 +110,7 @@ def _either_side(
 def _measured(
     model: "SLModel", o: Tensor, d: Tensor, T_scene_projector: Tensor, uv: Tensor
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Distance along camera rays at which the projector rays meet them, its sigma, and a weight: 0 if decoded wrongly."""
+    """Distance along camera rays at which projector rays meet them, its sigma, and a weight: 0 if decoded wrongly."""
     projector = model.projector
     d_projector = rotate(T_scene_projector, unproject(projector, uv))
     o_projector = T_scene_projector[:, :3, 3]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 _LEAST_DESCENT = 0.05  # cosine between ray and surface normal that even grazing rays have
 
+
 def coordinate_loss(
     rendered: Float[Tensor, "rays 2"], measured: Float[Tensor, "rays 2"], counts: Bool[Tensor, "rays"]
 ) -> Float[Tensor, ""]:

@@ -229,6 +229,13 @@ def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
     assert (kept[:, 2] < 0).sum() > 50  # the true sides stay
 
 
+def test_frames_that_look_along_a_side_do_not_say_how_far_it_reaches(tmp_path):
+    """From 80 degrees above, a pixel is 11 mm of an upright side; frames from 15 degrees see its edge to 2 mm."""
+    poses = pairs_around(6, elevation_deg=80) + pairs_around(6, elevation_deg=15)
+    result = trim_to_observed(box(-13.0, 4.0), scan_of(box(-4.0, 4.0), poses, tmp_path / "scan")).mesh
+    assert -4 - 2.5 < result.vertices[:, 2].min() < -2
+
+
 def test_a_floating_piece_that_no_frame_confirms_goes(truth, tmp_path):
     """In front of it nothing was decoded at all, so nothing denies it: but nothing confirms it either."""
     phantom = ball(tuple(58 * TOWARDS_FIRST_CAMERA), 6.0)

@@ -93,6 +93,35 @@ def test_a_field_inside_out_costs_signs_but_no_surface(views):
     assert float(found["free_space"]) > 0.01 and float(found["surface"]) < 1e-9
 
 
+class Folded(Sphere):
+    """Three sheets, `half` apart: the middle one at the sphere, inside out; slope one everywhere, and no sign wrong
+    farther than `half` from the sphere."""
+
+    def __init__(self, half: float) -> None:
+        super().__init__()
+        self.half = half
+
+    def _fold(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        x = super().sdf(p)
+        return x, x.abs() < 0.5 * self.half
+
+    def sdf(self, p: Tensor) -> Tensor:
+        x, middle = self._fold(p)
+        return torch.where(middle, -x, x - self.half * x.sign())
+
+    def sdf_and_gradient(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        _, middle = self._fold(p)
+        slope = torch.where(middle, -1.0, 1.0)[:, None] * p / p.norm(dim=-1, keepdim=True)
+        return self.sdf(p), slope
+
+
+@pytest.mark.parametrize("half", [0.002, 0.01, 0.02])
+def test_a_surface_that_is_folded_about_the_measured_points_costs_signs(views, half):
+    found = losses(Folded(half), *views)
+    assert float(found["surface"]) < 1e-9 and float(found["eikonal"]) < 1e-9
+    assert float(found["free_space"]) > 0.05
+
+
 def test_wrong_and_missing_decodings_do_not_count(views):
     outputs, batch = views
     coords, decoded = batch["coords"].clone(), batch["decoded"].clone()

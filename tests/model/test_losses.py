@@ -7,6 +7,7 @@ from sl_nerfstudio.model.losses import (
     behind_loss,
     coordinate_loss,
     eikonal_loss,
+    facing_loss,
     free_space_loss,
     pattern_loss,
     surface_loss,
@@ -80,3 +81,12 @@ def test_signs_on_the_way_and_behind():
     assert float(free_space_loss(sdf, least)) == pytest.approx((0 + 0.1 + 0.3) / 3)
     assert float(behind_loss(sdf)) == pytest.approx(0.6 / 3)
     assert float(behind_loss(-sdf.abs())) == 0
+
+
+def test_a_surface_may_be_grazed_but_not_seen_from_inside():
+    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(4, 3)
+    gradient = torch.tensor([[0.0, 0, -1], [1, 0, -0.05], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    weight = torch.tensor([1.0, 1.0, 2.0, 1.0], dtype=torch.float64)
+    assert float(facing_loss(gradient, direction, weight)) == pytest.approx((2 * 0.05 + 1.05) / 5)
+    assert float(facing_loss(gradient[:2], direction[:2], weight[:2])) == pytest.approx(0, abs=1e-12)
+    assert float(facing_loss(gradient, direction, 0 * weight)) == 0
