@@ -1,4 +1,4 @@
-"""Draws the curves of the documentation from benchmarks/results: accuracy, basin, sweeps.
+"""Draws the curves of the documentation from benchmarks/results: accuracy, ablation, basin, sweeps.
 
     python -m benchmarks.plots [--results benchmarks/results] [--output docs/pictures]
 
@@ -66,6 +66,28 @@ def accuracy(rows: Rows) -> Figure:
     return figure
 
 
+def ablation(rows: Rows) -> Figure:
+    """How many times the whole method's surface error each part left out makes, on the same scan."""
+    whole = {(row["scene"], row["seed"]): row["rigid_rmse"] for row in rows if row["variant"] == "refined"}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    shown = [v for v in dict.fromkeys(row["variant"] for row in rows) if v != "refined"]
+    figure, (ax,) = panels(1)
+    figure.set_size_inches(6.4, 0.42 * len(shown) + 1.4)
+    for k, scene in enumerate(scenes):
+        mine = [row for row in rows if row["scene"] == scene and row["variant"] in shown]
+        times = [row["rigid_rmse"] / whole[scene, row["seed"]] for row in mine]
+        at = [shown.index(row["variant"]) + (k - (len(scenes) - 1) / 2) * 0.22 for row in mine]
+        ax.plot(times, at, "o", color=COLOURS[k], markersize=5, label=scene)
+    ax.axvline(1, color=MUTED, linewidth=1)
+    ax.set_yticks(range(len(shown)), shown)
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    plain_decades(ax.xaxis)
+    ax.set_xlabel("surface error (rigid RMSE), times that of the whole method", color=INK)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
 def basin(rows: Rows) -> Figure:
     """Camera rotation before and after joint adjustment."""
     figure, (ax,) = panels(1)
@@ -122,6 +144,7 @@ def error_over_time(rows: Rows) -> Figure:
 
 PICTURES: dict[str, tuple[str, Callable[[Rows], Figure]]] = {
     "accuracy.png": ("accuracy.json", accuracy),
+    "ablation.png": ("ablation.json", ablation),
     "basin.png": ("basin.json", basin),
     "sweeps.png": ("sweeps.json", sweeps),
     "error_over_time.png": ("sweeps.json", error_over_time),

@@ -295,11 +295,14 @@ def _shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) 
 
 
 def _contrast_and_brightness(m: Float32[ndarray, "h w 5"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """By least squares; the contrast is kept above a fifth of the image's full scale."""
+    """By least squares; the contrast is kept above a quarter of that of the image's well lit parts."""
     n = np.maximum(m[..., 0], 1e-6)
     mp, pp, mi, ip = (m[..., k] / n for k in range(1, 5))
     variance = np.maximum(pp - mp * mp, 1e-6)
-    contrast = np.maximum((ip - mi * mp) / variance, 0.2)
+    contrast = (ip - mi * mp) / variance
+    seen = contrast[m[..., 0] > 0.5]
+    floor = 0.25 * float(np.quantile(seen, 0.9)) if len(seen) else 0.0
+    contrast = np.maximum(contrast, max(floor, 1e-3))
     return contrast, mi - contrast * mp
 
 

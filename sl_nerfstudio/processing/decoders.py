@@ -14,7 +14,7 @@ from sl_nerfstudio.scan.images import read_image
 
 DecoderName = Literal["network", "graycode"]
 Layout = GridPattern | GrayCode
-_VERSION = {"network": 2, "graycode": 1}  # raised when a decoder comes to other results
+_VERSION = {"network": 3, "graycode": 1}  # raised when a decoder comes to other results
 
 
 def decoder_for(layout: Layout, asked: DecoderName | None, path: Path) -> DecoderName:

@@ -42,6 +42,16 @@ def test_errors_of_the_network_are_taken_out(pixels, blur, noise, bound):
     assert np.median(agreement) > (0.9 if noise < 0.02 else 0.6)
 
 
+def test_a_dark_photograph_is_sharpened_as_a_bright_one():
+    """Lit to one side by twice as much as to the other, and exposed by a fifth of the light."""
+    truth = surface(14)
+    image = photograph(truth, 0.8, 0.002, np.random.default_rng(0))
+    grids = draw_sharpnesses(GRID.render(), 20.0)
+    bright, _ = refine(image, truth + np.float32(0.4), grids, 14.0)
+    dark, _ = refine(image / 5, truth + np.float32(0.4), grids, 14.0)
+    assert np.nanmax(np.abs(bright - dark)) < 0.02
+
+
 def test_what_shows_another_part_of_the_pattern_does_not_agree():
     truth = surface(14)
     image = photograph(truth, 0.6, 0.01, np.random.default_rng(0))
