@@ -111,7 +111,7 @@ def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
     from rich.table import Table
 
     console = Console()
-    units = evaluation.units
+    units = evaluation.truth_units
     if evaluation.surface:
         table = Table(title=f"Distances in {units}", title_justify="left")
         for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):

@@ -37,7 +37,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything `sl-eval` finds; lengths in `units`."""
+    """Everything `sl-eval` finds; lengths in `units`, distances from the truth in `truth_units`."""
 
     units: str
     fit: Fit
@@ -46,6 +46,11 @@ class Evaluation:
     pose_errors: PoseErrors | None  # of the poses that were evaluated
     initial_pose_errors: PoseErrors | None  # of the scan's own poses, where they are others
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
+
+    @property
+    def truth_units(self) -> str:
+        """Unit of distances from the truth: an alignment with scale brings a scan of unknown unit to the truth's."""
+        return "units of the truth" if self.units == "arbitrary" else self.units
 
     @property
     def alignment(self) -> str:

@@ -71,6 +71,7 @@ def render_report(report: ReportInput) -> str:
         scan=scan,
         fit=evaluation.fit,
         units=evaluation.units,
+        truth_units=evaluation.truth_units,
         verdict=judge(evaluation),
         surface=_surface_pictures(report, surface),
         comparisons=comparisons,
@@ -91,15 +92,14 @@ def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
     values, scale = _errors(report, surface, surface.vertices)
     colours = None if values is None or scale is None else scale(values)
     views = views_of(report.poses.T_world_camera, surface.centre)
-    figure = mesh_figure(
-        report.mesh, values, scale, report.evaluation.units, report.poses.T_world_camera, report.poses.T_world_projector
-    )
+    units = report.evaluation.truth_units
+    figure = mesh_figure(report.mesh, values, scale, units, report.poses.T_world_camera, report.poses.T_world_projector)
     histogram = ""
     if scale is not None:
         errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])
         if errors is not None:
             title = "Signed distance of the surface from the reference"
-            histogram = charts.histogram(title, report.evaluation.units, errors, scale.lower, scale.upper)
+            histogram = charts.histogram(title, units, errors, scale.lower, scale.upper)
     return SurfacePictures([data_uri(render(surface, v, colours)) for v in views], figure, scale, histogram)
 
 

@@ -13,9 +13,11 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
     """Plain dict for `json.dump`: figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
-    errors of the evaluated poses and `initial` those of the scan's own; `fit` is always there.
+    errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`; `fit` is always there.
     """
     out: dict[str, Any] = {"format": 1, "units": evaluation.units}
+    if evaluation.reference is not None or evaluation.pose_errors is not None:
+        out["truth_units"] = evaluation.truth_units
     if evaluation.reference is not None:
         out["reference"] = evaluation.reference.description
     for name, score in evaluation.surface.items():

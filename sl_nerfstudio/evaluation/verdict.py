@@ -103,7 +103,7 @@ def _accuracy(evaluation: Evaluation) -> Check:
     way = "of the surface from the truth" if exact else "of the reference points from the surface"
     return _check(
         "Accuracy" if exact else "Distance from reference", percent,
-        f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.units})", 0.25, 1.0,
+        f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.truth_units})", 0.25, 1.0,
         "≤ {} %", f"RMS distance {way} after {ALIGNED[evaluation.alignment]}, in percent of the size of the reference.",
         "see where the error colours are strong: all over means poses or scale, patches mean too few frames there",
     )  # fmt: skip

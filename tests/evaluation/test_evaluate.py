@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_
 def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
     content = to_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan()))
     assert json.loads(json.dumps(content, allow_nan=False)) == content
-    assert content["units"] == "mm"
+    assert content["units"] == content["truth_units"] == "mm"
     for name in ("rigid", "similarity", "none"):
         block = content[name]
         for distances in ("accuracy", "completeness"):
@@ -71,6 +72,20 @@ def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
     for device in ("camera", "projector"):
         assert set(content[device]) >= {"translation_rmse", "rotation_rmse_deg"}
     assert set(content["fit"]) >= {"coordinate_px_median", "epipolar_px_median", "pattern_cosine", "frames"}
+
+
+def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path) -> None:
+    """A result that is 60 times too small and off by 1 % of its size: by half a millimetre, says the truth."""
+    made, scan = FacetedScan(), replace(read_scan(clean_scan), units="arbitrary")
+    S = Similarity(1 / 60, np.eye(3), np.zeros(3))
+    vertices = made.truth().vertices
+    poses = Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
+    noisy = Mesh(vertices + np.random.default_rng(0).normal(0, 0.5, vertices.shape), made.truth().faces)
+    reference = mesh_reference(made.truth(), scan, Poses(*made.true_poses()), SAMPLES)
+    content = to_json(evaluate(noisy.mapped(S), scan, poses, reference, Poses(*made.true_poses()), samples=SAMPLES))
+    assert (content["units"], content["truth_units"]) == ("arbitrary", "units of the truth")
+    assert 0.1 < content["similarity"]["accuracy"]["rmse"] < 1.0
+    assert content["camera"]["translation_rmse"] < 1e-6
 
 
 def test_without_truth_only_the_fit_is_there(clean_scan: Path) -> None:

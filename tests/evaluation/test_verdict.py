@@ -49,4 +49,6 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
 
 def test_without_a_unit_the_scale_is_no_error() -> None:
     assert GOOD.alignment == "rigid"
-    assert replace(GOOD, units="arbitrary").alignment == "similarity"
+    unknown = replace(GOOD, units="arbitrary")
+    assert unknown.alignment == "similarity"
+    assert (GOOD.truth_units, unknown.truth_units) == ("mm", "units of the truth")
