@@ -61,7 +61,7 @@ def trim_to_observed(
         # What stands in front of the object without being there hid the object itself: look again without it.
         without = _without(mesh, denied, _observed(votes))
         if len(without.faces):
-            votes = collect_votes(mesh, Occluder(without), scan, T_camera, T_projector)
+            votes = collect_votes(mesh, Occluder(without), scan, T_camera, T_projector, before=votes)
     observed = _observed(votes)
     seen = votes.confirmed + votes.silent + votes.denied > 0
     if observed.sum() < _LEAST_SHARE * seen.sum() or not observed[mesh.faces].all(1).any():
