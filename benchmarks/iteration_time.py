@@ -10,7 +10,6 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads sleep: they would slow down whoever is measured next
 
 import json
-import platform
 import re
 import resource
 import statistics
@@ -18,13 +17,13 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 
 import torch
 import tyro
 
 from benchmarks.iteration_step import SIZES, VARIANTS
+from benchmarks.machine import describe
 from benchmarks.roofline import Floor, Machine, floor_of, measure_machine
 
 
@@ -109,26 +108,6 @@ def report(rows: list[Row], floor: Floor, machine: Machine) -> str:
     return "\n".join(lines)
 
 
-def _description(threads: int) -> dict[str, object]:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
-    return {
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "commit": commit.stdout.strip(),
-        "machine": names[0] if names else platform.processor(),
-        "cores": os.cpu_count(),
-        "threads": threads,
-        "load": os.getloadavg(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def _cpuinfo() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text().splitlines() if path.is_file() else []
-
-
 def main(config: Config) -> None:
     """Measure, print, write."""
     threads = config.threads or os.cpu_count() or 1
@@ -139,7 +118,7 @@ def main(config: Config) -> None:
             job.step()
         print(_peak_memory_mb())
         return
-    result: dict[str, object] = _description(threads)
+    result: dict[str, object] = {**describe(), "threads": threads, "load": os.getloadavg()}
     for size in config.sizes:
         rows = measure(size, config.rounds, threads)
         machine = measure_machine()

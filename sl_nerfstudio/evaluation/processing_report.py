@@ -7,6 +7,7 @@ from datetime import datetime
 
 from sl_nerfstudio.evaluation import charts
 from sl_nerfstudio.evaluation.overlap_graph import draw_overlaps
+from sl_nerfstudio.evaluation.pages import page
 from sl_nerfstudio.evaluation.pictures import data_uri
 from sl_nerfstudio.processing.advice import first_line
 from sl_nerfstudio.processing.preview import Preview
@@ -27,24 +28,18 @@ class FrameRow:
 
 def render_processing_report(result: ProcessResult, previews: Sequence[Preview]) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("sl_nerfstudio.evaluation"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"figure": _figure, "percent": _percent, "first_line": first_line}
     rows = [FrameRow(record, *_pictures(preview)) for record, preview in zip(result.frames, previews, strict=True)]
-    return environment.get_template(_TEMPLATE).render(
-        result=result,
-        rows=rows,
-        band=_band(result),
-        sentence=_sentence(result),
-        charts=_charts(result),
-        overlaps=draw_overlaps(result.frames, result.edges) if result.edges else "",
-        settings=sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
-        made_at=datetime.now(),
-    )
+    values = {
+        "result": result,
+        "rows": rows,
+        "band": _band(result),
+        "sentence": _sentence(result),
+        "charts": _charts(result),
+        "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
+        "settings": sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
+        "made_at": datetime.now(),
+    }
+    return page(_TEMPLATE, {"figure": _figure, "percent": _percent, "first_line": first_line}, values)
 
 
 def _band(result: ProcessResult) -> str:

@@ -12,6 +12,7 @@ from numpy import ndarray
 from sl_nerfstudio.evaluation import charts
 from sl_nerfstudio.evaluation.comparisons import Comparison, compare_frames
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Poses
+from sl_nerfstudio.evaluation.pages import page
 from sl_nerfstudio.evaluation.pictures import ColourScale, data_uri, render, views_of
 from sl_nerfstudio.evaluation.plot3d import compressed_script, mesh_figure
 from sl_nerfstudio.evaluation.poses import PoseErrors, compare_poses
@@ -53,39 +54,33 @@ class SurfacePictures:
 
 def render_report(report: ReportInput) -> str:
     """The page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("sl_nerfstudio.evaluation"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"number": _number, "percent": _percent, "fixed": _fixed}
     evaluation, scan = report.evaluation, report.scan
     surface = Surface(report.mesh)
     comparisons: list[Comparison] = compare_frames(
         surface, scan, evaluation.fit, report.poses.T_world_camera, report.poses.T_world_projector
     )
-    return environment.get_template(_TEMPLATE).render(
-        report=report,
-        evaluation=evaluation,
-        scan=scan,
-        fit=evaluation.fit,
-        units=evaluation.units,
-        truth_units=evaluation.truth_units,
-        verdict=judge(evaluation),
-        surface=_surface_pictures(report, surface),
-        comparisons=comparisons,
-        coordinate_scale=COORDINATE,
-        epipolar_scale=EPIPOLAR,
-        pattern_scale=PATTERN,
-        fit_chart=_fit_chart(evaluation),
-        outliers=_outliers(evaluation),
-        changes=_pose_changes(report),
-        truth=_truth_rows(evaluation),
-        training=_training(report.training),
-        summary=_summary(report),
-        plotly=compressed_script(),
-    )
+    values = {
+        "report": report,
+        "evaluation": evaluation,
+        "scan": scan,
+        "fit": evaluation.fit,
+        "units": evaluation.units,
+        "truth_units": evaluation.truth_units,
+        "verdict": judge(evaluation),
+        "surface": _surface_pictures(report, surface),
+        "comparisons": comparisons,
+        "coordinate_scale": COORDINATE,
+        "epipolar_scale": EPIPOLAR,
+        "pattern_scale": PATTERN,
+        "fit_chart": _fit_chart(evaluation),
+        "outliers": _outliers(evaluation),
+        "changes": _pose_changes(report),
+        "truth": _truth_rows(evaluation),
+        "training": _training(report.training),
+        "summary": _summary(report),
+        "plotly": compressed_script(),
+    }
+    return page(_TEMPLATE, {"number": _number, "percent": _percent, "fixed": _fixed}, values)
 
 
 def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
