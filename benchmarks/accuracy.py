@@ -82,7 +82,7 @@ def main() -> None:
             folder = options.folder / f"{scene}-{seed}"
             folder.mkdir()
             rows += measure(scene, seed, options.iterations, folder, options.variants)
-            write_rows(options.output, rows)
+            write_rows(options.output, rows, iterations=options.iterations)
 
 
 if __name__ == "__main__":

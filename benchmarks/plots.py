@@ -19,6 +19,7 @@ from matplotlib.ticker import FuncFormatter
 
 INK, MUTED, GRID = "#1d2733", "#66727f", "#dfe4e9"
 COLOURS = ("#2563a8", "#c2571a", "#3c8d5a", "#7a4fa3", "#8a8f98")
+FUSION = "fusion after ICP"
 Rows = list[dict[str, Any]]
 
 
@@ -46,8 +47,8 @@ def series(rows: Rows, key: str, value: str) -> tuple[list[float], list[float]]:
 
 
 def accuracy(rows: Rows) -> Figure:
-    """Surface error of every scene: refined and unrefined poses against the oracle's."""
-    shown = [v for v in ("refined", "oracle", "unrefined") if any(row["variant"] == v for row in rows)]
+    """Surface error of every scene: refined poses, true ones (oracle), and fusion."""
+    shown = [v for v in ("refined", "oracle", "unrefined", FUSION) if any(row["variant"] == v for row in rows)]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, (ax,) = panels(1)
     figure.set_size_inches(5.2, 3.2)
@@ -151,8 +152,20 @@ PICTURES: dict[str, tuple[str, Callable[[Rows], Figure]]] = {
 }
 
 
-def rows_of(name: str, rows: Rows) -> Rows:
-    """Those that a picture is about: the sweeps over time have one of their own."""
+def read_rows(path: Path) -> Rows:
+    """The rows of a result file; none if it is not there."""
+    return json.loads(path.read_text())["rows"] if path.exists() else []
+
+
+def rows_of(name: str, source: Path) -> Rows:
+    """What a picture is about: the sweeps over time have one of their own, fusion stands beside our surfaces."""
+    rows = read_rows(source)
+    if name == "accuracy.png":
+        fused = [row for row in read_rows(source.parent / "tsdf_baseline.json") if row["poses"] == "registered"]
+        rows += [
+            {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]}
+            for row in fused
+        ]
     timed = name == "error_over_time.png"
     return [row for row in rows if (row.get("sweep") == "time") == timed]
 
@@ -164,8 +177,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("docs/pictures"))
     options = parser.parse_args()
     for name, (source, draw) in PICTURES.items():
-        path = options.results / source
-        rows = rows_of(name, json.loads(path.read_text())["rows"]) if path.exists() else []
+        rows = rows_of(name, options.results / source)
         if rows:
             figure = draw(rows)
             FigureCanvasAgg(figure).print_png(str(options.output / name))
