@@ -23,8 +23,8 @@ SYNTH = {
 }
 TIME = {
     "sl-neus": ("sl-neus", (), (100, 200, 400, 1000)),
-    "oracle": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 200, 400, 1000)),
-    "unrefined": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400, 1000)),
+    "oracle": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400, 1000)),
+    "unrefined": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400)),
     "sl-neus-paper": ("sl-neus-paper", (), (100, 300, 1000)),
 }
 SWEEPS = (*SYNTH, "time")
