@@ -124,8 +124,8 @@ def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
         console.print(table)
     rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
     if any(errors for _, errors in rows):
-        table = Table(title="Pose errors, RMS", title_justify="left")
-        for column in ("", f"camera {units}", "deg", f"projector {units}", "deg", "scale"):
+        table = Table(title=f"Pose errors, RMS, in {units}", title_justify="left")
+        for column in ("", "camera", "deg", "projector", "deg", "scale"):
             table.add_column(column, justify="right" if column else "left")
         for name, errors in rows:
             if errors is not None:
