@@ -143,31 +143,31 @@ def error_over_time(rows: Rows) -> Figure:
     return figure
 
 
-PICTURES: dict[str, tuple[str, Callable[[Rows], Figure]]] = {
-    "accuracy.png": ("accuracy.json", accuracy),
-    "ablation.png": ("ablation.json", ablation),
-    "basin.png": ("basin.json", basin),
-    "sweeps.png": ("sweeps.json", sweeps),
-    "error_over_time.png": ("sweeps.json", error_over_time),
-}
-
-
 def read_rows(path: Path) -> Rows:
     """The rows of a result file; none if it is not there."""
     return json.loads(path.read_text())["rows"] if path.exists() else []
 
 
-def rows_of(name: str, source: Path) -> Rows:
-    """What a picture is about: the sweeps over time have one of their own, fusion stands beside our surfaces."""
-    rows = read_rows(source)
-    if name == "accuracy.png":
-        fused = [row for row in read_rows(source.parent / "tsdf_baseline.json") if row["poses"] == "registered"]
-        rows += [
-            {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]}
-            for row in fused
-        ]
-    timed = name == "error_over_time.png"
-    return [row for row in rows if (row.get("sweep") == "time") == timed]
+def accuracy_rows(results: Path) -> Rows:
+    """Our surfaces, and beside them those of fusion on the same scans."""
+    fused = [row for row in read_rows(results / "tsdf_baseline.json") if row["poses"] == "registered"]
+    return read_rows(results / "accuracy.json") + [
+        {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]} for row in fused
+    ]
+
+
+def sweep_rows(results: Path, timed: bool) -> Rows:
+    """The sweeps over time, or all others."""
+    return [row for row in read_rows(results / "sweeps.json") if (row["sweep"] == "time") == timed]
+
+
+PICTURES: dict[str, tuple[Callable[[Path], Rows], Callable[[Rows], Figure]]] = {
+    "accuracy.png": (accuracy_rows, accuracy),
+    "ablation.png": (lambda results: read_rows(results / "ablation.json"), ablation),
+    "basin.png": (lambda results: read_rows(results / "basin.json"), basin),
+    "sweeps.png": (lambda results: sweep_rows(results, timed=False), sweeps),
+    "error_over_time.png": (lambda results: sweep_rows(results, timed=True), error_over_time),
+}
 
 
 def main() -> None:
@@ -176,8 +176,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results"))
     parser.add_argument("--output", type=Path, default=Path("docs/pictures"))
     options = parser.parse_args()
-    for name, (source, draw) in PICTURES.items():
-        rows = rows_of(name, options.results / source)
+    for name, (read, draw) in PICTURES.items():
+        rows = read(options.results)
         if rows:
             figure = draw(rows)
             FigureCanvasAgg(figure).print_png(str(options.output / name))

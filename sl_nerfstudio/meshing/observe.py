@@ -99,7 +99,7 @@ def collect_votes(
     medians: list[float] = []
     # A frame's median must not come from disputed vertices alone: some are asked to the end.
     always = np.arange(len(mesh.vertices)) % 8 == 0
-    counts = np.ones(len(always), dtype=bool) if before is None else ~before.settled
+    still_open = ~votes.settled
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
         asked = np.flatnonzero(always | ~votes.settled)
@@ -109,7 +109,7 @@ def collect_votes(
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
         agrees, differs = view.most <= threshold, (view.least > threshold) | view.off_mask
-        new = counts[vertex]
+        new = still_open[vertex]
         confirmed[vertex] += new & agrees
         denied[vertex] += new & differs
         beside[vertex] += new & view.beside
@@ -165,12 +165,12 @@ def look(
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
         vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
     on_mask, near_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
+    least, most = np.full((2, len(vertex)), np.nan)
+    lit, uv_camera, uv_projector = vertex[on_mask], uv_camera[on_mask], uv_projector[on_mask]
     jacobian = _jacobian(
-        vertices[vertex], normals[vertex], uv_camera, uv_projector, frame.camera, T_world_camera, projector,
-        T_world_projector,
-    )  # fmt: skip
-    least, most = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
-    least, most = (np.where(on_mask, distance, np.nan) for distance in (least, most))
+        vertices[lit], normals[lit], uv_camera, uv_projector, frame.camera, T_world_camera, projector, T_world_projector
+    )
+    least[on_mask], most[on_mask] = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
     return View(vertex, ~near_mask, near_mask & ~on_mask, least, most)
 
 
