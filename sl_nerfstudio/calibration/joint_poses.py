@@ -11,7 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adjust
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud
-from sl_nerfstudio.calibration.gauge import restore
+from sl_nerfstudio.calibration.gauge import baseline_scale, restore
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.calibration.posterior import frame_sigmas
@@ -84,7 +84,7 @@ def joint_poses(
     maps = CoordinateMaps.of([torch.from_numpy(clouds[k].coords) for k in index])
     prior = _prior(clouds, registration, index, S_scene_world.scale)
     found = adjust(start, maps, prior, "free", settings or AdjustmentSettings())
-    rig = restore(start, found.rig, None)
+    rig = restore(start, found.rig, baseline_scale(start, found.rig, None))
     S_world_scene = S_scene_world.inverse()
     n = len(clouds)
     T_camera, T_projector = np.full((n, 4, 4), np.nan), np.full((n, 4, 4), np.nan)

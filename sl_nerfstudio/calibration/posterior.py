@@ -14,6 +14,7 @@ from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.calibration.gauge import gauge_directions
 from sl_nerfstudio.calibration.kernel import Kernel
 from sl_nerfstudio.calibration.linearisation import (
     Anchors,
@@ -121,16 +122,6 @@ def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndar
     """RMS per axis: frame translation (scene units times `unit`), frame rotation (degree), the same relative."""
     parts = sigma.reshape(-1, 4, 3).pow(2).mean(-1).sqrt().cpu().numpy()
     return parts * np.array([unit, 180 / np.pi, unit, 180 / np.pi])
-
-
-def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
-    """Increments that move the whole scene by a similarity: no residual feels them."""
-    n = rig.frames
-    out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
-    out[0, :, :, :6] = torch.eye(6, dtype=torch.float64)
-    out[0, :, :3, 6] = rig.T_world_camera[:, :3, 3]
-    out[1, :, :3, 6] = rig.T_camera_projector[:, :3, 3]
-    return out.reshape(12 * n, 7)
 
 
 def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:

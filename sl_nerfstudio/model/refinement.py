@@ -13,7 +13,7 @@ from sl_nerfstudio.calibration.bundle_adjustment import (
     adjust,
 )
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.calibration.gauge import known_baseline, restore
+from sl_nerfstudio.calibration.gauge import agreeing_scale, baseline_scale, known_baseline, restore
 from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import RefinePoses, constrained
@@ -117,12 +117,19 @@ def refine(
     maps, held_out = _maps(scan, samples)
     stated = pose_prior(scan, S_scene_world, prior)
     found = adjust(constrained(mode, start), maps, stated, mode, settings)
-    known = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
-    rig = restore(start, found.rig, known)
+    rig = restore(start, found.rig, _scale(scan, mode, start, found.rig, stated))
     verdict = compare(start, rig, held_out, maps, max(_GUARD_WIDTH * found.noise_px, _GUARD_FLOOR_PX))
     if not verdict.better:
         return Refinement(start.T_world_camera, start.T_world_projector, _prior_sigma(stated), verdict, found.noise_px)
     return Refinement(rig.T_world_camera, rig.T_world_projector, found.sigma, verdict, found.noise_px)
+
+
+def _scale(scan: Scan, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
+    """The factor by which the adjusted rig gets the scan's lengths."""
+    frame = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
+    if frame is None and scan.scale.known and mode != "known-rig":
+        return agreeing_scale(start, rig, prior)
+    return baseline_scale(start, rig, frame)
 
 
 def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:

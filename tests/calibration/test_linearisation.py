@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.calibration.gauge import gauge_directions
 from sl_nerfstudio.calibration.linearisation import Anchors, Rig, linearise, normal_equations, residuals_of
 from sl_nerfstudio.calibration.observations import observe, place_anchors
-from sl_nerfstudio.calibration.posterior import gauge_directions
 from sl_nerfstudio.geometry.se3 import transform
 
 from .analytic import ExactMaps, cast, disturbed, images_of, rig_of

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adjust
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.calibration.gauge import gauge_directions
 from sl_nerfstudio.calibration.pose_prior import PosePrior
-from sl_nerfstudio.calibration.posterior import gauge_directions
 from sl_nerfstudio.geometry.se3 import inverse, log_se3
 
 from .analytic import images_of, rig_of

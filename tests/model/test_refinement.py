@@ -87,6 +87,23 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
     assert (apart[0] - apart[1]).abs().max() < 0.5 * (apart[2] - apart[1]).abs().max()
 
 
+@pytest.mark.parametrize(
+    "scale, size",
+    [(Scale(True, "given camera poses"), 1.0), (Scale(True, "baseline of frame 1"), 1.02)],
+)
+def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
+    """Cameras stand where they are said to stand; all baselines are said to be 2 % longer than they are."""
+    start = rig_of(FRAMES, SIZE)
+    start.T_camera_projector[:, :3, 3] *= 1.02
+    sigma = PoseSigma(0.05, 0.05, 1.0, 0.3)
+    said = with_poses(scan, start)
+    said = replace(said, scale=scale, frames=tuple(replace(f, pose_sigma=sigma) for f in said.frames))
+    found = refine(said, S_SCENE_WORLD, build_samples(scan), "free", PriorConfig(), QUICK)
+    assert found.verdict.better
+    apart = [torch.cdist(T[:, :3, 3], T[:, :3, 3]).sum() for T in (found.T_scene_camera, true.T_world_camera)]
+    assert float(apart[0] / apart[1]) == pytest.approx(size, abs=5e-3)
+
+
 def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
     """`off` changes nothing, so nothing is better."""
     found = refine(scan, S_SCENE_WORLD, build_samples(scan), "off", PriorConfig(), replace(QUICK, max_iterations=1))
