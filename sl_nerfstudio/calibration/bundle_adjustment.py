@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt, with_intrinsics
 from sl_nerfstudio.calibration.kernel import NOISE_FLOOR_PX, Kernel, frame_medians, narrowed, noise_of
 from sl_nerfstudio.calibration.linearisation import Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.calibration.modes import RefinePoses, free_directions
@@ -54,6 +55,7 @@ class Adjustment:
 
     rig: Rig
     covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho), gauge freedom projected out
+    intrinsics: IntrinsicsDoubt | None  # None where nothing was refined
     noise_px: float  # estimated noise of one look-up, projector pixels
     iterations: int
     median_before_px: float
@@ -190,11 +192,14 @@ def adjust(
     r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     # at the result, with every residual trusted, in whichever stage the steps ended
-    evidence = Evidence(state.rig, state.anchors, found.rows, linear, kernel)
-    H_prior = found.noise**2 * prior_equations(prior, start, state.rig)[0]
+    extended = with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
+    evidence = Evidence(state.rig, state.anchors, found.rows, extended, kernel)
+    H, g = (found.noise**2 * part for part in prior_equations(prior, start, state.rig))
+    known = posterior(evidence, free_directions(refine, state.rig), Pull(H, g), found.noise, prior.intrinsics)
     return Adjustment(
         rig=state.rig,
-        covariance=posterior(evidence, free_directions(refine, state.rig), H_prior, found.noise),
+        covariance=known.covariance,
+        intrinsics=known.intrinsics,
         noise_px=found.noise,
         iterations=found.iterations,
         median_before_px=before,
@@ -206,4 +211,4 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor) -> Adjustment:
     """The starting poses, where no step is asked for or no frame sees what another decoded; known as the prior says."""
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
-    return Adjustment(start, gauge_free(start, B, H, 1.0), NOISE_FLOOR_PX, 0, nan, nan)
+    return Adjustment(start, gauge_free(start, B, H, 1.0), None, NOISE_FLOOR_PX, 0, nan, nan)

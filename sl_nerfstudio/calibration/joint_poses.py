@@ -131,4 +131,5 @@ def _prior(clouds: Sequence[FrameCloud], registration: Registration, index: Sequ
                 max(float(np.sqrt(np.trace(pose.covariance[:3, :3]) / 3)), _LEAST_ROTATION),
             )
         )
-    return PosePrior(*torch.tensor(rows, dtype=torch.float64).unbind(1))
+    a, b, c, d = torch.tensor(rows, dtype=torch.float64).unbind(1)
+    return PosePrior(a, b, c, d)

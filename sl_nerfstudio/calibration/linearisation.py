@@ -103,10 +103,13 @@ class Linearisation:
     """Residuals with their derivatives, before weighting."""
 
     residuals: Residuals
-    own_rho: Float[Tensor, "anchors 2 6"]
+    own: Float[Tensor, "anchors 2 a"]  # by rho of the anchor's frame
+    own_columns: Int[Tensor, "anchors a"]  # which of the unknowns those are
     own_depth: Float[Tensor, "anchors 2"]
-    cross_pose: Float[Tensor, "rows 2 18"]  # delta of the anchor's frame, delta and rho of the seeing frame
+    cross: Float[Tensor, "rows 2 b"]  # by delta of the anchor's frame, delta and rho of the seeing frame
+    cross_columns: Int[Tensor, "rows b"]
     cross_depth: Float[Tensor, "rows 2"]
+    unknowns: int  # beside depths: delta of all frames, then rho of all frames
 
 
 def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Linearisation:
@@ -127,12 +130,16 @@ def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: Coor
     by_point = by_point - seen.jacobian @ project_jacobian(rig.camera[j], p_j)
     by_world = by_point @ T_camera_world[:, :3, :3]
     by_delta = torch.cat([by_world, -by_world @ hat(p_world)], -1)
+    own_columns, cross_columns = _pose_columns(anchors, observations, rig.frames)
     return Linearisation(
         residuals=Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front),
-        own_rho=own_rho,
+        own=own_rho,
+        own_columns=own_columns,
         own_depth=own_depth,
-        cross_pose=torch.cat([by_delta, -by_delta, cross_rho], -1),
+        cross=torch.cat([by_delta, -by_delta, cross_rho], -1),
+        cross_columns=cross_columns,
         cross_depth=(by_world * d_world[:, None, :]).sum(-1),
+        unknowns=12 * rig.frames,
     )
 
 
@@ -161,20 +168,20 @@ def _projector_view(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Gauss-Newton equations of the poses (delta of all frames, then rho of all frames), depths eliminated."""
+    """Gauss-Newton equations of all unknowns but the depths, which are eliminated."""
 
     H: Float[Tensor, "unknowns unknowns"]
     g: Float[Tensor, "unknowns"]
-    depth_by_pose: Float[Tensor, "anchors unknowns"]
+    depth_by_rest: Float[Tensor, "anchors unknowns"]
     H_depth: Float[Tensor, "anchors"]
     g_depth: Float[Tensor, "anchors"]
 
     def depth_step(self, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "anchors"]:
-        """Change of the depths that goes with a step of the poses."""
-        return -(self.g_depth + self.depth_by_pose @ step) / self.H_depth
+        """Change of the depths that goes with a step of the other unknowns."""
+        return -(self.g_depth + self.depth_by_rest @ step) / self.H_depth
 
 
-def pose_columns(
+def _pose_columns(
     anchors: Anchors, observations: Observations, frames: int
 ) -> tuple[Int[Tensor, "anchors 6"], Int[Tensor, "rows 18"]]:
     """The unknowns (delta of all frames, then rho of all frames) that own and cross residuals depend on."""
@@ -186,40 +193,34 @@ def pose_columns(
 
 def normal_equations(
     linear: Linearisation,
-    anchors: Anchors,
     observations: Observations,
     own_weight: Float[Tensor, "anchors"],
     cross_weight: Float[Tensor, "rows"],
-    frames: int,
 ) -> NormalEquations:
     """Weighted normal equations with the Schur complement of the depths."""
-    n = frames
-    H = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-    g = torch.zeros(12 * n, dtype=torch.float64)
-    depth_by_pose = torch.zeros(len(anchors.frame) * 12 * n, dtype=torch.float64)
+    size, rows, r_of = linear.unknowns, observations.anchor, linear.residuals
+    H = torch.zeros(size, size, dtype=torch.float64)
+    g = torch.zeros(size, dtype=torch.float64)
+    depth_by_rest = torch.zeros(len(own_weight) * size, dtype=torch.float64)
     H_depth = own_weight * (linear.own_depth**2).sum(-1)
-    g_depth = own_weight * (linear.own_depth * linear.residuals.own).sum(-1)
-    own_columns, cross_columns = pose_columns(anchors, observations, n)
-    each, several, r_of = torch.arange(len(own_weight)), observations.anchor, linear.residuals
+    g_depth = own_weight * (linear.own_depth * r_of.own).sum(-1)
     groups = (
-        (linear.own_rho, linear.own_depth, r_of.own, own_weight, own_columns, each),
-        (linear.cross_pose, linear.cross_depth, r_of.cross, cross_weight, cross_columns, several),
+        (linear.own, linear.own_depth, r_of.own, own_weight, linear.own_columns, torch.arange(len(own_weight))),
+        (linear.cross, linear.cross_depth, r_of.cross, cross_weight, linear.cross_columns, rows),
     )
     for J, J_depth, r, w, cols, anchor in groups:
         wJ = w[:, None, None] * J
         g.index_add_(0, cols.reshape(-1), (wJ[:, 0] * r[:, :1] + wJ[:, 1] * r[:, 1:]).reshape(-1))
         coupling = wJ[:, 0] * J_depth[:, :1] + wJ[:, 1] * J_depth[:, 1:]
-        depth_by_pose.index_add_(0, (anchor[:, None] * 12 * n + cols).reshape(-1), coupling.reshape(-1))
-        threads = torch.get_num_threads()
-        partial = np.zeros((threads, 12 * n, 12 * n))
+        depth_by_rest.index_add_(0, (anchor[:, None] * size + cols).reshape(-1), coupling.reshape(-1))
+        partial = np.zeros((torch.get_num_threads(), size, size))
         _accumulate(J.numpy(), w.numpy(), cols.numpy(), partial)
         H += torch.from_numpy(partial.sum(0))
     H = torch.tril(H) + torch.tril(H, -1).T
-    rows = observations.anchor
     H_depth = H_depth.index_add(0, rows, cross_weight * (linear.cross_depth**2).sum(-1))
     g_depth = g_depth.index_add(0, rows, cross_weight * (linear.cross_depth * linear.residuals.cross).sum(-1))
     H_depth = H_depth.clamp_min(1e-12)
-    V = depth_by_pose.reshape(-1, 12 * n)
+    V = depth_by_rest.reshape(-1, size)
     scaled = V / H_depth[:, None]
     return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
 

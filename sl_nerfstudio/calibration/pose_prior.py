@@ -14,12 +14,13 @@ _INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rath
 
 @dataclass(frozen=True)
 class PosePrior:
-    """How well the starting poses are known: 1 sigma per frame, lengths in the scene's unit, angles in radian."""
+    """How well starting poses and intrinsics are known: 1 sigma; lengths in the scene's unit, angles in radian."""
 
     frame_translation: Float[Tensor, "frames"]
     frame_rotation: Float[Tensor, "frames"]
     relative_translation: Float[Tensor, "frames"]
     relative_rotation: Float[Tensor, "frames"]
+    intrinsics: float = 0.005  # focal lengths and principal points, as a share of the focal length
 
 
 def prior_equations(

@@ -4,6 +4,7 @@ The inverse of the normal matrix supposes that residuals err independently. Thos
 lens that is modelled a little wrong, or a systematic error of the decoding, pushes all of them one way. So residuals
 are summed over blocks of each image, and the spread of those sums tells how far the poses may be off (the
 cluster-robust "sandwich" estimate: Liang and Zeger, Biometrika 1986). Whichever of the two is larger is stated.
+Intrinsics are uncertain, too (`intrinsics_doubt`).
 """
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.calibration.gauge import gauge_directions
+from sl_nerfstudio.calibration.intrinsics_doubt import UNKNOWNS, IntrinsicsDoubt
 from sl_nerfstudio.calibration.kernel import Kernel
 from sl_nerfstudio.calibration.linearisation import (
     Anchors,
@@ -23,17 +25,18 @@ from sl_nerfstudio.calibration.linearisation import (
     Observations,
     Rig,
     normal_equations,
-    pose_columns,
 )
+from sl_nerfstudio.calibration.steps import Pull
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
 _BLOCKS = 4  # to a side of the decoded part of an image
+_EXACT = 1e-9  # stands for an uncertainty of zero
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Residuals at the result, with their derivatives and weights."""
+    """Residuals at the result, with their derivatives (by the intrinsics, too) and weights."""
 
     rig: Rig
     anchors: Anchors
@@ -42,31 +45,48 @@ class Evidence:
     kernel: Kernel
 
 
-def posterior(
-    evidence: Evidence,
-    B: Float[Tensor, "unknowns k"],
-    H_prior: Float[Tensor, "unknowns unknowns"],
-    noise: float,
-) -> Float[Tensor, "unknowns unknowns"]:
-    """Covariance of (delta, rho); the freedom of the whole scene takes no part in the variances.
+@dataclass(frozen=True)
+class Posterior:
+    """What is known at the result."""
 
-    `B` spans what was refined; `H_prior` is the prior's information in the weight of residuals of `noise` px.
+    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho); the freedom of the whole scene taken out
+    intrinsics: IntrinsicsDoubt | None  # None where nothing was refined
+
+
+def posterior(
+    evidence: Evidence, B: Float[Tensor, "unknowns k"], pull: Pull, noise: float, intrinsics_sigma: float
+) -> Posterior:
+    """Second moments of the errors of poses that were found with the stated intrinsics.
+
+    `B` spans what was refined; `pull` is the prior in the weight of residuals of `noise` px; `intrinsics_sigma` is how
+    well the intrinsics are known, as a share of the focal length. Those are eliminated as unknowns. What the poses
+    would still move if the intrinsics followed the captures counts as an error, too.
     """
-    e = evidence
-    weights = e.kernel.weights(e.linear.residuals)
-    equations = normal_equations(e.linear, e.anchors, e.rows, *weights, e.rig.frames)
-    H = B.T @ (equations.H + H_prior) @ B
-    formal = gauge_free(e.rig, B, H, noise)
+    e, n = evidence, evidence.rig.frames
     if B.shape[1] == 0:
-        return formal
+        return Posterior(torch.zeros(12 * n, 12 * n, dtype=torch.float64), None)
+    eye = torch.eye(UNKNOWNS, dtype=torch.float64)
+    B = torch.block_diag(B, eye)
+    H_prior = torch.block_diag(pull.H, noise**2 / max(intrinsics_sigma, _EXACT) ** 2 * eye)
+    weights = e.kernel.weights(e.linear.residuals)
+    equations = normal_equations(e.linear, e.rows, *weights)
+    H = B.T @ (equations.H + H_prior) @ B
+    H_inverse = torch.linalg.inv(H)
+    formal = _project(e.rig, noise**2 * B @ H_inverse @ B.T)
     sums = _block_sums(e, equations, *weights) @ B
     blocks = int((sums != 0).any(1).sum())
     free = max(blocks - B.shape[1], blocks / 4)  # blocks that the fit of the poses has not used up
     spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
-    half = torch.linalg.solve(H, spread)
-    robust = _project(e.rig, B @ torch.linalg.solve(H, half.T) @ B.T)
+    robust = _project(e.rig, B @ H_inverse @ spread @ H_inverse @ B.T)
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
-    return larger[:, None] * formal * larger
+    covariance = larger[:, None] * formal * larger
+    step = -B @ H_inverse @ B.T @ (equations.g + torch.cat([pull.g, torch.zeros(UNKNOWNS, dtype=torch.float64)]))
+    poses, intrinsics = slice(12 * n), slice(12 * n, None)
+    shift = without_gauge(e.rig, step[poses])
+    return Posterior(
+        covariance[poses, poses] + torch.outer(shift, shift),
+        IntrinsicsDoubt(step[intrinsics], covariance[intrinsics, intrinsics]),
+    )
 
 
 def _block_sums(
@@ -76,26 +96,19 @@ def _block_sums(
     cross_weight: Float[Tensor, "rows"],
 ) -> Float[Tensor, "blocks unknowns"]:
     """Gradient of the poses from each block of each image, depths eliminated."""
-    n, r = e.rig.frames, e.linear.residuals
+    n, r, size = e.rig.frames, e.linear.residuals, e.linear.unknowns
     own_block, cross_block = _blocks_of(e)
-    out = torch.zeros(n * _BLOCKS**2 * 12 * n, dtype=torch.float64)
+    out = torch.zeros(n * _BLOCKS**2 * size, dtype=torch.float64)
     pull = torch.zeros(n * _BLOCKS**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
-    own_columns, cross_columns = pose_columns(e.anchors, e.rows, n)
     every = torch.arange(len(e.anchors.frame))
+    own, cross = own_weight[:, None] * r.own, cross_weight[:, None] * r.cross
     for block, J, J_depth, wr, cols, anchor in (
-        (own_block, e.linear.own_rho, e.linear.own_depth, own_weight[:, None] * r.own, own_columns, every),
-        (
-            cross_block,
-            e.linear.cross_pose,
-            e.linear.cross_depth,
-            cross_weight[:, None] * r.cross,
-            cross_columns,
-            e.rows.anchor,
-        ),
+        (own_block, e.linear.own, e.linear.own_depth, own, e.linear.own_columns, every),
+        (cross_block, e.linear.cross, e.linear.cross_depth, cross, e.linear.cross_columns, e.rows.anchor),
     ):
-        out.index_add_(0, (block[:, None] * 12 * n + cols).reshape(-1), (J * wr[..., None]).sum(1).reshape(-1))
+        out.index_add_(0, (block[:, None] * size + cols).reshape(-1), (J * wr[..., None]).sum(1).reshape(-1))
         pull.view(-1).index_add_(0, block * pull.shape[1] + anchor, (J_depth * wr).sum(-1))
-    return out.reshape(-1, 12 * n) - pull @ (equations.depth_by_pose / equations.H_depth[:, None])
+    return out.reshape(-1, size) - pull @ (equations.depth_by_rest / equations.H_depth[:, None])
 
 
 def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
@@ -128,11 +141,18 @@ def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "u
     """`noise^2 / H`, with the freedom of the whole scene projected out: right if residuals err independently."""
     if B.shape[1] == 0:
         return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
-    C = noise**2 * B @ torch.linalg.inv(H) @ B.T
-    return _project(rig, C)
+    return _project(rig, noise**2 * B @ torch.linalg.inv(H) @ B.T)
 
 
-def _project(rig: Rig, C: Float[Tensor, "unknowns unknowns"]) -> Float[Tensor, "unknowns unknowns"]:
+def without_gauge(rig: Rig, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "unknowns"]:
+    """A step of the poses without the part that moves the whole scene."""
     G = gauge_directions(rig)
+    return step - G @ torch.linalg.solve(G.T @ G, G.T @ step)
+
+
+def _project(rig: Rig, C: Float[Tensor, "all all"]) -> Float[Tensor, "all all"]:
+    """A covariance of poses (and of what follows them) without the freedom of the whole scene."""
+    G = torch.zeros(len(C), 7, dtype=torch.float64)
+    G[: 12 * rig.frames] = gauge_directions(rig)
     P = torch.eye(len(C), dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)
     return P @ C @ P.T

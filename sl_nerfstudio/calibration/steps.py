@@ -52,7 +52,7 @@ def descend(
     rig, anchors, r, n = state.rig, state.anchors, linear.residuals, state.rig.frames
     if not B.shape[1]:
         return Descent(rig, anchors, state.damping)
-    equations = normal_equations(linear, anchors, rows, *kernel.weights(r), n)
+    equations = normal_equations(linear, rows, *kernel.weights(r))
     H, g = (equations.H, equations.g) if pull is None else (equations.H + pull.H, equations.g + pull.g)
     H, g = B.T @ H @ B, B.T @ g
     damping = state.damping

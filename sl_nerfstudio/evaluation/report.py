@@ -38,7 +38,7 @@ class ReportInput:
     mesh_name: str
     poses_name: str  # "" where the scan's own poses were evaluated
     pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # posterior, one per frame, or empty
-    training: dict[str, Any] | None = None  # settings, versions and curves of the run
+    training: dict[str, Any] | None = None  # settings, versions and curves of the run, and doubts of the intrinsics
     made_at: datetime = field(default_factory=datetime.now)
 
 
@@ -66,7 +66,7 @@ def render_report(report: ReportInput) -> str:
         "fit": evaluation.fit,
         "units": evaluation.units,
         "truth_units": evaluation.truth_units,
-        "verdict": judge(evaluation),
+        "verdict": judge(evaluation, str((report.training or {}).get("intrinsics", ""))),
         "surface": _surface_pictures(report, surface),
         "comparisons": comparisons,
         "coordinate_scale": COORDINATE,

@@ -42,8 +42,8 @@ class Verdict:
         return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad)]
 
 
-def judge(evaluation: Evaluation) -> Verdict:
-    """Judge an evaluation by fixed bands."""
+def judge(evaluation: Evaluation, intrinsics: str = "") -> Verdict:
+    """Judge an evaluation by fixed bands; `intrinsics`: what the joint adjustment said against them."""
     fit = evaluation.fit
     checks = [
         _check(
@@ -75,7 +75,9 @@ def judge(evaluation: Evaluation) -> Verdict:
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         checks.insert(0, _accuracy(evaluation))
     band: Band = max((c.band for c in checks), key=lambda b: _ORDER[b])
-    return Verdict(band, _sentence(band, evaluation), tuple(checks), _hints(evaluation, band))
+    return Verdict(
+        band, _sentence(band, evaluation), tuple(checks), (*_hints(evaluation, band), *filter(None, [intrinsics]))
+    )
 
 
 def _check(

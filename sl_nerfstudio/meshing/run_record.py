@@ -15,7 +15,10 @@ _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_
 
 
 def training_record(run: TrainedRun) -> dict[str, Any]:
-    """`settings` (nested), `versions` (of the export, by package) and `curves` (lists by name, NaN as None)."""
+    """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
+
+    The last is what the captures say against the intrinsics ("": nothing).
+    """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
         "versions": {
@@ -25,6 +28,7 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
             "device": _device(run.model.device),
         },
         "curves": {name: plain(values) for name, values in run.model.history().items()},
+        "intrinsics": run.model.intrinsics_doubt(),
     }
 
 

@@ -47,6 +47,10 @@ class TrainedModel(Protocol):
         """One sigma of each frame's poses, in the order of PoseSigma's fields; None where it was not estimated."""
         ...
 
+    def intrinsics_doubt(self) -> str:
+        """What the captures say against the intrinsics; "" if nothing."""
+        ...
+
     def history(self) -> dict[str, list[float]]:
         """Convergence curves, with the steps under `step`."""
         ...

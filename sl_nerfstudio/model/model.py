@@ -1,5 +1,6 @@
 """The nerfstudio model: a signed distance field, and the poses of the devices that saw it."""
 
+import statistics
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from nerfstudio.viewer.viewer_elements import ViewerSlider
 from numpy import ndarray
 from torch import Tensor, nn
 
+from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -102,6 +104,15 @@ class SLModel(Model):
         sigma = self.device_poses.sigma
         return None if bool(sigma.isnan().any()) else sigmas_in_scan_units(sigma, self.S_scene_world)
 
+    def intrinsics_doubt(self) -> str:
+        """What the captures say against the intrinsics; "" if nothing, or if poses were not adjusted."""
+        poses = self.device_poses
+        doubt = IntrinsicsDoubt(poses.intrinsics_change.cpu(), poses.intrinsics_covariance.cpu())
+        if not doubt.serious:
+            return ""
+        camera = statistics.median(frame.camera.fl_x for frame in self.scan.frames)
+        return doubt.message(camera, self.scan.projector.fl_x)
+
     def history(self) -> dict[str, list[float]]:
         """Convergence curves of the run, with the steps under `step`."""
         return self.history_table.curves()
@@ -148,7 +159,10 @@ class SLModel(Model):
             found = refine(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             self.device_poses.rebase(found.T_scene_camera, found.T_scene_projector)
             self.device_poses.sigma.copy_(found.sigma)
-            print(found.message(), flush=True)
+            if found.intrinsics is not None:
+                self.device_poses.intrinsics_change.copy_(found.intrinsics.change)
+                self.device_poses.intrinsics_covariance.copy_(found.intrinsics.covariance)
+            print("\n".join(text for text in (found.message(), self.intrinsics_doubt()) if text), flush=True)
         camera, projector = self.poses_scene()
         noise, px_per_length = measure(self.scan, samples, camera.cpu(), projector.cpu())
         self.noise_px.fill_(noise)

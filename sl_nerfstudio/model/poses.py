@@ -23,6 +23,8 @@ class Poses(nn.Module):
     base_camera: Tensor
     base_projector: Tensor
     sigma: Tensor
+    intrinsics_change: Tensor
+    intrinsics_covariance: Tensor
 
     def __init__(
         self,
@@ -39,6 +41,9 @@ class Poses(nn.Module):
         n = len(T_scene_camera)
         # posterior 1 sigma of (delta, rho): translation xyz, rotation xyz each; NaN where not estimated
         self.register_buffer("sigma", torch.full((n, 12), float("nan"), dtype=torch.float64))
+        # what the adjustment says of the intrinsics (see IntrinsicsDoubt); NaN where nothing
+        self.register_buffer("intrinsics_change", torch.full((6,), float("nan"), dtype=torch.float64))
+        self.register_buffer("intrinsics_covariance", torch.full((6, 6), float("nan"), dtype=torch.float64))
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
 

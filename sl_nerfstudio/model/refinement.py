@@ -15,6 +15,7 @@ from sl_nerfstudio.calibration.bundle_adjustment import (
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.gauge import agreeing_scale, baseline_scale, known_baseline, restore
 from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
+from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import RefinePoses, constrained
 from sl_nerfstudio.calibration.pose_prior import PosePrior
@@ -33,7 +34,7 @@ _GUARD_FLOOR_PX = 0.25  # where decoding is perfect, looking up between pixels i
 
 @dataclass
 class PriorConfig:
-    """How well the starting poses are known where the scan does not say (`sl_pose_sigma`); 1 sigma per axis."""
+    """How well the starting poses are known where the scan does not say (`sl_pose_sigma`), and intrinsics; 1 sigma."""
 
     frame_rotation_deg: float = 2.0
     """Orientation of a frame in the world, in degrees."""
@@ -43,6 +44,9 @@ class PriorConfig:
     """Orientation of the projector against the camera, in degrees."""
     relative_translation: float = 0.05
     """Position of the projector against the camera, as a share of the baseline."""
+    intrinsics: float = 0.005
+    """Focal lengths and principal points of both devices, as a share of the focal length; they stay as they are, but
+    poses are stated to be as uncertain as this makes them."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class Refinement:
     sigma: Float[Tensor, "frames 12"]
     verdict: Verdict
     noise_px: float
+    intrinsics: IntrinsicsDoubt | None = None  # None where nothing was refined
 
     def message(self) -> str:
         """One line for the person who waits."""
@@ -101,7 +106,8 @@ def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> Po
             )
     # a sigma of zero is a pose known exactly: a very small one keeps the equations solvable
     sigma = torch.tensor(np.maximum(np.array(rows), 1e-9), dtype=torch.float64)
-    return PosePrior(*sigma.unbind(1))
+    a, b, c, d = sigma.unbind(1)
+    return PosePrior(a, b, c, d, config.intrinsics)
 
 
 def refine(
@@ -119,9 +125,9 @@ def refine(
     found = adjust(constrained(mode, start), maps, stated, mode, settings)
     rig = restore(start, found.rig, _scale(scan, mode, start, found.rig, stated))
     verdict = compare(start, rig, held_out, maps, max(_GUARD_WIDTH * found.noise_px, _GUARD_FLOOR_PX))
-    if not verdict.better:
-        return Refinement(start.T_world_camera, start.T_world_projector, _prior_sigma(stated), verdict, found.noise_px)
-    return Refinement(rig.T_world_camera, rig.T_world_projector, found.sigma, verdict, found.noise_px)
+    kept = rig if verdict.better else start
+    sigma = found.sigma if verdict.better else _prior_sigma(stated)
+    return Refinement(kept.T_world_camera, kept.T_world_projector, sigma, verdict, found.noise_px, found.intrinsics)
 
 
 def _scale(scan: Scan, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:

@@ -93,15 +93,15 @@ def test_jacobians_are_central_differences_of_the_residuals(scene):
     i, j = anchors.frame[observations.anchor], observations.frame
     for k in range(6):
         own, _ = difference(moved(rig, 1, k, STEP), moved(rig, 1, k, -STEP))
-        agrees(own, linear.own_rho[..., k], every)
+        agrees(own, linear.own[..., k], every)
         for frame in (0, FRAMES - 1):
             own, cross = difference(single(rig, 0, frame, k, STEP), single(rig, 0, frame, k, -STEP))
             assert torch.equal(own, torch.zeros_like(own))
-            expected = torch.where((i == frame)[:, None], linear.cross_pose[..., k], torch.zeros_like(cross))
-            expected = torch.where((j == frame)[:, None], linear.cross_pose[..., 6 + k], expected)
+            expected = torch.where((i == frame)[:, None], linear.cross[..., k], torch.zeros_like(cross))
+            expected = torch.where((j == frame)[:, None], linear.cross[..., 6 + k], expected)
             agrees(cross, expected, ok)
             _, cross = difference(single(rig, 1, frame, k, STEP), single(rig, 1, frame, k, -STEP))
-            expected = torch.where((j == frame)[:, None], linear.cross_pose[..., 12 + k], torch.zeros_like(cross))
+            expected = torch.where((j == frame)[:, None], linear.cross[..., 12 + k], torch.zeros_like(cross))
             agrees(cross, expected, ok)
 
 
@@ -111,7 +111,7 @@ def equations_of(rig, maps, anchors, observations, seed: int = 0):
     own = torch.rand(len(anchors.frame), generator=generator, dtype=torch.float64) + 0.1
     cross = torch.rand(len(observations.frame), generator=generator, dtype=torch.float64) + 0.1
     cross = cross * linear.residuals.cross_valid
-    return linear, own, cross, normal_equations(linear, anchors, observations, own, cross, rig.frames)
+    return linear, own, cross, normal_equations(linear, observations, own, cross)
 
 
 def test_normal_equations_are_those_of_the_dense_system(scene):
@@ -123,12 +123,12 @@ def test_normal_equations_are_those_of_the_dense_system(scene):
     J = torch.zeros(m + len(observations.frame), 2, 12 * n + m, dtype=torch.float64)
     for a in range(m):
         f = int(anchors.frame[a])
-        J[a, :, 6 * (n + f) : 6 * (n + f) + 6] = linear.own_rho[a]
+        J[a, :, 6 * (n + f) : 6 * (n + f) + 6] = linear.own[a]
         J[a, :, 12 * n + a] = linear.own_depth[a]
     for row, (a, j) in enumerate(zip(observations.anchor.tolist(), observations.frame.tolist(), strict=True)):
         i = int(anchors.frame[a])
         for block, first in enumerate((6 * i, 6 * j, 6 * (n + j))):
-            J[m + row, :, first : first + 6] = linear.cross_pose[row, :, 6 * block : 6 * block + 6]
+            J[m + row, :, first : first + 6] = linear.cross[row, :, 6 * block : 6 * block + 6]
         J[m + row, :, 12 * n + a] = linear.cross_depth[row]
     root = torch.cat([own, cross]).sqrt()[:, None]
     r = torch.cat([linear.residuals.own, linear.residuals.cross])
@@ -164,7 +164,7 @@ def test_the_gauge_and_nothing_else_is_free(scene):
 def test_without_observations_the_equations_are_those_of_own_views(scene):
     true, maps, anchors, observations = scene
     linear, own, cross, _ = equations_of(true, maps, anchors, observations)
-    alone = normal_equations(linear, anchors, observations, own, torch.zeros_like(cross), FRAMES)
+    alone = normal_equations(linear, observations, own, torch.zeros_like(cross))
     assert torch.equal(alone.H[: 6 * FRAMES], torch.zeros_like(alone.H[: 6 * FRAMES]))
     blocks = alone.H[6 * FRAMES :, 6 * FRAMES :].reshape(FRAMES, 6, FRAMES, 6)
     off = ~torch.eye(FRAMES, dtype=torch.bool)

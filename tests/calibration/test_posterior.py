@@ -15,7 +15,8 @@ from sl_nerfstudio.geometry.se3 import inverse, log_se3
 from .analytic import images_of, rig_of
 
 FRAMES, SIZE, SCANS = 4, 100, 10
-PRIOR = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.03, radians(1.0), 0.01, radians(0.3))))
+SIGMAS = (0.03, radians(1.0), 0.01, radians(0.3))
+PRIOR = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in SIGMAS), intrinsics=0.0)
 SETTINGS = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_iterations=8)
 
 

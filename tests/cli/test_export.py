@@ -45,6 +45,9 @@ class BallModel:
     def pose_sigma(self):
         return self.sigma
 
+    def intrinsics_doubt(self):
+        return "the camera is too long"
+
     def history(self):
         return {"step": [0.0, 5.0], "loss": [1.0, float("nan")]}
 
@@ -110,6 +113,7 @@ def test_training_record_is_json_with_settings_versions_and_curves(scan, tmp_pat
     assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["model"] == {"lr": 1e-3, "where": "a"}
     assert record["versions"]["torch"] == torch.__version__ and "python" in record["versions"]
     assert record["curves"] == {"step": [0.0, 5.0], "loss": [1.0, None]}
+    assert record["intrinsics"] == "the camera is too long"
     assert "sl_pose_sigma" not in (tmp_path / "r/transforms.json").read_text()  # not estimated, so not stated
 
 

@@ -24,6 +24,7 @@ TRAINING = {
     "settings": {"method": "sl-neus", "model": {"refine_poses": "free", "note": "<script>alert(1)</script>"}},
     "versions": {"torch": "2.11"},
     "curves": {"step": [0, 100, 200], "loss": [5.0, 0.5, 0.1], "coordinate_px": [20.0, None, 0.4]},
+    "intrinsics": "The intrinsics contradict the captures",
 }
 
 
@@ -113,7 +114,7 @@ def test_report_tells_everything(full_report: str) -> None:
         "Scan report: scan", "<mesh & co>.ply", "refined/transforms.json", "2026-01-02 03:04", "What it means",
         "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
         "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
-        "known (by construction)", "σ frame",
+        "known (by construction)", "σ frame", "The intrinsics contradict the captures",
     ):  # fmt: skip
         assert what in text, what
     assert "<script>alert(1)" not in full_report  # only escaped

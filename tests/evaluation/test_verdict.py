@@ -19,6 +19,12 @@ def test_a_good_fit_is_good_and_asks_for_nothing() -> None:
     assert "no truth is known" in verdict.sentence  # and does not pretend to know more
 
 
+def test_doubts_of_the_intrinsics_come_first() -> None:
+    poor = judge(replace(GOOD, starting_poses=False, fit=replace(FIT, hit_share=0.5)), "The camera is too long")
+    assert poor.next_steps[0] == "The camera is too long" and poor.next_steps[1].startswith("Coverage")
+    assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
+
+
 @pytest.mark.parametrize(
     ("change", "check", "band"),
     [
