@@ -47,8 +47,8 @@ sl_neus = MethodSpecification(
         rays=4096,
         iterations=1000,
         optimizers={
-            "table": _group(RowAdamOptimizerConfig(lr=1e-3), DecaySchedulerConfig(final=0.02)),
-            "mlp": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.02)),
+            "table": _group(RowAdamOptimizerConfig(lr=1e-3), DecaySchedulerConfig(final=0.002)),
+            "mlp": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.002)),
             "camera_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
             "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
         },
