@@ -1,7 +1,8 @@
 """From a registration to a scan's poses: joint adjustment of all registered frames, in the registration's gauge."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import median
 
 import numpy as np
 import torch
@@ -12,12 +13,13 @@ from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adju
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud
 from sl_nerfstudio.calibration.gauge import baseline_scale, restore
+from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.calibration.posterior import frame_sigmas
 from sl_nerfstudio.calibration.registration import Registration
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan.types import PoseSigma
 
@@ -40,6 +42,7 @@ class JointPoses:
     noise_px: float  # of one look-up, projector pixels
     median_before_px: float  # cross-frame residual before
     median_after_px: float
+    intrinsics: str = ""  # what the captures say against the intrinsics
 
     def scaled(self, factor: float) -> "JointPoses":
         """With all lengths multiplied: what makes a scan metric."""
@@ -57,7 +60,7 @@ class JointPoses:
             )
             for s in self.sigma
         )
-        return JointPoses(camera, projector, sigma, self.noise_px, self.median_before_px, self.median_after_px)
+        return replace(self, T_world_camera=camera, T_world_projector=projector, sigma=sigma)
 
 
 def joint_poses(
@@ -95,8 +98,20 @@ def joint_poses(
     for k, values in zip(index, stated, strict=True):
         sigma[k] = PoseSigma(*values.tolist())
     return JointPoses(
-        T_camera, T_projector, tuple(sigma), found.noise_px, found.median_before_px, found.median_after_px
+        T_camera,
+        T_projector,
+        tuple(sigma),
+        found.noise_px,
+        found.median_before_px,
+        found.median_after_px,
+        _said_against(found.intrinsics, [clouds[k].camera for k in index], clouds[0].projector),
     )
+
+
+def _said_against(doubt: IntrinsicsDoubt | None, cameras: Sequence[Device], projector: Device) -> str:
+    if doubt is None or not doubt.serious:
+        return ""
+    return doubt.message(median(camera.fl_x for camera in cameras), projector.fl_x)
 
 
 def _projector_pose(cloud: FrameCloud, registration: Registration, k: int) -> Float64[ndarray, "4 4"]:

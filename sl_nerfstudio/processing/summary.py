@@ -36,11 +36,17 @@ def summarise(
         scale_source=scale.source if scale.known else "",
         frames=frames,
         edges=records,
-        remarks=() if registration is None else tuple(registration.remarks),
+        remarks=_remarks(registration, joint),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if joint is None else _both_known(joint.median_before_px, joint.median_after_px),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
+
+
+def _remarks(registration: Registration | None, joint: JointPoses | None) -> tuple[str, ...]:
+    """What remains uncertain."""
+    placed = () if registration is None else tuple(registration.remarks)
+    return (joint.intrinsics, *placed) if joint is not None and joint.intrinsics else placed
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:

@@ -170,12 +170,20 @@ def test_the_joint_adjustment_brings_frames_to_their_places(clouds, whole):
     assert rotation.max() < 0.3
     assert np.abs(scale).max() < 0.006
     assert found.median_after_px < found.median_before_px
+    assert found.intrinsics == ""
     assert all(s is not None and s.camera_translation > 0 for s in found.sigma)
     assert np.exp(np.log(baseline).mean()) == pytest.approx(1)
     twice = found.scaled(2.0)
     np.testing.assert_allclose(twice.T_world_camera[:, :3, 3], 2 * found.T_world_camera[:, :3, 3])
     assert twice.sigma[0].relative_translation == pytest.approx(2 * found.sigma[0].relative_translation)
     assert twice.sigma[0].camera_rotation_deg == found.sigma[0].camera_rotation_deg
+
+
+def test_a_wrong_camera_is_told(clouds, whole):
+    long = [replace(c, camera=replace(c.camera, fl_x=1.03 * c.camera.fl_x, fl_y=1.03 * c.camera.fl_y)) for c in clouds]
+    found = joint_poses(long, whole, AdjustmentSettings(anchors_per_frame=120, max_iterations=16))
+    assert found.intrinsics.startswith("The intrinsics contradict the captures")
+    assert "camera: focal length -" in found.intrinsics
 
 
 def test_an_unordered_set_is_registered(clouds):
