@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 INK, MUTED, GRID = "#1d2733", "#66727f", "#dfe4e9"
 COLOURS = ("#2563a8", "#c2571a", "#3c8d5a", "#7a4fa3", "#8a8f98")
@@ -36,7 +36,9 @@ def panels(count: int, height: float = 3.0) -> tuple[Figure, list[Any]]:
 
 
 def plain_decades(axis: Axis) -> None:
-    """0.1 in place of a power of ten."""
+    """0.1 in place of a power of ten, and ticks at 1, 2 and 5."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
