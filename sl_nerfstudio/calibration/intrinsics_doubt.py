@@ -8,7 +8,9 @@ with wrong intrinsics have taken up the difference, and by how much belongs to w
 Changes are shares of the focal length: of the focal lengths themselves, and of the principal point's x and y.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import median
 
 import torch
 from jaxtyping import Float
@@ -16,13 +18,12 @@ from torch import Tensor
 
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.linearisation import Anchors, Linearisation, Observations, Rig
-from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
 UNKNOWNS = 6  # focal length, centre x, centre y: of all cameras together, then of the projector
-_DOUBTED = (
-    50.0  # chi square of six unknowns: chance makes it one time in 10^8; blocks of pixels do not err independently
-)
+# Chi square of six unknowns: chance makes it one time in 10^8, but blocks of pixels do not err independently.
+_DOUBTED = 50.0
 _LEAST = 1e-3  # of the focal length: what no calibration promises
 
 
@@ -49,6 +50,10 @@ class IntrinsicsDoubt:
         if not (self.change.isfinite().all() and self.covariance.isfinite().all()):  # nothing was refined
             return False
         return self.chi_square > _DOUBTED and bool((self.change.abs() > _LEAST).any())
+
+    def said(self, cameras: Sequence[Device], projector: Device) -> str:
+        """The message about these devices; "" if the stated intrinsics may be right."""
+        return self.message(median(camera.fl_x for camera in cameras), projector.fl_x) if self.serious else ""
 
     def message(self, camera_focal: float, projector_focal: float) -> str:
         """What would agree better, for the person who calibrated; focal lengths in pixels."""

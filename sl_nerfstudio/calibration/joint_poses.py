@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 import numpy as np
 import torch
@@ -13,13 +12,12 @@ from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adju
 from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.frame_cloud import FrameCloud
 from sl_nerfstudio.calibration.gauge import baseline_scale, restore
-from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.pose_prior import PosePrior
 from sl_nerfstudio.calibration.posterior import frame_sigmas
 from sl_nerfstudio.calibration.registration import Registration
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan.types import PoseSigma
 
@@ -104,14 +102,10 @@ def joint_poses(
         found.noise_px,
         found.median_before_px,
         found.median_after_px,
-        _said_against(found.intrinsics, [clouds[k].camera for k in index], clouds[0].projector),
+        ""
+        if found.intrinsics is None
+        else found.intrinsics.said([clouds[k].camera for k in index], clouds[0].projector),
     )
-
-
-def _said_against(doubt: IntrinsicsDoubt | None, cameras: Sequence[Device], projector: Device) -> str:
-    if doubt is None or not doubt.serious:
-        return ""
-    return doubt.message(median(camera.fl_x for camera in cameras), projector.fl_x)
 
 
 def _projector_pose(cloud: FrameCloud, registration: Registration, k: int) -> Float64[ndarray, "4 4"]:

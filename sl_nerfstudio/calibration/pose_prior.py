@@ -9,6 +9,7 @@ from torch import Tensor
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 
+INTRINSICS_SIGMA = 0.005  # where nobody says how well the intrinsics are known
 _INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
 
 
@@ -20,7 +21,7 @@ class PosePrior:
     frame_rotation: Float[Tensor, "frames"]
     relative_translation: Float[Tensor, "frames"]
     relative_rotation: Float[Tensor, "frames"]
-    intrinsics: float = 0.005  # focal lengths and principal points, as a share of the focal length
+    intrinsics: float = INTRINSICS_SIGMA  # focal lengths and principal points, as a share of the focal length
 
 
 def prior_equations(

@@ -72,19 +72,19 @@ def posterior(
     equations = normal_equations(e.linear, e.rows, *weights)
     H = B.T @ (equations.H + H_prior) @ B
     H_inverse = torch.linalg.inv(H)
-    formal = _project(e.rig, noise**2 * B @ H_inverse @ B.T)
+    P = _without_gauge(e.rig, len(B))
+    formal = noise**2 * P @ B @ H_inverse @ B.T @ P.T
     sums = _block_sums(e, equations, *weights) @ B
     blocks = int((sums != 0).any(1).sum())
     free = max(blocks - B.shape[1], blocks / 4)  # blocks that the fit of the poses has not used up
     spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
-    robust = _project(e.rig, B @ H_inverse @ spread @ H_inverse @ B.T)
+    robust = P @ B @ H_inverse @ spread @ H_inverse @ B.T @ P.T
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
     covariance = larger[:, None] * formal * larger
-    step = -B @ H_inverse @ B.T @ (equations.g + torch.cat([pull.g, torch.zeros(UNKNOWNS, dtype=torch.float64)]))
+    step = -P @ B @ H_inverse @ B.T @ (equations.g + torch.cat([pull.g, torch.zeros(UNKNOWNS, dtype=torch.float64)]))
     poses, intrinsics = slice(12 * n), slice(12 * n, None)
-    shift = without_gauge(e.rig, step[poses])
     return Posterior(
-        covariance[poses, poses] + torch.outer(shift, shift),
+        covariance[poses, poses] + torch.outer(step[poses], step[poses]),
         IntrinsicsDoubt(step[intrinsics], covariance[intrinsics, intrinsics]),
     )
 
@@ -141,18 +141,12 @@ def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "u
     """`noise^2 / H`, with the freedom of the whole scene projected out: right if residuals err independently."""
     if B.shape[1] == 0:
         return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
-    return _project(rig, noise**2 * B @ torch.linalg.inv(H) @ B.T)
+    P = _without_gauge(rig, len(B))
+    return noise**2 * P @ B @ torch.linalg.inv(H) @ B.T @ P.T
 
 
-def without_gauge(rig: Rig, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "unknowns"]:
-    """A step of the poses without the part that moves the whole scene."""
-    G = gauge_directions(rig)
-    return step - G @ torch.linalg.solve(G.T @ G, G.T @ step)
-
-
-def _project(rig: Rig, C: Float[Tensor, "all all"]) -> Float[Tensor, "all all"]:
-    """A covariance of poses (and of what follows them) without the freedom of the whole scene."""
-    G = torch.zeros(len(C), 7, dtype=torch.float64)
+def _without_gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns unknowns"]:
+    """Projection of steps of the poses (and of what follows them) that takes out what moves the whole scene."""
+    G = torch.zeros(unknowns, 7, dtype=torch.float64)
     G[: 12 * rig.frames] = gauge_directions(rig)
-    P = torch.eye(len(C), dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)
-    return P @ C @ P.T
+    return torch.eye(unknowns, dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)

@@ -75,9 +75,7 @@ def judge(evaluation: Evaluation, intrinsics: str = "") -> Verdict:
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         checks.insert(0, _accuracy(evaluation))
     band: Band = max((c.band for c in checks), key=lambda b: _ORDER[b])
-    return Verdict(
-        band, _sentence(band, evaluation), tuple(checks), (*_hints(evaluation, band), *filter(None, [intrinsics]))
-    )
+    return Verdict(band, _sentence(band, evaluation), tuple(checks), _hints(evaluation, band, intrinsics))
 
 
 def _check(
@@ -133,13 +131,16 @@ def _geometry(evaluation: Evaluation) -> Check:
     )  # fmt: skip
 
 
-def _hints(evaluation: Evaluation, band: Band) -> tuple[str, ...]:
+def _hints(evaluation: Evaluation, band: Band, intrinsics: str) -> tuple[str, ...]:
+    hints = []
     if _ORDER[band] and evaluation.starting_poses:
-        return (
+        hints.append(
             "These figures are for the scan's starting poses: if the surface was trained with refined ones, "
-            "give them with --poses",
+            "give them with --poses"
         )
-    return ()
+    if intrinsics:
+        hints.append(intrinsics)
+    return tuple(hints)
 
 
 def _sentence(band: Band, evaluation: Evaluation) -> str:

@@ -1,6 +1,5 @@
 """The nerfstudio model: a signed distance field, and the poses of the devices that saw it."""
 
-import statistics
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -108,10 +107,7 @@ class SLModel(Model):
         """What the captures say against the intrinsics; "" if nothing, or if poses were not adjusted."""
         poses = self.device_poses
         doubt = IntrinsicsDoubt(poses.intrinsics_change.cpu(), poses.intrinsics_covariance.cpu())
-        if not doubt.serious:
-            return ""
-        camera = statistics.median(frame.camera.fl_x for frame in self.scan.frames)
-        return doubt.message(camera, self.scan.projector.fl_x)
+        return doubt.said([frame.camera for frame in self.scan.frames], self.scan.projector)
 
     def history(self) -> dict[str, list[float]]:
         """Convergence curves of the run, with the steps under `step`."""

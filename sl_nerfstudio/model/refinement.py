@@ -18,7 +18,7 @@ from sl_nerfstudio.calibration.guard import HeldOut, Verdict, compare
 from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.calibration.modes import RefinePoses, constrained
-from sl_nerfstudio.calibration.pose_prior import PosePrior
+from sl_nerfstudio.calibration.pose_prior import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.calibration.posterior import frame_sigmas
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics
@@ -44,7 +44,7 @@ class PriorConfig:
     """Orientation of the projector against the camera, in degrees."""
     relative_translation: float = 0.05
     """Position of the projector against the camera, as a share of the baseline."""
-    intrinsics: float = 0.005
+    intrinsics: float = INTRINSICS_SIGMA
     """Focal lengths and principal points of both devices, as a share of the focal length; they stay as they are, but
     poses are stated to be as uncertain as this makes them."""
 
