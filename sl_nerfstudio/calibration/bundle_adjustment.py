@@ -194,8 +194,7 @@ def adjust(
     # at the result, with every residual trusted, in whichever stage the steps ended
     extended = with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     evidence = Evidence(state.rig, state.anchors, found.rows, extended, kernel)
-    H, g = (found.noise**2 * part for part in prior_equations(prior, start, state.rig))
-    known = posterior(evidence, free_directions(refine, state.rig), Pull(H, g), found.noise, prior.intrinsics)
+    known = posterior(evidence, free_directions(refine, state.rig), start, prior, found.noise)
     return Adjustment(
         rig=state.rig,
         covariance=known.covariance,

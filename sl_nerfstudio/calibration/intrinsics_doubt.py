@@ -2,8 +2,9 @@
 
 Focal length and principal point of both devices become six more unknowns of the joint adjustment, common to all
 frames, and one Gauss-Newton step says how much better other values would agree (self-calibration; Triggs et al.,
-Bundle Adjustment - A Modern Synthesis, 2000, section 3). The step is not taken: it is told. Poses that were adjusted
-with wrong intrinsics have taken up the difference, and by how much belongs to what is stated of their uncertainty.
+Bundle Adjustment - A Modern Synthesis, 2000, section 3). The step is not taken here: it is told. Poses that were
+adjusted with wrong intrinsics have taken up the difference, and by how much belongs to what is stated of their
+uncertainty.
 
 Changes are shares of the focal length: of the focal lengths themselves, and of the principal point's x and y.
 """
@@ -20,6 +21,7 @@ from sl_nerfstudio.calibration.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.calibration.linearisation import Anchors, Linearisation, Observations, Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.scan.types import IntrinsicsChange
 
 UNKNOWNS = 6  # focal length, centre x, centre y: of all cameras together, then of the projector
 # Chi square of six unknowns: chance makes it one time in 10^8, but blocks of pixels do not err independently.
@@ -51,14 +53,32 @@ class IntrinsicsDoubt:
             return False
         return self.chi_square > _DOUBTED and bool((self.change.abs() > _LEAST).any())
 
-    def said(self, cameras: Sequence[Device], projector: Device) -> str:
-        """The message about these devices; "" if the stated intrinsics may be right."""
-        return self.message(median(camera.fl_x for camera in cameras), projector.fl_x) if self.serious else ""
+    @staticmethod
+    def of(change: IntrinsicsChange, covariance: Float[Tensor, "6 6"]) -> "IntrinsicsDoubt":
+        """From a change in plain numbers."""
+        return IntrinsicsDoubt(torch.tensor(change, dtype=torch.float64), covariance)
 
-    def message(self, camera_focal: float, projector_focal: float) -> str:
-        """What would agree better, for the person who calibrated; focal lengths in pixels."""
+    def said(self, cameras: Sequence[Device], projector: Device) -> str:
+        """What would agree better, for the person who calibrated; "" if the intrinsics may be right."""
+        if not self.serious:
+            return ""
+        return "\n".join(
+            [
+                f"The intrinsics contradict the captures (chi square {self.chi_square:.0f}, by chance 6). These "
+                "changes, together, would agree better:",
+                *self.lines(cameras, projector),
+                "    cause:  the calibration of a device is off, or belongs to another zoom, focus or image size",
+                "    remedy: train with --pipeline.model.refine-intrinsics True, and if that does not help, calibrate\n"
+                "            again; as it is, poses and surface take up the difference, which is part of the stated\n"
+                "            uncertainty of the poses",
+            ]
+        )
+
+    def lines(self, cameras: Sequence[Device], projector: Device) -> list[str]:
+        """The change of each device, in percent and pixels."""
         parts = []
-        for name, focal, first in (("camera", camera_focal, 0), ("projector", projector_focal, 3)):
+        camera_focal = median(camera.fl_x for camera in cameras)
+        for name, focal, first in (("camera", camera_focal, 0), ("projector", projector.fl_x, 3)):
             units = torch.tensor([100.0, focal, focal])
             f, x, y = (units * self.change[first : first + 3]).tolist()
             f_sigma, x_sigma, y_sigma = (units * self.sigma[first : first + 3]).tolist()
@@ -66,16 +86,7 @@ class IntrinsicsDoubt:
                 f"    {name}: focal length {f:+.2f} ± {f_sigma:.2f} %, principal point "
                 f"({x:+.1f} ± {x_sigma:.1f}, {y:+.1f} ± {y_sigma:.1f}) px"
             )
-        return "\n".join(
-            [
-                f"The intrinsics contradict the captures (chi square {self.chi_square:.0f}, by chance 6). These "
-                "changes, together, would agree better:",
-                *parts,
-                "    cause:  the calibration of a device is off, or belongs to another zoom, focus or image size",
-                "    remedy: calibrate again, or train with the changed values; poses and surface have taken up the\n"
-                "            difference, which is part of the uncertainty that is stated of the poses",
-            ]
-        )
+        return parts
 
 
 def with_intrinsics(

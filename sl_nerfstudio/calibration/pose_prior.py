@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sl_nerfstudio.calibration.linearisation import Rig
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
+from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
 
 INTRINSICS_SIGMA = 0.005  # where nobody says how well the intrinsics are known
 _INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
@@ -22,6 +23,7 @@ class PosePrior:
     relative_translation: Float[Tensor, "frames"]
     relative_rotation: Float[Tensor, "frames"]
     intrinsics: float = INTRINSICS_SIGMA  # focal lengths and principal points, as a share of the focal length
+    intrinsics_change: IntrinsicsChange = UNCHANGED  # how far the devices are from what was stated of them
 
 
 def prior_equations(

@@ -26,7 +26,7 @@ from sl_nerfstudio.calibration.linearisation import (
     Rig,
     normal_equations,
 )
-from sl_nerfstudio.calibration.steps import Pull
+from sl_nerfstudio.calibration.pose_prior import PosePrior, prior_equations
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
@@ -54,20 +54,22 @@ class Posterior:
 
 
 def posterior(
-    evidence: Evidence, B: Float[Tensor, "unknowns k"], pull: Pull, noise: float, intrinsics_sigma: float
+    evidence: Evidence, B: Float[Tensor, "unknowns k"], start: Rig, prior: PosePrior, noise: float
 ) -> Posterior:
-    """Second moments of the errors of poses that were found with the stated intrinsics.
+    """Second moments of the errors of poses that were found with the present intrinsics.
 
-    `B` spans what was refined; `pull` is the prior in the weight of residuals of `noise` px; `intrinsics_sigma` is how
-    well the intrinsics are known, as a share of the focal length. Those are eliminated as unknowns. What the poses
-    would still move if the intrinsics followed the captures counts as an error, too.
+    `B` spans what was refined, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. What
+    the poses would still move if the intrinsics followed the captures counts as an error, too.
     """
     e, n = evidence, evidence.rig.frames
     if B.shape[1] == 0:
         return Posterior(torch.zeros(12 * n, 12 * n, dtype=torch.float64), None)
     eye = torch.eye(UNKNOWNS, dtype=torch.float64)
     B = torch.block_diag(B, eye)
-    H_prior = torch.block_diag(pull.H, noise**2 / max(intrinsics_sigma, _EXACT) ** 2 * eye)
+    poses_H, poses_g = prior_equations(prior, start, e.rig)
+    weight = 1 / max(prior.intrinsics, _EXACT) ** 2
+    H_prior = noise**2 * torch.block_diag(poses_H, weight * eye)
+    g_prior = noise**2 * torch.cat([poses_g, weight * torch.tensor(prior.intrinsics_change, dtype=torch.float64)])
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
     H = B.T @ (equations.H + H_prior) @ B
@@ -81,7 +83,7 @@ def posterior(
     robust = P @ B @ H_inverse @ spread @ H_inverse @ B.T @ P.T
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
     covariance = larger[:, None] * formal * larger
-    step = -P @ B @ H_inverse @ B.T @ (equations.g + torch.cat([pull.g, torch.zeros(UNKNOWNS, dtype=torch.float64)]))
+    step = -P @ B @ H_inverse @ B.T @ (equations.g + g_prior)
     poses, intrinsics = slice(12 * n), slice(12 * n, None)
     return Posterior(
         covariance[poses, poses] + torch.outer(step[poses], step[poses]),

@@ -23,8 +23,8 @@ class EvalConfig:
     data: Path
     """The scan folder. Its ground_truth/ is used if it is there."""
     poses: Path | None = None
-    """transforms.json with the poses to evaluate, such as refined/transforms.json; default: the scan's own.
-    training.json beside it goes into the report."""
+    """transforms.json with the poses, and the intrinsics if it has any, to evaluate, such as refined/transforms.json;
+    default: the scan's own. training.json beside it goes into the report."""
     json: Path | None = None
     """Where to write all figures."""
     report: Path | None = None
@@ -47,7 +47,7 @@ def evaluate_scan(config: EvalConfig) -> None:
     from sl_nerfstudio.evaluation.result_json import to_json
     from sl_nerfstudio.evaluation.thumbnails import ThumbnailCollector
     from sl_nerfstudio.meshing.mesh_io import read_mesh
-    from sl_nerfstudio.scan import read_ground_truth, read_scan
+    from sl_nerfstudio.scan import read_devices, read_ground_truth, read_scan
     from sl_nerfstudio.scan.atomic import write_atomic
 
     mesh = read_mesh(config.mesh)
@@ -55,6 +55,7 @@ def evaluate_scan(config: EvalConfig) -> None:
     truth = read_ground_truth(scan)
     poses_path = config.poses / "transforms.json" if config.poses and config.poses.is_dir() else config.poses
     poses = read_poses_file(poses_path, scan) if poses_path else Poses(scan.T_world_camera, scan.T_world_projector)
+    scan = read_devices(poses_path, scan) if poses_path else scan
     true_poses = None
     if truth.T_world_camera is not None and truth.T_world_projector is not None:
         true_poses = Poses(truth.T_world_camera, truth.T_world_projector)

@@ -11,9 +11,12 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from sl_nerfstudio.dataparser.normalise import normalisation
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan, read_scan
+from sl_nerfstudio.scan.intrinsics import device_problems
+from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
 
 
 @dataclass
@@ -25,6 +28,9 @@ class SLDataParserConfig(DataParserConfig):
     """The scan folder, or its transforms.json."""
     downscale_factor: float | None = None
     """Shrink whole images by this factor in evaluation, rendering and the viewer. Training sees every pixel."""
+    intrinsics_change: IntrinsicsChange = UNCHANGED
+    """Added to the scan's intrinsics, as shares of the focal length: of the focal lengths, and of the principal point's
+    x and y; three numbers for the cameras, then three for the projector. `refine_intrinsics` fills them in."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,7 @@ class SLDataParser(DataParser):
     @property
     def loaded(self) -> LoadedScan:
         """The scan, its pixels and its normalisation. Raises UserError for a folder that cannot be used."""
-        return load_scan(self.config.data)
+        return load_scan(self.config.data, self.config.intrinsics_change)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: dict | None) -> DataparserOutputs:
         scan, S = self.loaded.scan, self.loaded.S_scene_world
@@ -100,13 +106,14 @@ def scan_root(data: Path) -> Path:
     return data.parent if data.name == "transforms.json" else data
 
 
-_remembered: dict[tuple[Path, int], LoadedScan] = {}
+_remembered: dict[tuple[Path, int], dict[IntrinsicsChange, LoadedScan]] = {}
 
 
-def load_scan(data: Path) -> LoadedScan:
+def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED) -> LoadedScan:
     """Read a scan with all of its pixels. The last one is remembered while its transforms.json is unchanged.
 
-    nerfstudio makes several dataparsers in one command; the pixels are read once.
+    nerfstudio makes several dataparsers in one command; the pixels are read once. Raises UserError for a folder that
+    cannot be used, or a change that makes impossible devices of its intrinsics.
     """
     root = scan_root(data)
     scan = read_scan(root)
@@ -114,8 +121,25 @@ def load_scan(data: Path) -> LoadedScan:
     if key not in _remembered:
         _remembered.clear()
         samples = build_samples(scan)
-        _remembered[key] = LoadedScan(scan, samples, normalisation(scan, samples))
-    return _remembered[key]
+        _remembered[key] = {UNCHANGED: LoadedScan(scan, samples, normalisation(scan, samples))}
+    loaded = _remembered[key]
+    if intrinsics_change not in loaded:
+        changed = scan.with_intrinsics_change(intrinsics_change)
+        _require_possible(changed)
+        samples = loaded[UNCHANGED].samples
+        loaded[intrinsics_change] = LoadedScan(changed, samples, normalisation(changed, samples))
+    return loaded[intrinsics_change]
+
+
+def _require_possible(scan: Scan) -> None:
+    """No device that cannot be true. Raises UserError."""
+    for device in {*(frame.camera for frame in scan.frames), scan.projector}:
+        for key, problem in device_problems(device):
+            raise UserError(
+                f"intrinsics_change {scan.intrinsics_change}: {key} {problem.problem}\n"
+                "    cause:  percent or pixels were given\n"
+                "    remedy: give shares of the focal length, 0.01 for one hundredth of it"
+            )
 
 
 sl_data = DataParserSpecification(config=SLDataParserConfig(), description="A scan with a moving pattern projector")

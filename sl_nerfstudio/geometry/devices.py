@@ -39,6 +39,19 @@ class Device:
     p2: float = 0.0
     model: DeviceKind = "OPENCV"
 
+    def changed(self, focal: float, x: float, y: float) -> "Device":
+        """The same device with its focal lengths longer by a share `focal`, its principal point moved by `x`, `y`.
+
+        All three are shares of fl_x, as `calibration.intrinsics_doubt` has them.
+        """
+        return replace(
+            self,
+            fl_x=self.fl_x * (1 + focal),
+            fl_y=self.fl_y * (1 + focal),
+            cx=self.cx + self.fl_x * x,
+            cy=self.cy + self.fl_x * y,
+        )
+
     def scaled(self, factor: float) -> "Device":
         """The same device with its image resized by `factor` (no half pixel: centres are at .5)."""
         return replace(

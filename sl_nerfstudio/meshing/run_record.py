@@ -39,6 +39,7 @@ def run_settings(config: Any) -> dict[str, Any]:
         **chosen,
         "data": str(config.pipeline.datamanager.data),
         "rays": config.pipeline.datamanager.train_num_rays_per_batch,
+        "intrinsics_change": list(config.pipeline.datamanager.dataparser.intrinsics_change),
         "model": plain(config.pipeline.model),
     }
 

@@ -62,6 +62,9 @@ class SLModelConfig(ModelConfig):
     all of them), `known-rig` (frames only), `static-projector` (frames, and a projector that never moves), `off`."""
     adjust_poses: bool = True
     """Adjust all poses jointly, by second-order steps on the decoded coordinates, before the first training step."""
+    refine_intrinsics: bool = False
+    """Where the captures contradict focal lengths and principal points, change those before training, if that makes
+    held-out pixels agree better; the scan folder stays as it is."""
     pose_parameters: Literal["rig", "independent"] = "rig"
     """`rig`: a frame moves as a whole and its projector against its camera; `independent`: each device by itself."""
     train_poses: bool = False

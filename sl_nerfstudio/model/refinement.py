@@ -45,20 +45,29 @@ class PriorConfig:
     relative_translation: float = 0.05
     """Position of the projector against the camera, as a share of the baseline."""
     intrinsics: float = INTRINSICS_SIGMA
-    """Focal lengths and principal points of both devices, as a share of the focal length; they stay as they are, but
-    poses are stated to be as uncertain as this makes them."""
+    """Focal lengths and principal points of both devices, as a share of the focal length; unless `refine_intrinsics`
+    is on they stay as they are, but poses are stated to be as uncertain as this makes them."""
 
 
 @dataclass(frozen=True)
 class Refinement:
     """Refined poses in the scene frame, or the starting ones where refinement did not help."""
 
-    T_scene_camera: Float[Tensor, "frames 4 4"]
-    T_scene_projector: Float[Tensor, "frames 4 4"]
+    rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
     verdict: Verdict
     noise_px: float
     intrinsics: IntrinsicsDoubt | None = None  # None where nothing was refined
+
+    @property
+    def T_scene_camera(self) -> Float[Tensor, "frames 4 4"]:
+        """Poses of the cameras."""
+        return self.rig.T_world_camera
+
+    @property
+    def T_scene_projector(self) -> Float[Tensor, "frames 4 4"]:
+        """Poses of the projectors."""
+        return self.rig.T_world_projector
 
     def message(self) -> str:
         """One line for the person who waits."""
@@ -107,7 +116,7 @@ def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> Po
     # a sigma of zero is a pose known exactly: a very small one keeps the equations solvable
     sigma = torch.tensor(np.maximum(np.array(rows), 1e-9), dtype=torch.float64)
     a, b, c, d = sigma.unbind(1)
-    return PosePrior(a, b, c, d, config.intrinsics)
+    return PosePrior(a, b, c, d, config.intrinsics, scan.intrinsics_change)
 
 
 def refine(
@@ -120,14 +129,13 @@ def refine(
 ) -> Refinement:
     """Adjust all poses jointly, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
-    maps, held_out = _maps(scan, samples)
+    maps, held_out = maps_and_held_out(scan, samples)
     stated = pose_prior(scan, S_scene_world, prior)
     found = adjust(constrained(mode, start), maps, stated, mode, settings)
     rig = restore(start, found.rig, _scale(scan, mode, start, found.rig, stated))
-    verdict = compare(start, rig, held_out, maps, max(_GUARD_WIDTH * found.noise_px, _GUARD_FLOOR_PX))
-    kept = rig if verdict.better else start
+    verdict = compare(start, rig, held_out, maps, guard_width(found.noise_px))
     sigma = found.sigma if verdict.better else _prior_sigma(stated)
-    return Refinement(kept.T_world_camera, kept.T_world_projector, sigma, verdict, found.noise_px, found.intrinsics)
+    return Refinement(rig if verdict.better else start, sigma, verdict, found.noise_px, found.intrinsics)
 
 
 def _scale(scan: Scan, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
@@ -144,7 +152,12 @@ def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:
     return torch.stack(parts, 1).repeat_interleave(3, 1)
 
 
-def _maps(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOut]:
+def guard_width(noise_px: float) -> float:
+    """From where on a held-out residual says nothing more, in projector pixels."""
+    return max(_GUARD_WIDTH * noise_px, _GUARD_FLOOR_PX)
+
+
+def maps_and_held_out(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOut]:
     """Coordinate images without the held-out pixels, and some of those."""
     images, frames, uv_camera, uv_projector = [], [], [], []
     for number, frame in enumerate(scan.frames):

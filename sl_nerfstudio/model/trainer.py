@@ -10,10 +10,13 @@ import torch
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
+from sl_nerfstudio.dataparser.dataparser import LoadedScan, SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.config import SLModelConfig
+from sl_nerfstudio.model.refined_intrinsics import refine_intrinsics
 from sl_nerfstudio.model.schedulers import DecaySchedulerConfig
 from sl_nerfstudio.scan import require_valid
+from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
 
 
 @dataclass
@@ -47,13 +50,18 @@ class SLTrainerConfig(TrainerConfig):
         _require_device(self.machine.device_type)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         require_valid(root)
-        load_scan(root)  # remembered for the data manager; tells whether rays meet at all
+        dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
+        loaded = load_scan(root, dataparser.intrinsics_change)  # remembered; tells whether rays meet at all
+        model: SLModelConfig = self.pipeline.model  # type: ignore[assignment]
+        if model.refine_intrinsics:
+            dataparser.intrinsics_change = _refined(loaded, model)
+            model.refine_intrinsics = False  # the settings that are saved hold what was found: --load-config goes on
         self.data = root
         self.pipeline.datamanager.data = root
         self.output_dir = self.output_dir.expanduser().absolute()
         if self.schedule_iterations is None:
             self.schedule_iterations = schedule_of(checkpoint) or self.max_num_iterations
-        self.pipeline.model.schedule_iterations = self.schedule_iterations  # type: ignore[attr-defined]
+        model.schedule_iterations = self.schedule_iterations
         self.optimizers = {
             name: {**group, "scheduler": _with_length(group["scheduler"], self.schedule_iterations)}
             for name, group in self.optimizers.items()
@@ -70,6 +78,24 @@ class SLTrainerConfig(TrainerConfig):
         if data == Path():
             raise UserError(f"no scan given. Add --data FOLDER: ns-train {self.method_name} --data FOLDER")
         return scan_root(data)
+
+
+def _refined(loaded: LoadedScan, model: SLModelConfig) -> IntrinsicsChange:
+    """The change of intrinsics that the captures ask for, told. Raises UserError for settings that exclude it."""
+    if loaded.scan.intrinsics_change != UNCHANGED:
+        raise UserError(
+            "--pipeline.model.refine-intrinsics: a change of intrinsics is given, too\n"
+            "    cause:  sl-data --intrinsics-change states it\n    remedy: leave out one"
+        )
+    if model.refine_poses == "off" or not model.adjust_poses:
+        raise UserError(
+            "--pipeline.model.refine-intrinsics: intrinsics are found together with the poses, and those are not to be "
+            "adjusted\n    cause:  refine-poses off, or adjust-poses False\n"
+            "    remedy: leave that out, or refine-intrinsics"
+        )
+    found = refine_intrinsics(loaded, model.refine_poses, model.prior, model.adjustment)
+    print(found.message(loaded.scan), flush=True)
+    return found.change
 
 
 def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConfig | None:

@@ -3,7 +3,7 @@
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.scan.examining import check_scan, require_valid
 from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.pose_files import read_ground_truth, read_poses, write_transforms
+from sl_nerfstudio.scan.pose_files import read_devices, read_ground_truth, read_poses, write_transforms
 from sl_nerfstudio.scan.reading import read_scan
 from sl_nerfstudio.scan.types import UNITS, Frame, GroundTruth, PoseSigma, Scale, Scan
 from sl_nerfstudio.scan.writing import ScanWriter
@@ -20,6 +20,7 @@ __all__ = [
     "ScanError",
     "ScanWriter",
     "check_scan",
+    "read_devices",
     "read_ground_truth",
     "read_poses",
     "read_scan",

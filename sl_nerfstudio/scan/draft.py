@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.scan.document import document_faults, frame_label, read_document
+from sl_nerfstudio.scan.document import Record, document_faults, frame_label, read_document
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.intrinsics import CAMERA_KEYS, PROJECTOR_KEYS, read_device
@@ -184,6 +184,22 @@ def _frame_camera(frame: Fields, top: Fields) -> Device | None:
         return None
     merged = {**{k: top.record[k] for k in CAMERA_KEYS if k in top.record}, **frame.record}
     return read_device(Fields(merged, frame.faults, frame.file, frame.frame), "camera")
+
+
+def draft_devices(document: Record, file: str, faults: Faults) -> tuple[Device | None, dict[str, Device]]:
+    """The projector, and the camera of each frame by its name, of a document that may say nothing of them."""
+    top = Fields(document, faults, file)
+    section = document.get("projector")
+    projector = None
+    if isinstance(section, dict) and "fl_x" in section:
+        projector = read_device(Fields(section, faults, file, prefix="projector."), "projector")
+    cameras: dict[str, Device] = {}
+    for index, record in enumerate(document["frames"]):
+        if "fl_x" in record or "fl_x" in document:
+            name = frame_label(record, index)
+            camera = _frame_camera(Fields(record, faults, file, name), top)
+            cameras.update({name: camera} if camera is not None else {})
+    return projector, cameras
 
 
 def _read_path(fields: Fields, key: str, root: Path) -> Path | None:

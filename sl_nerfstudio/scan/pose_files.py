@@ -1,6 +1,7 @@
-"""Other poses for the frames of a scan: true ones read, refined ones written, as a transforms.json."""
+"""Other poses and devices for the frames of a scan: true ones read, refined ones written, as a transforms.json."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,18 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import Fault, ScanError
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.document import Record, document_faults, frame_label, read_document
-from sl_nerfstudio.scan.draft import POSES, TRANSFORMS, read_pose
+from sl_nerfstudio.scan.draft import POSES, TRANSFORMS, draft_devices, read_pose
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.problem import Faults, Problem
-from sl_nerfstudio.scan.types import GroundTruth, Scan
+from sl_nerfstudio.scan.types import UNCHANGED, GroundTruth, Scan
 from sl_nerfstudio.scan.writing import encode_json, pose_fields
 
 GROUND_TRUTH = "ground_truth"
+_FOCAL_AND_CENTRE = ("fl_x", "fl_y", "cx", "cy")
 
 Poses = Float64[ndarray, "n 4 4"]
 
@@ -31,7 +34,7 @@ def write_transforms(
     extra_frame_fields: Sequence[dict[str, Any]] | None = None,
     extra_fields: dict[str, Any] | None = None,
 ) -> None:
-    """Write a copy of the scan's transforms.json with other poses; atomic.
+    """Write a copy of the scan's transforms.json with other poses, and intrinsics where those were changed; atomic.
 
     Everything else is kept, unknown keys too, except `sl_pose_sigma`, which spoke of the poses replaced here. Paths are
     kept as they are, relative to the scan folder: the copy is used by putting it there in place of the original.
@@ -53,7 +56,39 @@ def write_transforms(
         record.pop("sl_pose_sigma", None)
         record.update(pose_fields(T_world_camera[index], T_world_projector[index]))
         record.update(extras[index])
+    if scan.intrinsics_change != UNCHANGED:
+        _put_devices(document, scan)
     write_atomic(path, encode_json({**document, **(extra_fields or {})}))
+
+
+def _put_devices(document: Record, scan: Scan) -> None:
+    """The scan's focal lengths and principal points: of cameras that are all alike at the top, else in every frame."""
+    alike = len({frame.camera for frame in scan.frames}) == 1
+    _replace(document["projector"], scan.projector)
+    _replace(document, scan.frames[0].camera if alike else None)
+    for record, frame in zip(document["frames"], scan.frames, strict=True):
+        _replace(record, None if alike else frame.camera)
+
+
+def _replace(record: Record, device: Device | None) -> None:
+    for key in _FOCAL_AND_CENTRE:
+        record.pop(key, None)
+        if device is not None:
+            record[key] = getattr(device, key)
+
+
+def read_devices(path: Path, scan: Scan) -> Scan:
+    """The scan with the intrinsics of another transforms.json, such as a refined one; its own where that has none.
+
+    Frames are matched by name. Raises ScanError for a device whose numbers cannot be true.
+    """
+    document = _read(path, str(path.parent))
+    faults = Faults()
+    projector, cameras = draft_devices(document, path.name, faults)
+    if faults.found:
+        raise ScanError(faults.found, str(path.parent))
+    frames = tuple(replace(frame, camera=cameras.get(frame.name, frame.camera)) for frame in scan.frames)
+    return replace(scan, projector=projector or scan.projector, frames=frames)
 
 
 def read_poses(path: Path, scan: Scan) -> tuple[Poses | None, Poses | None]:

@@ -1,6 +1,6 @@
 """What a scan folder holds, as frozen dataclasses; files are opened only by the `read_*` methods."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,10 @@ from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.images import as_grey, read_image
 
 FORMAT = 1  # of the scan folder
+
+IntrinsicsChange = tuple[float, float, float, float, float, float]
+"""Shares of the focal length: of the focal lengths, and of the principal point's x and y; cameras, then projector."""
+UNCHANGED: IntrinsicsChange = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "arbitrary": None}
 """Units of length a scan may be given in, and their length in metres (None: not known)."""
@@ -87,6 +91,19 @@ class Scan:
     projector: Device
     pattern_path: Path
     frames: tuple[Frame, ...]
+    intrinsics_change: IntrinsicsChange = UNCHANGED  # of the devices here against those of transforms.json
+
+    def with_intrinsics_change(self, change: IntrinsicsChange) -> "Scan":
+        """The scan with other focal lengths and principal points. Raises ValueError if they were changed before."""
+        if self.intrinsics_change != UNCHANGED:
+            raise ValueError("the intrinsics of this scan were changed before")
+        camera, projector = change[:3], change[3:]
+        return replace(
+            self,
+            projector=self.projector.changed(*projector),
+            frames=tuple(replace(frame, camera=frame.camera.changed(*camera)) for frame in self.frames),
+            intrinsics_change=change,
+        )
 
     def read_pattern(self) -> Float32[ndarray, "h w"]:
         """The projected pattern in [0, 1]."""

@@ -11,7 +11,7 @@ from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt, with_int
 from sl_nerfstudio.calibration.linearisation import Anchors, Rig, linearise, residuals_of
 from sl_nerfstudio.calibration.observations import observe, place_anchors
 from sl_nerfstudio.calibration.pose_prior import PosePrior
-from sl_nerfstudio.geometry.devices import Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, log_se3
 
 from .analytic import ExactMaps, camera_of, disturbed, rig_of
@@ -111,12 +111,29 @@ def test_poses_found_with_wrong_intrinsics_that_are_taken_for_exact_are_stated_t
 
 
 def test_the_message_names_devices_units_and_remedy():
-    doubt = IntrinsicsDoubt(
-        torch.tensor([-0.0068, 0.0, 0.001, 0.0005, 0.0, 0.002], dtype=torch.float64),
-        torch.eye(6, dtype=torch.float64) * 0.0005**2,
-    )
-    text = doubt.message(600.0, 1200.0)
+    doubt = IntrinsicsDoubt.of((-0.0068, 0.0, 0.001, 0.0005, 0.0, 0.002), torch.eye(6, dtype=torch.float64) * 0.0005**2)
+    cameras = [Device(800, 600, focal, focal, 400.0, 300.0) for focal in (500.0, 600.0, 610.0)]
+    text = doubt.said(cameras, Device(1000, 800, 1200.0, 1200.0, 500.0, 400.0))
     assert doubt.serious and "chi square 206" in text
     assert "camera: focal length -0.68 ± 0.05 %, principal point (+0.0 ± 0.3, +0.6 ± 0.3) px" in text
     assert "projector: focal length +0.05 ± 0.05 %, principal point (+0.0 ± 0.6, +2.4 ± 0.6) px" in text
-    assert "cause:" in text and "remedy:" in text
+    assert "cause:" in text and "remedy:" in text and "--pipeline.model.refine-intrinsics True" in text
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_a_change_already_made_is_held_back_by_what_was_stated(share):
+    """Where the captures say little, the way back to the stated values is as strong as the way on was."""
+    far = torch.tensor([0.01, 0.0, 0.0, 0.0, 0.0, 0.0]).double()
+    sigma, found = 1e-6, []
+    for change in ((0.0,) * 6, tuple((share * far).tolist())):
+        parts = (torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.03, 0.02, 0.05, 0.02))
+        true = rig_of(FRAMES, SIZE)
+        told = replace(true, camera=changed(true.camera, change[:3]))
+        settings = AdjustmentSettings(anchors_per_frame=60, frames_per_anchor=3, max_iterations=14)
+        doubt = adjust(
+            told, ExactMaps.around(true, SIZE), PosePrior(*parts, sigma, change), "free", settings
+        ).intrinsics
+        assert doubt is not None
+        found.append(doubt.change)
+    assert found[0].abs().max() < 1e-6
+    assert torch.allclose(found[1], -share * far, rtol=0, atol=1e-4)

@@ -16,7 +16,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.meshing.trained_run import load_run
-from sl_nerfstudio.scan import read_poses, read_scan
+from sl_nerfstudio.scan import read_devices, read_poses, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 from tests.test_ns_commands import train
 
@@ -68,6 +68,24 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
     assert len(record["curves"]["step"]) > 0 and record["versions"]["torch"] == torch.__version__
     assert f"sl-eval --mesh '{mesh_path}' --data {scan_root} --poses {refined}/transforms.json" in said
     assert " cm\n" in said
+
+
+def test_a_run_with_changed_intrinsics_exports_them(scan_root, tmp_path, monkeypatch):
+    change = (0.01, 0.0, -0.002, -0.005, 0.001, 0.0)
+    flags = ("sl-data", "--intrinsics-change", *change)
+    config = train(monkeypatch, scan_root, tmp_path / "outputs", 2, *flags)
+    scan, stated = read_scan(scan_root), (scan_root / "transforms.json").read_bytes()
+    wanted = scan.with_intrinsics_change(change)
+    refined = tmp_path / "refined"
+    command(
+        monkeypatch, "--load-config", config, "--output", tmp_path / "m.ply", "--poses", refined, "--resolution", 32
+    )
+    found = read_devices(refined / "transforms.json", scan)
+    assert found.projector == wanted.projector != scan.projector
+    assert {frame.camera for frame in found.frames} == {frame.camera for frame in wanted.frames}
+    record = json.loads((refined / "training.json").read_text())
+    assert record["settings"]["intrinsics_change"] == list(change)
+    assert (scan_root / "transforms.json").read_bytes() == stated
 
 
 def test_faults_end_with_status_1_and_no_traceback(tmp_path, monkeypatch, capsys):

@@ -228,6 +228,45 @@ def test_scan_is_read_once_and_again_when_it_changes(tmp_path: Path) -> None:
     assert len(manager(root).train_dataset) == 2
 
 
+WRONG = (0.02, -0.01, 0.004, -0.015, 0.002, 0.006)
+
+
+def mended() -> tuple[float, float, float, float, float, float]:
+    """The change that takes WRONG back: shares of a focal length that is itself wrong."""
+    a, b, c, d, e, f = WRONG
+    return -a / (1 + a), -b / (1 + a), -c / (1 + a), -d / (1 + d), -e / (1 + d), -f / (1 + d)
+
+
+def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_right_scan(tmp_path: Path) -> None:
+    right = manager(TinyScan().write(tmp_path / "right"))
+    root = TinyScan().write(tmp_path / "wrong")
+    content = json.loads((root / "transforms.json").read_text())
+    for fields, (f, x, y) in ((content, WRONG[:3]), (content["projector"], WRONG[3:])):
+        fields.update(cx=fields["cx"] + x * fields["fl_x"], cy=fields["cy"] + y * fields["fl_x"])
+        fields.update(fl_x=fields["fl_x"] * (1 + f), fl_y=fields["fl_y"] * (1 + f))
+    (root / "transforms.json").write_text(json.dumps(content))
+    found = manager(root, dataparser=SLDataParserConfig(intrinsics_change=mended()))
+    (rays, batch), (other_rays, other_batch) = found.next_train(3), right.next_train(3)
+    torch.testing.assert_close(rays.directions, other_rays.directions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(batch, other_batch, rtol=0, atol=0, equal_nan=True)
+    loaded, other = found.dataparser.loaded, right.dataparser.loaded
+    assert loaded.scan.intrinsics_change == mended() and other.scan.intrinsics_change == (0.0,) * 6
+    assert loaded.scan.projector.fl_x == pytest.approx(other.scan.projector.fl_x, rel=1e-14)
+    np.testing.assert_allclose(loaded.S_scene_world.matrix(), other.S_scene_world.matrix(), atol=1e-9)
+    cameras = [m.train_dataset.cameras for m in (found, right)]
+    torch.testing.assert_close(cameras[0].fx, cameras[1].fx)
+    torch.testing.assert_close(cameras[0].cy, cameras[1].cy)
+    wrong = manager(root)  # the same folder, as it is stated: not what was remembered with the change
+    assert (wrong.next_train(3)[0].directions - other_rays.directions).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("which, value", [(3, -1.0), (1, 40.0), (4, float("nan"))])
+def test_a_change_in_percent_or_pixels_is_refused(tiny_root: Path, which: int, value: float) -> None:
+    a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
+    with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
+        manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=(a, b, c, d, e, f)))
+
+
 def test_transforms_json_itself_may_be_named(tiny_root: Path) -> None:
     assert sl_data.config.__class__ is SLDataParserConfig
     assert len(manager(tiny_root / "transforms.json").train_dataset) == 3

@@ -1,5 +1,6 @@
 """From a scan on disk to refined poses: right ones in, right ones out; useless ones refused."""
 
+import copy
 from dataclasses import replace
 from math import radians
 from pathlib import Path
@@ -11,9 +12,13 @@ import torch
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
 from sl_nerfstudio.calibration.guard import Verdict
 from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.dataparser.samples import build_samples
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.methods import sl_neus
+from sl_nerfstudio.model.refined_intrinsics import RefinedIntrinsics, refine_intrinsics
 from sl_nerfstudio.model.refinement import (
     PriorConfig,
     Refinement,
@@ -23,6 +28,7 @@ from sl_nerfstudio.model.refinement import (
     sigmas_in_scan_units,
 )
 from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, read_scan
+from sl_nerfstudio.scan.types import UNCHANGED
 
 from ..calibration.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
 
@@ -57,7 +63,7 @@ def scan(true, tmp_path_factory) -> Scan:
         units="mm",
         scale=Scale(True, "baseline of frame 1"),
         projector=PROJECTORS["pinhole"],
-        pattern=np.zeros((400, 400), dtype=np.uint8),
+        pattern=np.tile(np.arange(0, 200, dtype=np.uint8), (400, 2)),
         camera=camera_of(SIZE),
     ) as writer:
         for k, (coords, c, p) in enumerate(zip(images_of(true, SIZE), *in_mm(true), strict=True)):
@@ -116,10 +122,9 @@ def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
     assert found.message().startswith("Poses NOT changed") and found.message().endswith("starting poses are kept.")
 
 
-def test_the_message_tells_both_figures():
+def test_the_message_tells_both_figures(true):
     verdict = Verdict(before_px=3.0, after_px=0.25)
-    poses = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
-    text = Refinement(poses, poses, torch.zeros(2, 12), verdict, 0.1).message()
+    text = Refinement(true, torch.zeros(FRAMES, 12), verdict, 0.1).message()
     assert text == "Poses adjusted: held-out pixels agree to 0.25 px, before 3 px."
 
 
@@ -145,3 +150,81 @@ def test_sigmas_in_units_for_people():
     assert found == pytest.approx(
         [MM * 0.05 / 3**0.5, 0.1 * degree, MM * 0.06 / 3**0.5, 0.2 * degree / 3**0.5], rel=1e-5
     )
+
+
+MENDABLE = (-0.009, 0.003, 0.0, 0.007, 0.0, -0.004)
+
+
+def stated_with(scan: Scan, change: tuple[float, float, float, float, float, float]) -> LoadedScan:
+    """The scan as a folder that states other intrinsics would be loaded."""
+    wrong = replace(scan.with_intrinsics_change(change), intrinsics_change=UNCHANGED)
+    return LoadedScan(wrong, build_samples(scan), S_SCENE_WORLD)
+
+
+def relative_error(found: Refinement, true: Rig) -> float:
+    return float((found.rig.T_camera_projector - true.T_camera_projector).abs().max())
+
+
+@pytest.fixture(scope="module")
+def mended(scan) -> RefinedIntrinsics:
+    return refine_intrinsics(stated_with(scan, MENDABLE), "free", PriorConfig(), QUICK)
+
+
+def test_wrong_intrinsics_are_taken_back_and_poses_with_them(scan, true, mended):
+    """In images of 80 pixels one cannot see that both focal lengths are too long, but that one is against the other."""
+    loaded = stated_with(scan, MENDABLE)
+    assert mended.before.intrinsics is not None and mended.before.intrinsics.serious
+    assert mended.held_out.better and mended.after.verdict.better
+    changed = loaded.scan.with_intrinsics_change(mended.change)
+    ratio = changed.frames[0].camera.fl_x / scan.frames[0].camera.fl_x / (changed.projector.fl_x / scan.projector.fl_x)
+    assert abs(ratio - 1) < 0.1 * abs((1 + MENDABLE[0]) / (1 + MENDABLE[3]) - 1)
+    assert relative_error(mended.after, true) < 0.1 * relative_error(mended.before, true)
+    text = mended.message(loaded.scan)
+    assert text.startswith("Intrinsics changed (chi square ") and "camera: focal length +0." in text
+    assert "projector: focal length -" in text
+
+
+def test_right_intrinsics_stay_exactly_as_they_are(scan):
+    found = refine_intrinsics(stated_with(scan, UNCHANGED), "free", PriorConfig(), QUICK)
+    assert found.change == UNCHANGED and found.after is found.before
+    assert found.message(scan).startswith("Intrinsics NOT changed: the captures agree with them (chi square ")
+
+
+def test_a_run_takes_the_change_into_its_settings(scan, mended, monkeypatch, capsys):
+    """Everything that opens the run later reads those, and so the same devices."""
+    asked = []
+
+    def found(*question) -> RefinedIntrinsics:
+        asked.append(question)
+        return mended
+
+    monkeypatch.setattr("sl_nerfstudio.model.trainer.refine_intrinsics", found)
+    config = copy.deepcopy(sl_neus.config)
+    config.data = config.pipeline.datamanager.data = scan.root
+    model = config.pipeline.model
+    model.refine_intrinsics, model.refine_poses = True, "rigid-rig"
+    config.prepare()
+    assert config.pipeline.datamanager.dataparser.intrinsics_change == mended.change != UNCHANGED
+    ((loaded, *question),) = asked
+    assert loaded.scan.root == scan.root and question == ["rigid-rig", model.prior, model.adjustment]
+    config.prepare()  # as a saved and loaded configuration is: nothing is asked again
+    assert len(asked) == 1 and config.pipeline.datamanager.dataparser.intrinsics_change == mended.change
+    assert "Intrinsics changed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "settings, change, said",
+    [
+        ({"refine_poses": "off"}, UNCHANGED, "those are not to be adjusted"),
+        ({"adjust_poses": False}, UNCHANGED, "those are not to be adjusted"),
+        ({}, MENDABLE, "a change of intrinsics is given, too"),
+    ],
+)
+def test_intrinsics_are_not_refined_without_poses_nor_twice(scan, settings, change, said):
+    config = copy.deepcopy(sl_neus.config)
+    config.data = config.pipeline.datamanager.data = scan.root
+    config.pipeline.datamanager.dataparser.intrinsics_change = change
+    for name, value in {"refine_intrinsics": True, **settings}.items():
+        setattr(config.pipeline.model, name, value)
+    with pytest.raises(UserError, match=said):
+        config.prepare()

@@ -13,7 +13,7 @@ from sl_nerfstudio.errors import ScanError, UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import PoseSigma, Scale, ScanWriter, check_scan, read_ground_truth, read_poses, read_scan
 from sl_nerfstudio.scan.atomic import write_atomic
-from sl_nerfstudio.scan.pose_files import write_transforms
+from sl_nerfstudio.scan.pose_files import read_devices, write_transforms
 
 
 def files(root: Path) -> set[str]:
@@ -274,6 +274,55 @@ def test_refined_poses_keep_everything_else(sphere: Path) -> None:
     target.replace(sphere / "transforms.json")
     assert check_scan(sphere) == []
     assert np.array_equal(read_scan(sphere).T_world_camera, T_c)
+
+
+CHANGE = (0.01, -0.002, 0.003, -0.008, 0.004, 0.001)
+
+
+@pytest.mark.parametrize("own_cameras", [False, True])
+def test_changed_intrinsics_are_written_and_read_beside_the_scans_own(sphere: Path, own_cameras: bool) -> None:
+    def give_every_frame_its_own(document: dict[str, Any]) -> None:
+        common = {key: document.pop(key) for key in ("fl_x", "fl_y", "cx")}
+        for index, record in enumerate(document["frames"]):
+            record.update(common | {"fl_x": common["fl_x"] + index})
+
+    if own_cameras:
+        edit(sphere, give_every_frame_its_own)
+    scan, stated = read_scan(sphere), (sphere / "transforms.json").read_bytes()
+    changed = scan.with_intrinsics_change(CHANGE)
+    for old, new, (f, x, y) in (
+        (scan.frames[2].camera, changed.frames[2].camera, CHANGE[:3]),
+        (scan.projector, changed.projector, CHANGE[3:]),
+    ):
+        assert (new.fl_x, new.fl_y) == pytest.approx((old.fl_x * (1 + f), old.fl_y * (1 + f)), rel=1e-15)
+        assert (new.cx - old.cx, new.cy - old.cy) == pytest.approx((old.fl_x * x, old.fl_x * y), rel=1e-9)
+        assert (new.w, new.h, new.k1, new.model) == (old.w, old.h, old.k1, old.model)
+    with pytest.raises(ValueError, match="changed before"):
+        changed.with_intrinsics_change(CHANGE)
+    target = sphere.parent / "refined" / "transforms.json"
+    write_transforms(target, changed, scan.T_world_camera, scan.T_world_projector)
+    assert (sphere / "transforms.json").read_bytes() == stated
+    found = read_devices(target, scan)
+    assert [frame.camera for frame in found.frames] == [frame.camera for frame in changed.frames]
+    assert found.projector == changed.projector
+    target.replace(sphere / "transforms.json")  # and a scan with it is a scan
+    assert check_scan(sphere) == []
+    assert [frame.camera for frame in read_scan(sphere).frames] == [frame.camera for frame in changed.frames]
+
+
+def test_a_file_of_poses_may_say_nothing_of_devices_but_nothing_false(sphere: Path, tmp_path: Path) -> None:
+    scan = read_scan(sphere)
+    document = json.loads((sphere / "transforms.json").read_text())
+    frames = [{"file_path": record["file_path"]} for record in document["frames"]]
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps({"frames": frames}))
+    found = read_devices(path, scan)
+    assert found.projector == scan.projector
+    assert [frame.camera for frame in found.frames] == [frame.camera for frame in scan.frames]
+    path.write_text(json.dumps({**document, "fl_x": -1.0}))
+    with pytest.raises(ScanError, match="fl_x: is -1") as error:
+        read_devices(path, scan)
+    assert "poses.json" in str(error.value)
 
 
 def test_wrong_numbers_of_poses_are_refused(sphere: Path) -> None:

@@ -1,0 +1,75 @@
+"""Intrinsics that agree better with the captures: found before training, kept only if held-out pixels say so, too."""
+
+from dataclasses import dataclass
+
+from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
+from sl_nerfstudio.calibration.guard import Verdict, compare
+from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
+from sl_nerfstudio.calibration.modes import RefinePoses
+from sl_nerfstudio.dataparser.dataparser import LoadedScan
+from sl_nerfstudio.model.refinement import PriorConfig, Refinement, guard_width, maps_and_held_out, refine
+from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
+
+_ROUNDS = 3  # Gauss-Newton steps of the intrinsics, with all poses adjusted anew after each
+_AGREED = 6.0  # chi square that right intrinsics have
+
+
+@dataclass(frozen=True)
+class RefinedIntrinsics:
+    """How intrinsics were changed; `change` is UNCHANGED where they were not."""
+
+    change: IntrinsicsChange
+    before: Refinement
+    after: Refinement
+    held_out: Verdict  # how held-out pixels agree with the rigs before and after
+
+    def message(self, stated: Scan) -> str:
+        """For the person who waits; `stated` is the scan with the devices of its transforms.json."""
+        if self.before.intrinsics is None or self.after.intrinsics is None:
+            return "Intrinsics NOT changed: no frame sees what another one decoded."
+        chi = f"chi square {self.before.intrinsics.chi_square:.0f}"
+        if self.change == UNCHANGED:
+            serious = self.before.intrinsics.serious
+            why = "other ones did not help held-out pixels" if serious else f"the captures agree with them ({chi})"
+            return f"Intrinsics NOT changed: {why}."
+        total = IntrinsicsDoubt.of(self.change, self.after.intrinsics.covariance)
+        return "\n".join(
+            [
+                f"Intrinsics changed ({chi} before, {self.after.intrinsics.chi_square:.0f} now; held-out pixels agree "
+                f"to {self.held_out.after_px:.3g} px, before {self.held_out.before_px:.3g} px):",
+                *total.lines([frame.camera for frame in stated.frames], stated.projector),
+            ]
+        )
+
+
+def refine_intrinsics(
+    loaded: LoadedScan, mode: RefinePoses, prior: PriorConfig, settings: AdjustmentSettings
+) -> RefinedIntrinsics:
+    """Change the intrinsics as far as the captures contradict them, adjusting all poses with each change.
+
+    `loaded` holds the scan as it is stated. Intrinsics that are believed stay exactly as they are.
+    """
+
+    def adjusted(change: IntrinsicsChange) -> Refinement:
+        scan = loaded.scan.with_intrinsics_change(change)
+        return refine(scan, loaded.S_scene_world, loaded.samples, mode, prior, settings)
+
+    before = adjusted(UNCHANGED)
+    best = RefinedIntrinsics(UNCHANGED, before, before, Verdict(before.verdict.after_px, before.verdict.after_px))
+    if before.intrinsics is None or not before.intrinsics.serious:
+        return best
+    maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
+    for _ in range(_ROUNDS):
+        doubt = best.after.intrinsics
+        if doubt is None or doubt.chi_square < _AGREED:
+            break
+        a, b, c, d, e, f = (old + new for old, new in zip(best.change, doubt.change.tolist(), strict=True))
+        found = adjusted((a, b, c, d, e, f))
+        width = guard_width(before.noise_px)
+        if not compare(best.after.rig, found.rig, held_out, maps, width).better:
+            break
+        best = RefinedIntrinsics(
+            (a, b, c, d, e, f), before, found, compare(before.rig, found.rig, held_out, maps, width)
+        )
+    return best
