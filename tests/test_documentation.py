@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -108,8 +110,11 @@ def test_commands_and_their_flags_exist(page):
         elif command.startswith("ns-"):
             sub = next((word for word in words if not word.startswith("-")), "")
             settings = nerfstudio_command(command, sub)
-            for flag in flags_of(words):
+            end = words.index("sl-data") if "sl-data" in words else len(words)  # what follows is the dataparser's
+            for flag in flags_of(words[:end]):
                 assert flag == "--help" or has_field(settings, flag), f"{command}: no flag {flag}"
+            for flag in flags_of(words[end:]):
+                assert has_field(SLDataParserConfig, flag), f"sl-data: no flag {flag}"
         elif command == "python" and words[0] != "-m":
             assert (ROOT / words[0]).is_file(), words
         elif command == "python" and words[1] not in ("pytest", "pip"):
