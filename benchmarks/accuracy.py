@@ -51,7 +51,7 @@ class Row(Score):
     variant: str
 
 
-def measure(scene: str, seed: int, iterations: int, folder: Path, variants: Sequence[str]) -> list[Row]:
+def measure(scene: str, seed: int, method: str, iterations: int, folder: Path, variants: Sequence[str]) -> list[Row]:
     """All variants on one scan."""
     scan = folder / "scan"
     run("sl-synth", "--output", str(scan), "--scene", scene, "--frames", str(FRAMES[scene]), "--seed", str(seed))
@@ -59,7 +59,7 @@ def measure(scene: str, seed: int, iterations: int, folder: Path, variants: Sequ
     for variant in variants:
         data = with_true_poses(scan, folder / "true") if variant == "oracle" else scan
         options = ("--max-num-iterations", str(iterations), *VARIANTS[variant])
-        score = train_and_score(data, folder, variant, options)
+        score = train_and_score(data, folder, variant, options, method)
         print(f"{scene:18} {seed:4} {variant:17} {score.text()}", flush=True)
         rows.append(Row(**asdict(score), scene=scene, seed=seed, variant=variant))
     return rows
@@ -71,6 +71,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(FRAMES), choices=FRAMES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--variants", nargs="+", default=list(COMPARED), choices=VARIANTS)
+    parser.add_argument("--method", default="sl-neus", choices=("sl-neus", "sl-neus-paper"))
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--folder", type=Path, default=Path("outputs/accuracy"), help="must not exist yet")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/accuracy.json"))
@@ -81,8 +82,8 @@ def main() -> None:
         for scene in options.scenes:
             folder = options.folder / f"{scene}-{seed}"
             folder.mkdir()
-            rows += measure(scene, seed, options.iterations, folder, options.variants)
-            write_rows(options.output, rows, iterations=options.iterations)
+            rows += measure(scene, seed, options.method, options.iterations, folder, options.variants)
+            write_rows(options.output, rows, method=options.method, iterations=options.iterations)
 
 
 if __name__ == "__main__":

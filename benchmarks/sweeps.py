@@ -25,7 +25,7 @@ TIME = {
     "sl-neus": ("sl-neus", (), (100, 200, 400, 1000)),
     "oracle": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400, 1000)),
     "unrefined": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400)),
-    "sl-neus-paper": ("sl-neus-paper", (), (100, 300, 1000)),
+    "sl-neus-paper": ("sl-neus-paper", (), (100, 300, 1000, 10_000)),
 }
 SWEEPS = (*SYNTH, "time")
 
