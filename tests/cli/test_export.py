@@ -64,7 +64,11 @@ def run_of(scan: Scan, sigma: np.ndarray | None = None) -> TrainedRun:
         method_name="sl-neus",
         max_num_iterations=10,
         pipeline=SimpleNamespace(
-            datamanager=SimpleNamespace(data=scan.root, train_num_rays_per_batch=7),
+            datamanager=SimpleNamespace(
+                data=scan.root,
+                train_num_rays_per_batch=7,
+                dataparser=SimpleNamespace(intrinsics_change=scan.intrinsics_change),
+            ),
             model={"lr": 1e-3, "where": Path("a")},
         ),
     )
