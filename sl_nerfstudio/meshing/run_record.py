@@ -9,6 +9,8 @@ from typing import Any
 import torch
 
 from sl_nerfstudio.meshing.trained_run import TrainedRun
+from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.types import UNCHANGED
 
 _PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", "open3d")
 _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
@@ -17,7 +19,7 @@ _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_
 def training_record(run: TrainedRun) -> dict[str, Any]:
     """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
 
-    The last is what the captures say against the intrinsics ("": nothing).
+    The last says how intrinsics were changed, and what the captures say against them ("": nothing).
     """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
@@ -28,8 +30,19 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
             "device": _device(run.model.device),
         },
         "curves": {name: plain(values) for name, values in run.model.history().items()},
-        "intrinsics": run.model.intrinsics_doubt(),
+        "intrinsics": "\n".join(filter(None, (_changed(run.model.scan), run.model.intrinsics_doubt()))),
     }
+
+
+def _changed(scan: Scan) -> str:
+    """That the run's intrinsics are not those of the scan folder; "" if they are."""
+    if scan.intrinsics_change == UNCHANGED:
+        return ""
+    camera, projector = 100 * scan.intrinsics_change[0], 100 * scan.intrinsics_change[3]
+    return (
+        f"The intrinsics are not those of the scan folder: focal length of the camera {camera:+.2f} %, of the "
+        f"projector {projector:+.2f} %. The transforms.json of the refined poses holds them"
+    )
 
 
 def run_settings(config: Any) -> dict[str, Any]:
