@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import write_rows
+from benchmarks.scans import made_once
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
-from sl_nerfstudio.dataparser.dataparser import LoadedScan, load_scan
+from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.poses import compare_poses
 from sl_nerfstudio.model.refinement import PriorConfig, refine
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.setup import Setup, make_setup
-from sl_nerfstudio.synthesis.synthesise import synthesise
 
 LEVELS = (
     (0.0, 0.0),
@@ -103,10 +103,7 @@ def main() -> None:
     rows: list[Row] = []
     for seed in options.seeds:
         config = SynthConfig(scene=options.scene, frames=options.frames, resolution=options.resolution, seed=seed)
-        folder = options.folder / f"{options.scene}-{options.frames}-{options.resolution}-{seed}"
-        if not folder.exists():
-            synthesise(config, folder)
-        loaded = load_scan(folder)
+        loaded = made_once(config, options.folder)
         for level in LEVELS:
             rows.append(measure(loaded, make_setup(replace(config, pose_error=level)), seed, level))
             print(text(rows[-1]), flush=True)

@@ -15,15 +15,15 @@ import numpy as np
 
 from benchmarks.accuracy import FRAMES
 from benchmarks.machine import write_rows
+from benchmarks.scans import made_once
 from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adjust
 from sl_nerfstudio.calibration.gauge import agreeing_scale, baseline_scale, known_baseline, restore
 from sl_nerfstudio.calibration.linearisation import Rig
-from sl_nerfstudio.dataparser.dataparser import LoadedScan, load_scan
+from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.poses import compare_poses
 from sl_nerfstudio.model.refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.synthesise import synthesise
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,8 @@ def main() -> None:
     rows: list[Row] = []
     for scene in options.scenes:
         for seed in options.seeds:
-            folder = options.folder / f"{scene}-{seed}"
-            if not folder.exists():
-                synthesise(SynthConfig(scene=scene, frames=FRAMES[scene], seed=seed), folder)
-            for row in measure(load_scan(folder), scene, seed):
+            loaded = made_once(SynthConfig(scene=scene, frames=FRAMES[scene], seed=seed), options.folder)
+            for row in measure(loaded, scene, seed):
                 rows.append(row)
                 moved = f"centre {row.shift_mm:6.2f} mm  turned {row.turn_deg:5.2f} deg"
                 print(f"{scene:18} {seed:3} {row.rule:22} lengths {row.scale_percent:+7.3f} %  {moved}", flush=True)

@@ -22,14 +22,14 @@ class RefinedIntrinsics:
     change: IntrinsicsChange
     before: Refinement
     after: Refinement
-    held_out: Verdict  # how held-out pixels agree with the rigs before and after
+    held_out: Verdict | None = None  # how held-out pixels agree with both rigs; None where the stated ones are believed
 
     def message(self, stated: Scan) -> str:
         """For the person who waits; `stated` is the scan with the devices of its transforms.json."""
         if self.before.intrinsics is None or self.after.intrinsics is None:
             return "Intrinsics NOT changed: no frame sees what another one decoded."
         chi = f"chi square {self.before.intrinsics.chi_square:.0f}"
-        if self.change == UNCHANGED:
+        if self.change == UNCHANGED or self.held_out is None:
             serious = self.before.intrinsics.serious
             why = "other ones did not help held-out pixels" if serious else f"the captures agree with them ({chi})"
             return f"Intrinsics NOT changed: {why}."
@@ -56,20 +56,21 @@ def refine_intrinsics(
         return refine(scan, loaded.S_scene_world, loaded.samples, mode, prior, settings)
 
     before = adjusted(UNCHANGED)
-    best = RefinedIntrinsics(UNCHANGED, before, before, Verdict(before.verdict.after_px, before.verdict.after_px))
     if before.intrinsics is None or not before.intrinsics.serious:
-        return best
+        return RefinedIntrinsics(UNCHANGED, before, before)
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
+
+    def judged(one: Refinement, other: Refinement) -> Verdict:
+        return compare(one.rig, other.rig, held_out, maps, guard_width(before.noise_px))
+
+    change, after = UNCHANGED, before
     for _ in range(_ROUNDS):
-        doubt = best.after.intrinsics
+        doubt = after.intrinsics
         if doubt is None or doubt.chi_square < _AGREED:
             break
-        a, b, c, d, e, f = (old + new for old, new in zip(best.change, doubt.change.tolist(), strict=True))
+        a, b, c, d, e, f = (old + new for old, new in zip(change, doubt.change.tolist(), strict=True))
         found = adjusted((a, b, c, d, e, f))
-        width = guard_width(before.noise_px)
-        if not compare(best.after.rig, found.rig, held_out, maps, width).better:
+        if not judged(after, found).better:
             break
-        best = RefinedIntrinsics(
-            (a, b, c, d, e, f), before, found, compare(before.rig, found.rig, held_out, maps, width)
-        )
-    return best
+        change, after = (a, b, c, d, e, f), found
+    return RefinedIntrinsics(change, before, after, judged(before, after))

@@ -198,7 +198,8 @@ def draft_devices(document: Record, file: str, faults: Faults) -> tuple[Device |
         if "fl_x" in record or "fl_x" in document:
             name = frame_label(record, index)
             camera = _frame_camera(Fields(record, faults, file, name), top)
-            cameras.update({name: camera} if camera is not None else {})
+            if camera is not None:
+                cameras[name] = camera
     return projector, cameras
 
 
