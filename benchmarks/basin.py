@@ -17,10 +17,10 @@ import numpy as np
 
 from benchmarks.machine import write_rows
 from benchmarks.scans import made_once
-from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.evaluation.poses import compare_poses
-from sl_nerfstudio.model.refinement import PriorConfig, refine
+from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.setup import Setup, make_setup
@@ -65,7 +65,7 @@ def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, flo
     """Adjust one set of starting poses."""
     start, truth = setup.start, (setup.truth.T_world_camera, setup.truth.T_world_projector)
     begin = time.monotonic()
-    found = refine(
+    found = adjust_scan(
         from_errors(loaded.scan, setup),
         loaded.S_scene_world,
         loaded.samples,

@@ -17,8 +17,8 @@ from numpy import ndarray
 
 from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.decoding.network import NetworkDecoder
-from sl_nerfstudio.decoding.types import DecodingError
+from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.noise import disturb_image
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream

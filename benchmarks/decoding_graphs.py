@@ -10,12 +10,12 @@ import numpy as np
 import torch
 import tyro
 
+from benchmarks.baselines.window_matching import match_windows
 from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.decoding.gcn import turned_pattern
-from sl_nerfstudio.decoding.graph import neighbourhoods
-from sl_nerfstudio.decoding.network import NetworkDecoder
-from sl_nerfstudio.decoding.window_matching import match_windows
+from sl_nerfstudio.decoding.grid.gcn import turned_pattern
+from sl_nerfstudio.decoding.grid.graph import neighbourhoods
+from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, DamagedGraph, damage_graph
 

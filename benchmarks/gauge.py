@@ -16,12 +16,12 @@ import numpy as np
 from benchmarks.accuracy import FRAMES
 from benchmarks.machine import write_rows
 from benchmarks.scans import made_once
-from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings, adjust
-from sl_nerfstudio.calibration.gauge import agreeing_scale, baseline_scale, known_baseline, restore
-from sl_nerfstudio.calibration.linearisation import Rig
+from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings, adjust
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.evaluation.poses import compare_poses
-from sl_nerfstudio.model.refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
+from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.model.pose_refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
 

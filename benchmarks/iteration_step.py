@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sl_nerfstudio.model.field import FieldConfig, SDFField
-from sl_nerfstudio.model.field_torch import knee
-from sl_nerfstudio.model.optim import RowAdam
+from sl_nerfstudio.field.row_adam import RowAdam
+from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
+from sl_nerfstudio.field.torch_backend import knee
 
 KAPPA = 100.0
 FRAMES = 22

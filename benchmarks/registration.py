@@ -20,12 +20,12 @@ import numpy as np
 from numpy import ndarray
 
 from benchmarks.machine import write_rows
-from sl_nerfstudio.calibration.correspondence_rays import correspondences_of
-from sl_nerfstudio.calibration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.calibration.joint_poses import joint_poses
-from sl_nerfstudio.calibration.registration import register
-from sl_nerfstudio.calibration.relative_pose import calibrate_frame
+from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
@@ -86,13 +86,13 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
     """All frames, one by one."""
     from scipy.spatial.transform import Rotation
 
-    from sl_nerfstudio.calibration.epipolar_fit import direction_basis
+    from sl_nerfstudio.relative_pose.epipolar_fit import direction_basis
 
     clouds, rows = [], []
     start = time.process_time()
     for frame, T in zip(scan.frames, true_relative, strict=True):
         coords = frame.read_coords()
-        pose = calibrate_frame(*correspondences_of(coords), frame.camera, scan.projector)
+        pose = estimate_relative_pose(*correspondences_of(coords), frame.camera, scan.projector)
         clouds.append(frame_cloud(frame.name, coords, frame.camera, scan.projector, pose))
         found, b = pose.T_camera_projector, T[:3, 3] / np.linalg.norm(T[:3, 3])
         w = Rotation.from_matrix(T[:3, :3] @ found[:3, :3].T).as_rotvec()
@@ -157,7 +157,7 @@ def measure(root: Path, sequence: bool = True) -> Row:
     start = time.process_time()
     found = register(clouds, sequence)
     middle = time.process_time()
-    joint = joint_poses(clouds, found)
+    joint = adjust_registered(clouds, found)
     end = time.process_time()
     baseline = np.linalg.norm(joint.T_world_camera[:, :3, 3] - joint.T_world_projector[:, :3, 3], axis=1)
     return Row(

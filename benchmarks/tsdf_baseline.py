@@ -10,15 +10,15 @@ from typing import Annotated
 
 import tyro
 
+from benchmarks.baselines.icp_registration import register
+from benchmarks.baselines.tsdf import fuse
 from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
-from sl_nerfstudio.evaluation.poses import compare_poses
-from sl_nerfstudio.evaluation.registration import register
+from sl_nerfstudio.evaluation.pose_errors import compare_poses
 from sl_nerfstudio.evaluation.surface import Surface
-from sl_nerfstudio.evaluation.tsdf import fuse
 from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
 from sl_nerfstudio.scan import read_ground_truth, read_scan
 

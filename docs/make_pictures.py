@@ -16,7 +16,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from sl_nerfstudio.evaluation.pictures import ColourScale, View, render
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, View, render
 from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh_io import read_mesh

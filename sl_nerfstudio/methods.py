@@ -9,8 +9,8 @@ from nerfstudio.plugins.types import MethodSpecification
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.model import paper_model
+from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
-from sl_nerfstudio.model.schedulers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 
 # nerfstudio 1.1.5 indexes its cameras in a way that torch has deprecated: ten lines of warning before every picture

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from sl_nerfstudio.decoding.unet import Reading, UNet
+from sl_nerfstudio.decoding.grid.unet import Reading, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
 from training.records import cosine_rate, log_row, save_weights

@@ -9,7 +9,7 @@ import tyro
 from sl_nerfstudio.cli.run import run
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.scan.examining import Examination
+    from sl_nerfstudio.scan.check.examination import Examination
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
         folder: The scan folder, which holds transforms.json.
     """
     from sl_nerfstudio.errors import ScanError
-    from sl_nerfstudio.scan.examining import examine
+    from sl_nerfstudio.scan.check.examination import examine
 
     result = examine(folder)
     if result.faults:

@@ -44,8 +44,8 @@ def evaluate_scan(config: EvalConfig) -> None:
     _check(config)
     from sl_nerfstudio.cli.evaluate_files import read_poses_file, read_reference, read_sigmas, read_training
     from sl_nerfstudio.evaluation.evaluate import Poses, evaluate
+    from sl_nerfstudio.evaluation.report.thumbnails import ThumbnailCollector
     from sl_nerfstudio.evaluation.result_json import to_json
-    from sl_nerfstudio.evaluation.thumbnails import ThumbnailCollector
     from sl_nerfstudio.meshing.mesh_io import read_mesh
     from sl_nerfstudio.scan import read_devices, read_ground_truth, read_scan
     from sl_nerfstudio.scan.atomic import write_atomic
@@ -71,7 +71,7 @@ def evaluate_scan(config: EvalConfig) -> None:
     if config.json:
         results[config.json] = json.dumps(to_json(evaluation), indent=2, allow_nan=False) + "\n"
     if config.report:
-        from sl_nerfstudio.evaluation.report import ReportInput, render_report
+        from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
         results[config.report] = render_report(
             ReportInput(

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from sl_nerfstudio.meshing.mesh import Mesh
-    from sl_nerfstudio.meshing.trained_run import TrainedModel, TrainedRun
     from sl_nerfstudio.meshing.trim import Trimmed
+    from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
 
 _SUSPICIOUS_PX = 3.0
 
@@ -50,7 +50,7 @@ def main() -> None:
 def export(config: ExportConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can mend."""
     check_outputs(config)
-    from sl_nerfstudio.meshing.trained_run import load_run
+    from sl_nerfstudio.runs.trained_run import load_run
 
     print(export_run(load_run(config.load_config, config.data), config))
 
@@ -108,7 +108,7 @@ def export_run(run: "TrainedRun", config: ExportConfig) -> str:
 
 
 def _write_poses(run: "TrainedRun", config: ExportConfig) -> None:
-    from sl_nerfstudio.meshing.run_record import training_record
+    from sl_nerfstudio.runs.run_record import training_record
     from sl_nerfstudio.scan import PoseSigma, write_transforms
     from sl_nerfstudio.scan.atomic import write_atomic
     from sl_nerfstudio.scan.writing import encode_json, sigma_fields

@@ -20,8 +20,10 @@ def main() -> None:
 def _process() -> None:
     config = tyro.cli(ProcessConfig, prog="sl-process", config=(tyro.conf.FlagCreatePairsOff,))
     config.check()
-    from sl_nerfstudio.evaluation.processing_report import render_processing_report  # slow to import: torch, open3d
-    from sl_nerfstudio.processing.pipeline import process
+    from sl_nerfstudio.evaluation.report.processing_report import (
+        render_processing_report,  # slow to import: torch, open3d
+    )
+    from sl_nerfstudio.processing.process import process
 
     result = process(config, render_processing_report, tell)
     sys.stdout.write(closing_words(result))

@@ -12,11 +12,10 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from sl_nerfstudio.dataparser.normalise import normalisation
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan, read_scan
 from sl_nerfstudio.scan.intrinsics import device_problems
-from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
 
 
 @dataclass
@@ -29,8 +28,7 @@ class SLDataParserConfig(DataParserConfig):
     downscale_factor: float | None = None
     """Shrink whole images by this factor in evaluation, rendering and the viewer. Training sees every pixel."""
     intrinsics_change: IntrinsicsChange = UNCHANGED
-    """Added to the scan's intrinsics, as shares of the focal length: of the focal lengths, and of the principal point's
-    x and y; three numbers for the cameras, then three for the projector. `refine_intrinsics` fills them in."""
+    """Change of the scan's focal lengths and principal points; `refine_intrinsics` fills it in."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def _require_possible(scan: Scan) -> None:
     for device in {*(frame.camera for frame in scan.frames), scan.projector}:
         for key, problem in device_problems(device):
             raise UserError(
-                f"intrinsics_change {scan.intrinsics_change}: {key} {problem.problem}\n"
+                f"intrinsics_change {scan.intrinsics_change.values}: {key} {problem.problem}\n"
                 "    cause:  percent or pixels were given\n"
                 "    remedy: give shares of the focal length, 0.01 for one hundredth of it"
             )

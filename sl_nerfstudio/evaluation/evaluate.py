@@ -9,10 +9,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.alignment import align_poses
-from sl_nerfstudio.evaluation.fit import Fit, FitAccumulator, FrameFit, FramePixels, fit_frames
+from sl_nerfstudio.evaluation.capture_fit import CaptureFit, FitAccumulator, FrameFit, FramePixels, fit_captures
 from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
 from sl_nerfstudio.evaluation.observed import observable
-from sl_nerfstudio.evaluation.poses import PoseErrors, compare_poses
+from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference, Reference
 from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -40,7 +40,7 @@ class Evaluation:
     """Everything `sl-eval` finds; lengths in `units`, distances from the truth in `truth_units`."""
 
     units: str
-    fit: Fit
+    fit: CaptureFit
     reference: Reference | None
     surface: dict[str, SurfaceScore]  # alignment -> score; empty without a reference
     pose_errors: PoseErrors | None  # of the poses that were evaluated
@@ -165,9 +165,9 @@ def _fit(
     scan: Scan,
     poses: Poses,
     on_frame: Callable[[Frame, FrameFit, FramePixels], None] | None,
-) -> Fit:
+) -> CaptureFit:
     fit = FitAccumulator()
-    frames = fit_frames(surface, scan, poses.T_world_camera, poses.T_world_projector)
+    frames = fit_captures(surface, scan, poses.T_world_camera, poses.T_world_projector)
     for frame, figures, pixels in track(frames, "ray casting the frames", total=len(scan.frames)):
         fit.add(figures, pixels)
         if on_frame is not None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
-from sl_nerfstudio.evaluation.poses import DeviceErrors, PoseErrors
+from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:

@@ -103,7 +103,9 @@ def collect_votes(
     poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
         asked = np.flatnonzero(always | ~votes.settled)
-        view = look(mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector)
+        view = observe_vertices(
+            mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector
+        )
         vertex = asked[view.vertex]
         known = view.most[always[vertex] & np.isfinite(view.most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
@@ -130,7 +132,7 @@ def _begin(mesh: Mesh, before: Votes | None) -> Votes:
 
 
 @dataclass(frozen=True)
-class View:
+class FrameObservation:
     """What one frame says about the vertices that it should see and light; distances in pattern pixels."""
 
     vertex: Int64[ndarray, "m"]
@@ -140,7 +142,7 @@ class View:
     most: Float[ndarray, "m"]  # at most
 
 
-def look(
+def observe_vertices(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
     occluder: Occluder,
@@ -148,7 +150,7 @@ def look(
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> View:
+) -> FrameObservation:
     """What a frame says about the vertices that it should see and light.
 
     They face camera and projector, fall inside image and pattern, and the mesh hides them from neither.
@@ -171,7 +173,7 @@ def look(
         vertices[lit], normals[lit], uv_camera, uv_projector, frame.camera, T_world_camera, projector, T_world_projector
     )
     least[on_mask], most[on_mask] = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
-    return View(vertex, ~near_mask, near_mask & ~on_mask, least, most)
+    return FrameObservation(vertex, ~near_mask, near_mask & ~on_mask, least, most)
 
 
 def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:

@@ -5,11 +5,11 @@ from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
-from sl_nerfstudio.calibration.bundle_adjustment import AdjustmentSettings
-from sl_nerfstudio.calibration.modes import RefinePoses
-from sl_nerfstudio.model.field import FieldConfig
-from sl_nerfstudio.model.refinement import PriorConfig
-from sl_nerfstudio.model.schedule import AnnealingConfig
+from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
+from sl_nerfstudio.field.sdf_field import FieldConfig
+from sl_nerfstudio.model.pose_refinement import PriorConfig
+from sl_nerfstudio.rendering.schedule import AnnealingConfig
 
 
 @dataclass

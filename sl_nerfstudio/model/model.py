@@ -15,28 +15,28 @@ from nerfstudio.viewer.viewer_elements import ViewerSlider
 from numpy import ndarray
 from torch import Tensor, nn
 
-from sl_nerfstudio.calibration.intrinsics_doubt import IntrinsicsDoubt
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.field.cached_grid import CachedGrid
+from sl_nerfstudio.field.sdf_field import SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.model import pictures
+from sl_nerfstudio.model import outputs as pictures
 from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.direct import direct_losses, measure
-from sl_nerfstudio.model.field import SDFField
 from sl_nerfstudio.model.history import History
-from sl_nerfstudio.model.losses import coordinate_loss, pattern_loss
-from sl_nerfstudio.model.poses import IndependentPoses, RigPoses, StaticProjectorPoses
-from sl_nerfstudio.model.refinement import refine, scene_rig, sigmas_in_scan_units
-from sl_nerfstudio.model.rendering import Rendered, render
-from sl_nerfstudio.model.sampling import first_crossing, sphere_interval, uniform_samples
-from sl_nerfstudio.model.schedule import kappa_at, level_weights_at
-from sl_nerfstudio.model.surface_cache import SurfaceCache
+from sl_nerfstudio.model.pose_parameters import IndependentPoseParameters, RigPoseParameters, StaticProjectorParameters
+from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
+from sl_nerfstudio.rendering.direct_losses import direct_losses, measure
+from sl_nerfstudio.rendering.losses import coordinate_loss, pattern_loss
+from sl_nerfstudio.rendering.ray_samples import first_crossing, sphere_interval, uniform_samples
+from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at
+from sl_nerfstudio.rendering.volume_rendering import Rendered, render
 from sl_nerfstudio.scan import Scan, read_scan
 
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
 _EVAL_SAMPLES = 24
 _SHADOW_SAMPLES = 32
-_POSE_PARAMETERS = {"rig": RigPoses, "independent": IndependentPoses}
+_POSE_PARAMETERS = {"rig": RigPoseParameters, "independent": IndependentPoseParameters}
 
 
 class SLModel(Model):
@@ -61,11 +61,13 @@ class SLModel(Model):
         super().populate_modules()
         c = self.config
         self.field = SDFField(c.sdf)
-        self.cache = SurfaceCache()
+        self.cache = CachedGrid()
         self._cache_is_old = False  # after a checkpoint was loaded to be looked at: as old as the last refresh
         rig = scene_rig(self.scan, self.S_scene_world)
         moves = c.train_poses and c.refine_poses != "off"
-        make = StaticProjectorPoses if c.refine_poses == "static-projector" else _POSE_PARAMETERS[c.pose_parameters]
+        make = (
+            StaticProjectorParameters if c.refine_poses == "static-projector" else _POSE_PARAMETERS[c.pose_parameters]
+        )
         self.device_poses = make(
             rig.T_world_camera,
             rig.T_world_projector,
@@ -106,7 +108,7 @@ class SLModel(Model):
     def intrinsics_doubt(self) -> str:
         """What the captures say against the intrinsics; "" if nothing, or if poses were not adjusted."""
         poses = self.device_poses
-        doubt = IntrinsicsDoubt(poses.intrinsics_change.cpu(), poses.intrinsics_covariance.cpu())
+        doubt = SelfCalibration(poses.intrinsics_change.cpu(), poses.intrinsics_covariance.cpu())
         return doubt.said([frame.camera for frame in self.scan.frames], self.scan.projector)
 
     def history(self) -> dict[str, list[float]]:
@@ -152,7 +154,7 @@ class SLModel(Model):
         """Before the first step: refine the poses, and measure the noise of the decoding."""
         c = self.config
         if c.adjust_poses and c.refine_poses != "off" and len(self.scan.frames) > 1:
-            found = refine(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
+            found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             self.device_poses.rebase(found.T_scene_camera, found.T_scene_projector)
             self.device_poses.sigma.copy_(found.sigma)
             if found.intrinsics is not None:

@@ -12,11 +12,11 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from sl_nerfstudio.dataparser.dataparser import LoadedScan, SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.refined_intrinsics import refine_intrinsics
-from sl_nerfstudio.model.schedulers import DecaySchedulerConfig
+from sl_nerfstudio.model.intrinsics_refinement import refine_intrinsics
+from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
 from sl_nerfstudio.scan import require_valid
-from sl_nerfstudio.scan.types import UNCHANGED, IntrinsicsChange
 
 
 @dataclass
@@ -82,7 +82,7 @@ class SLTrainerConfig(TrainerConfig):
 
 def _refined(loaded: LoadedScan, model: SLModelConfig) -> IntrinsicsChange:
     """The change of intrinsics that the captures ask for, told. Raises UserError for settings that exclude it."""
-    if loaded.scan.intrinsics_change != UNCHANGED:
+    if loaded.scan.intrinsics_change:
         raise UserError(
             "--pipeline.model.refine-intrinsics: a change of intrinsics is given, too\n"
             "    cause:  sl-data --intrinsics-change states it\n    remedy: leave out one"

@@ -36,7 +36,7 @@ def _gaps(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: b
 
 
 def _weak(frame: FrameRecord) -> list[str]:
-    said = [f"{frame.name}: {weakness}" for weakness in frame.weaknesses]
+    said = [f"{frame.name}: {degeneracy}" for degeneracy in frame.degeneracies]
     if frame.decode_rate is not None and frame.decode_rate < _LOW_RATE:
         said.append(
             f"{frame.name}: only {frame.decode_rate:.0%} of the pattern was decoded; sharper focus, more light from "

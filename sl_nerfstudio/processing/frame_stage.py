@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from sl_nerfstudio.calibration.correspondence_rays import correspondences_of
-from sl_nerfstudio.calibration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.calibration.relative_pose import CalibrationError, calibrate_frame
-from sl_nerfstudio.decoding.types import Decoded, DecodingError
+from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.decoders import DecoderName, Layout, decoder_key, make_decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.decoders import DecoderName, Layout, decoder_key, make_decoder
 from sl_nerfstudio.processing.store import DecodedStore
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan.file_error import FileError
 
 
@@ -74,7 +74,7 @@ class FrameWorker:
         share = float(decoded.mask.mean())
         try:
             cloud = self._calibrated(frame, decoded)
-        except CalibrationError as error:
+        except RelativePoseError as error:
             return FrameOutcome(frame, key, resumed, decoded.rate, share, None, "calibrating", _about(frame, error))
         return FrameOutcome(frame, key, resumed, decoded.rate, share, cloud)
 
@@ -95,7 +95,7 @@ class FrameWorker:
 
     def _calibrated(self, frame: CapturedFrame, decoded: Decoded) -> FrameCloud:
         job = self._job
-        pose = calibrate_frame(*correspondences_of(decoded.coords), job.camera, job.projector, job.seed)
+        pose = estimate_relative_pose(*correspondences_of(decoded.coords), job.camera, job.projector, job.seed)
         return frame_cloud(frame.name, decoded.coords, job.camera, job.projector, pose)
 
 

@@ -21,7 +21,7 @@ class FrameRecord:
     sigma_direction_deg: float | None = None
     fitness: float | None = None  # share of the judged points that agree with the frames they overlap
     baseline: float | None = None  # camera to projector, in the scan's unit
-    weaknesses: tuple[str, ...] = ()
+    degeneracies: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

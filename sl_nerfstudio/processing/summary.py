@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sl_nerfstudio import __version__
-from sl_nerfstudio.calibration.joint_poses import JointPoses
-from sl_nerfstudio.calibration.registration import Registration
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_stage import FrameOutcome
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
+from sl_nerfstudio.registration.register import Registration
 from sl_nerfstudio.scan.types import Scale
 
 
@@ -20,7 +20,7 @@ def summarise(
     decoder: str,
     outcomes: Sequence[FrameOutcome],
     registration: Registration | None,
-    joint: JointPoses | None,
+    joint: AdjustedFrames | None,
     units: str,
     scale: Scale,
 ) -> ProcessResult:
@@ -43,7 +43,7 @@ def summarise(
     )
 
 
-def _remarks(registration: Registration | None, joint: JointPoses | None) -> tuple[str, ...]:
+def _remarks(registration: Registration | None, joint: AdjustedFrames | None) -> tuple[str, ...]:
     """What remains uncertain."""
     placed = () if registration is None else tuple(registration.remarks)
     return (joint.intrinsics, *placed) if joint is not None and joint.intrinsics else placed
@@ -55,7 +55,7 @@ def _both_known(before: float, after: float) -> tuple[float, float] | None:
 
 
 def _record(
-    outcome: FrameOutcome, registration: Registration | None, joint: JointPoses | None, k: int | None
+    outcome: FrameOutcome, registration: Registration | None, joint: AdjustedFrames | None, k: int | None
 ) -> FrameRecord:
     cloud = outcome.cloud
     known = outcome.stage not in ("reading", "decoding")
@@ -83,5 +83,5 @@ def _record(
         sigma_direction_deg=pose.sigma_direction_deg,
         fitness=fitness,
         baseline=baseline,
-        weaknesses=tuple(weakness.message for weakness in pose.weaknesses),
+        degeneracies=tuple(degeneracy.message for degeneracy in pose.degeneracies),
     )

@@ -7,15 +7,15 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.frame_cloud import FrameCloud
-from sl_nerfstudio.calibration.joint_poses import JointPoses
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
+from sl_nerfstudio.decoding.decoders import Layout
 from sl_nerfstudio.pattern.files import encode_gray_code, encode_grid
 from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.processing.decoders import Layout
 from sl_nerfstudio.processing.frame_stage import FrameJob, FrameOutcome, FrameWorker
 from sl_nerfstudio.processing.preview import Preview, make_preview
 from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.progress import track
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.scan.types import Scale
@@ -27,7 +27,7 @@ def write_scan(
     job: FrameJob,
     outcomes: Sequence[FrameOutcome],
     clouds: Sequence[FrameCloud],
-    joint: JointPoses,
+    joint: AdjustedFrames,
     units: str,
     scale: Scale,
     result: ProcessResult,

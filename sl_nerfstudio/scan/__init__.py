@@ -1,7 +1,7 @@
 """The scan folder (format 1): reading, checking and writing it. See docs/scan-format.md."""
 
 from sl_nerfstudio.errors import Fault, ScanError
-from sl_nerfstudio.scan.examining import check_scan, require_valid
+from sl_nerfstudio.scan.check.examination import check_scan, require_valid
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.pose_files import read_devices, read_ground_truth, read_poses, write_transforms
 from sl_nerfstudio.scan.reading import read_scan

@@ -4,13 +4,13 @@ from pathlib import Path
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.coordinates import read_coords_size
-from sl_nerfstudio.scan.draft import Draft, FrameDraft
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import read_header
+from sl_nerfstudio.scan.partial_scan import PartialFrame, PartialScan
 from sl_nerfstudio.scan.problem import Faults, Problem
 
 
-def check_headers(draft: Draft, faults: Faults) -> set[Path]:
+def check_headers(draft: PartialScan, faults: Faults) -> set[Path]:
     """Add what the heads of all files tell; return the files that are worth decoding."""
     good: set[Path] = set()
     if draft.pattern_path is not None:
@@ -26,7 +26,7 @@ def relative(path: Path, root: Path) -> str:
     return path.relative_to(root).as_posix()
 
 
-def _check_frame(frame: FrameDraft, root: Path, good: set[Path], faults: Faults) -> None:
+def _check_frame(frame: PartialFrame, root: Path, good: set[Path], faults: Faults) -> None:
     size = _size(frame.camera)
     for key in ("file_path", "sl_pattern_path", "mask_path"):
         if key in frame.paths:

@@ -13,11 +13,11 @@ from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.document import Record, document_faults, frame_label, read_document
-from sl_nerfstudio.scan.draft import POSES, TRANSFORMS, draft_devices, read_pose
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.partial_scan import POSES, TRANSFORMS, document_devices, read_pose
 from sl_nerfstudio.scan.problem import Faults, Problem
-from sl_nerfstudio.scan.types import UNCHANGED, GroundTruth, Scan
+from sl_nerfstudio.scan.types import GroundTruth, Scan
 from sl_nerfstudio.scan.writing import encode_json, pose_fields
 
 GROUND_TRUTH = "ground_truth"
@@ -56,7 +56,7 @@ def write_transforms(
         record.pop("sl_pose_sigma", None)
         record.update(pose_fields(T_world_camera[index], T_world_projector[index]))
         record.update(extras[index])
-    if scan.intrinsics_change != UNCHANGED:
+    if scan.intrinsics_change:
         _put_devices(document, scan)
     write_atomic(path, encode_json({**document, **(extra_fields or {})}))
 
@@ -84,7 +84,7 @@ def read_devices(path: Path, scan: Scan) -> Scan:
     """
     document = _read(path, str(path.parent))
     faults = Faults()
-    projector, cameras = draft_devices(document, path.name, faults)
+    projector, cameras = document_devices(document, path.name, faults)
     if faults.found:
         raise ScanError(faults.found, str(path.parent))
     frames = tuple(replace(frame, camera=cameras.get(frame.name, frame.camera)) for frame in scan.frames)

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 from sl_nerfstudio.errors import ScanError
-from sl_nerfstudio.scan.draft import read_draft
 from sl_nerfstudio.scan.headers import check_headers
+from sl_nerfstudio.scan.partial_scan import read_partial_scan
 from sl_nerfstudio.scan.problem import Faults
 from sl_nerfstudio.scan.types import Scan
 
@@ -17,7 +17,7 @@ def read_scan(root: Path, need_coords: bool = True) -> Scan:
     """
     root = Path(os.path.realpath(root))
     faults = Faults()
-    draft = read_draft(root, faults, need_coords)
+    draft = read_partial_scan(root, faults, need_coords)
     check_headers(draft, faults)
     if faults.found:
         raise ScanError(faults.found, str(root))

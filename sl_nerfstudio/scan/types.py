@@ -7,15 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.images import as_grey, read_image
 
 FORMAT = 1  # of the scan folder
-
-IntrinsicsChange = tuple[float, float, float, float, float, float]
-"""Shares of the focal length: of the focal lengths, and of the principal point's x and y; cameras, then projector."""
-UNCHANGED: IntrinsicsChange = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "arbitrary": None}
 """Units of length a scan may be given in, and their length in metres (None: not known)."""
@@ -95,13 +91,12 @@ class Scan:
 
     def with_intrinsics_change(self, change: IntrinsicsChange) -> "Scan":
         """The scan with other focal lengths and principal points. Raises ValueError if they were changed before."""
-        if self.intrinsics_change != UNCHANGED:
+        if self.intrinsics_change:
             raise ValueError("the intrinsics of this scan were changed before")
-        camera, projector = change[:3], change[3:]
         return replace(
             self,
-            projector=self.projector.changed(*projector),
-            frames=tuple(replace(frame, camera=frame.camera.changed(*camera)) for frame in self.frames),
+            projector=change.projector.applied(self.projector),
+            frames=tuple(replace(frame, camera=change.camera.applied(frame.camera)) for frame in self.frames),
             intrinsics_change=change,
         )
 

@@ -17,8 +17,8 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.meshing.run_record import plain
-from sl_nerfstudio.meshing.trained_run import TrainedRun
+from sl_nerfstudio.runs.run_record import plain
+from sl_nerfstudio.runs.trained_run import TrainedRun
 from sl_nerfstudio.scan import Scan, read_poses
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
 

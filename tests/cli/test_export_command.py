@@ -4,6 +4,8 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,10 @@ import yaml
 
 from sl_nerfstudio.cli.export import main
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.meshing.trained_run import load_run
+from sl_nerfstudio.runs.trained_run import load_run
 from sl_nerfstudio.scan import read_devices, read_poses, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 from tests.test_ns_commands import train
@@ -71,8 +74,10 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
 
 
 def test_a_run_with_changed_intrinsics_exports_them(scan_root, tmp_path, monkeypatch):
-    change = (0.01, 0.0, -0.002, -0.005, 0.001, 0.0)
-    flags = ("sl-data", "--intrinsics-change", *change)
+    change = IntrinsicsChange(DeviceChange(0.01, 0.0, -0.002), DeviceChange(-0.005, 0.001, 0.0))
+    flags = ["sl-data"]
+    for device, key in product(("camera", "projector"), ("focal", "x", "y")):
+        flags += [f"--intrinsics-change.{device}.{key}", getattr(getattr(change, device), key)]
     config = train(monkeypatch, scan_root, tmp_path / "outputs", 2, *flags)
     scan, stated = read_scan(scan_root), (scan_root / "transforms.json").read_bytes()
     wanted = scan.with_intrinsics_change(change)
@@ -84,7 +89,7 @@ def test_a_run_with_changed_intrinsics_exports_them(scan_root, tmp_path, monkeyp
     assert found.projector == wanted.projector != scan.projector
     assert {frame.camera for frame in found.frames} == {frame.camera for frame in wanted.frames}
     record = json.loads((refined / "training.json").read_text())
-    assert record["settings"]["intrinsics_change"] == list(change)
+    assert record["settings"]["intrinsics_change"] == asdict(change)
     assert "focal length of the camera +1.00 %, of the projector -0.50 %" in record["intrinsics"]
     assert (scan_root / "transforms.json").read_bytes() == stated
 

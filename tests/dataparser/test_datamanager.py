@@ -11,7 +11,7 @@ from PIL import Image
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
@@ -231,10 +231,10 @@ def test_scan_is_read_once_and_again_when_it_changes(tmp_path: Path) -> None:
 WRONG = (0.02, -0.01, 0.004, -0.015, 0.002, 0.006)
 
 
-def mended() -> tuple[float, float, float, float, float, float]:
+def mended() -> IntrinsicsChange:
     """The change that takes WRONG back: shares of a focal length that is itself wrong."""
     a, b, c, d, e, f = WRONG
-    return -a / (1 + a), -b / (1 + a), -c / (1 + a), -d / (1 + d), -e / (1 + d), -f / (1 + d)
+    return IntrinsicsChange.of((-a / (1 + a), -b / (1 + a), -c / (1 + a), -d / (1 + d), -e / (1 + d), -f / (1 + d)))
 
 
 def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_right_scan(tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_righ
     torch.testing.assert_close(rays.directions, other_rays.directions, rtol=0, atol=1e-6)
     torch.testing.assert_close(batch, other_batch, rtol=0, atol=0, equal_nan=True)
     loaded, other = found.dataparser.loaded, right.dataparser.loaded
-    assert loaded.scan.intrinsics_change == mended() and other.scan.intrinsics_change == (0.0,) * 6
+    assert loaded.scan.intrinsics_change == mended() and other.scan.intrinsics_change == UNCHANGED
     assert loaded.scan.projector.fl_x == pytest.approx(other.scan.projector.fl_x, rel=1e-14)
     np.testing.assert_allclose(loaded.S_scene_world.matrix(), other.S_scene_world.matrix(), atol=1e-9)
     cameras = [m.train_dataset.cameras for m in (found, right)]
@@ -264,7 +264,7 @@ def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_righ
 def test_a_change_in_percent_or_pixels_is_refused(tiny_root: Path, which: int, value: float) -> None:
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
-        manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=(a, b, c, d, e, f)))
+        manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
 
 
 def test_transforms_json_itself_may_be_named(tiny_root: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.graph import OFFSETS, STEPS, build_graph, neighbourhoods, phase_maps
+from sl_nerfstudio.decoding.grid.graph import OFFSETS, STEPS, build_graph, neighbourhoods, phase_maps
 
 H, W = 60, 80
 

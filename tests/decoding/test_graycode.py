@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.graycode import decode_gray_code
+from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.graycode.decode import decode_gray_code
 from sl_nerfstudio.decoding.regions import drop_small_regions
-from sl_nerfstudio.decoding.types import DecodingError
 from sl_nerfstudio.pattern.graycode import GrayCode
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
 

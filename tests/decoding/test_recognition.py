@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.decoding.consensus import agree
-from sl_nerfstudio.decoding.gcn import one_hot, turned_pattern
-from sl_nerfstudio.decoding.graph import OFFSETS, GridGraph, neighbourhoods
-from sl_nerfstudio.decoding.network import NetworkDecoder
-from sl_nerfstudio.decoding.window_matching import match_windows
+from benchmarks.baselines.window_matching import match_windows
+from sl_nerfstudio.decoding.grid.consensus import agree
+from sl_nerfstudio.decoding.grid.gcn import one_hot, turned_pattern
+from sl_nerfstudio.decoding.grid.graph import OFFSETS, GridGraph, neighbourhoods
+from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
 from sl_nerfstudio.pattern.codes import code_array, rotate_codes
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, damage_graph

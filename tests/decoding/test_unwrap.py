@@ -1,6 +1,6 @@
 import numpy as np
 
-from sl_nerfstudio.decoding.unwrap import spread
+from sl_nerfstudio.decoding.grid.unwrap import spread
 
 
 def field(h=40, w=50, period=10.0):

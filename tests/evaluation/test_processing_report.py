@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.processing_report import render_processing_report
+from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.preview import Preview, make_preview
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.charts import nice_limit
 from sl_nerfstudio.evaluation.evaluate import Poses, evaluate, mesh_reference
-from sl_nerfstudio.evaluation.pictures import ColourScale, View, pixel_map, render, views_of
-from sl_nerfstudio.evaluation.plot3d import decimated
 from sl_nerfstudio.evaluation.reference import PointReference
-from sl_nerfstudio.evaluation.report import ReportInput, render_report
+from sl_nerfstudio.evaluation.report.charts import nice_limit
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, View, pixel_map, render, views_of
+from sl_nerfstudio.evaluation.report.plot3d import decimated
+from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
+from sl_nerfstudio.evaluation.report.thumbnails import ThumbnailCollector
 from sl_nerfstudio.evaluation.surface import Surface
-from sl_nerfstudio.evaluation.thumbnails import ThumbnailCollector
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
 from .faceted_scan import FacetedScan

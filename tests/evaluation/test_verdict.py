@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import pytest
 
+from sl_nerfstudio.evaluation.capture_fit import CaptureFit, FrameFit
 from sl_nerfstudio.evaluation.evaluate import Evaluation
-from sl_nerfstudio.evaluation.fit import Fit, FrameFit
 from sl_nerfstudio.evaluation.verdict import judge
 
 FRAME = FrameFit("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
-FIT = Fit(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
+FIT = CaptureFit(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
 GOOD = Evaluation("mm", FIT, None, {}, None, None, starting_poses=True)
 
 

@@ -21,7 +21,7 @@ def test_every_reason_is_named():
     frames = [
         _frame("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
         _frame("b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"),
-        _frame("c", decode_rate=0.9, mask_share=0.01, weaknesses=("all points lie in one plane",)),
+        _frame("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
         _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
     ]
     said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)

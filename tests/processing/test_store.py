@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.types import Decoded
+from sl_nerfstudio.decoding.decoded import Decoded
+from sl_nerfstudio.decoding.decoders import decoder_key
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.decoders import decoder_key
 from sl_nerfstudio.processing.store import DecodedStore, Manifest
 
 

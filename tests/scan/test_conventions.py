@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
 
 from sl_nerfstudio.scan import check_scan
-from sl_nerfstudio.scan.conventions import convention_problems
-from sl_nerfstudio.scan.correspondences import Correspondences, sample_pixels
-from sl_nerfstudio.scan.readings import Reading, apply_reading, fit_frames, other_readings
+from sl_nerfstudio.scan.check.conventions import convention_problems
+from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
+from sl_nerfstudio.scan.check.readings import Reading, apply_reading, fit_reading, other_readings
 
 OPENCV = np.diag([1.0, -1, -1, 1])
 KEYS = ("transform_matrix", "projector_transform_matrix")
@@ -171,7 +171,7 @@ def test_units_that_cannot_be(metres: float | None, words: str) -> None:
 
 def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
     frames = frames_of(poses())
-    fit = fit_frames(frames, PROJECTOR)
+    fit = fit_reading(frames, PROJECTOR)
     assert fit.typical_px < 0.5
     assert np.median(np.linalg.norm(fit.clouds[0], axis=1)) == pytest.approx(40, abs=0.5)
     apart = [
@@ -180,7 +180,7 @@ def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
     for index, frame in enumerate(apart):
         frame.T_world_camera[0, 3] += 1e4 * index
         frame.T_world_projector[0, 3] += 1e4 * index
-    assert np.allclose(fit_frames(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
+    assert np.allclose(fit_reading(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
 
 
 def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:

@@ -14,8 +14,8 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, edit_co
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
+from sl_nerfstudio.scan.check.examination import examine
 from sl_nerfstudio.scan.coordinates import read_coords, read_coords_size
-from sl_nerfstudio.scan.examining import examine
 
 NAME = NAMES[1]
 COORDS = f"coords/{NAME}.npz"

@@ -11,9 +11,9 @@ from sphere_scan import edit
 from test_conventions import disturbed, undo
 
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.conventions import convention_problems
-from sl_nerfstudio.scan.examining import Examination, examine
-from sl_nerfstudio.scan.readings import Reading
+from sl_nerfstudio.scan.check.conventions import convention_problems
+from sl_nerfstudio.scan.check.examination import Examination, examine
+from sl_nerfstudio.scan.check.readings import Reading
 
 DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

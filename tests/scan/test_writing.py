@@ -10,7 +10,7 @@ import pytest
 from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, pattern_image, poses, write_sphere
 
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.scan import PoseSigma, Scale, ScanWriter, check_scan, read_ground_truth, read_poses, read_scan
 from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.pose_files import read_devices, write_transforms
@@ -276,7 +276,7 @@ def test_refined_poses_keep_everything_else(sphere: Path) -> None:
     assert np.array_equal(read_scan(sphere).T_world_camera, T_c)
 
 
-CHANGE = (0.01, -0.002, 0.003, -0.008, 0.004, 0.001)
+CHANGE = IntrinsicsChange.of((0.01, -0.002, 0.003, -0.008, 0.004, 0.001))
 
 
 @pytest.mark.parametrize("own_cameras", [False, True])
@@ -291,8 +291,8 @@ def test_changed_intrinsics_are_written_and_read_beside_the_scans_own(sphere: Pa
     scan, stated = read_scan(sphere), (sphere / "transforms.json").read_bytes()
     changed = scan.with_intrinsics_change(CHANGE)
     for old, new, (f, x, y) in (
-        (scan.frames[2].camera, changed.frames[2].camera, CHANGE[:3]),
-        (scan.projector, changed.projector, CHANGE[3:]),
+        (scan.frames[2].camera, changed.frames[2].camera, CHANGE.values[:3]),
+        (scan.projector, changed.projector, CHANGE.values[3:]),
     ):
         assert (new.fl_x, new.fl_y) == pytest.approx((old.fl_x * (1 + f), old.fl_y * (1 + f)), rel=1e-15)
         assert (new.cx - old.cx, new.cy - old.cy) == pytest.approx((old.fl_x * x, old.fl_x * y), rel=1e-9)

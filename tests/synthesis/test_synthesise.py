@@ -9,7 +9,7 @@ import trimesh
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import read_ground_truth, read_scan
-from sl_nerfstudio.scan.examining import check_scan
+from sl_nerfstudio.scan.check.examination import check_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 

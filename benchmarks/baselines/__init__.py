@@ -1,0 +1,1 @@
+"""What others do, as a yardstick: fusion, rigid registration, window matching."""

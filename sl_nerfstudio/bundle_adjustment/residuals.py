@@ -1,0 +1,240 @@
+"""Residuals of the joint adjustment and their normal equations.
+
+Unknowns are the poses and, for every *anchor* (a decoded pixel of one frame), its depth along its
+camera ray. An anchor is observed twice over:
+
+    own    its decoded coordinate against its own projector's view of it,
+    cross  wherever another camera sees it: the coordinate decoded *there* against that frame's
+           projector's view of it.
+
+All residuals are projector pixels, so nothing is gained by shrinking the scene: the collapse that
+free-scale ICP suffers from cannot happen. Depths are eliminated by the Schur complement.
+
+Increments: `T_world_camera <- exp(delta) T_world_camera` moves a frame as a whole (rotating about
+the origin, which is the centre of the scene), `T_camera_projector <- exp(rho) T_camera_projector`
+moves its projector against its camera.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.compiled import compiled_parallel
+from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.se3 import exp_se3, hat, inverse, rotate, transform
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All devices of a scan; poses in the scene frame, whose origin is the centre of the object."""
+
+    camera: Intrinsics  # batch (frames,)
+    projector: Intrinsics  # batch ()
+    T_world_camera: Float[Tensor, "frames 4 4"]
+    T_camera_projector: Float[Tensor, "frames 4 4"]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.T_world_camera)
+
+    @property
+    def T_world_projector(self) -> Float[Tensor, "frames 4 4"]:
+        """Projector poses in the scene frame."""
+        return self.T_world_camera @ self.T_camera_projector
+
+    def moved(self, delta: Float[Tensor, "frames 6"], rho: Float[Tensor, "frames 6"]) -> "Rig":
+        """The rig after an increment."""
+        return Rig(
+            self.camera,
+            self.projector,
+            exp_se3(delta) @ self.T_world_camera,
+            exp_se3(rho) @ self.T_camera_projector,
+        )
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Decoded pixels whose depth is an unknown."""
+
+    frame: Int[Tensor, "anchors"]
+    d_camera: Float[Tensor, "anchors 3"]  # unit ray direction in camera axes
+    uv_projector: Float[Tensor, "anchors 2"]  # decoded there
+    depth: Float[Tensor, "anchors"]  # along the ray
+    normal: Float[Tensor, "anchors 3"]  # of the surface there, in camera axes, towards the camera
+
+    def at(self, depth: Float[Tensor, "anchors"]) -> "Anchors":
+        """The same anchors at other depths."""
+        return replace(self, depth=depth)
+
+    def chosen(self, index: Tensor) -> "Anchors":
+        """Some of the anchors, by mask or by index."""
+        return Anchors(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Which anchor is looked for in which other frame."""
+
+    anchor: Int[Tensor, "rows"]
+    frame: Int[Tensor, "rows"]
+
+    def pairs(self, anchors: Anchors) -> Int[Tensor, "2 rows"]:
+        """Frame of the anchor, frame that looks for it."""
+        return torch.stack([anchors.frame[self.anchor], self.frame])
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Values of all residuals, in projector pixels."""
+
+    own: Float[Tensor, "anchors 2"]
+    cross: Float[Tensor, "rows 2"]
+    cross_valid: Bool[Tensor, "rows"]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals with their derivatives, before weighting."""
+
+    residuals: Residuals
+    own: Float[Tensor, "anchors 2 a"]  # by rho of the anchor's frame
+    own_columns: Int[Tensor, "anchors a"]  # which of the unknowns those are
+    own_depth: Float[Tensor, "anchors 2"]
+    cross: Float[Tensor, "rows 2 b"]  # by delta of the anchor's frame, delta and rho of the seeing frame
+    cross_columns: Int[Tensor, "rows b"]
+    cross_depth: Float[Tensor, "rows 2"]
+    unknowns: int  # beside depths: delta of all frames, then rho of all frames
+
+
+def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Linearisation:
+    """Residuals and first derivatives at the present state."""
+    i = anchors.frame
+    p_camera = anchors.depth[:, None] * anchors.d_camera
+    own, own_rho, own_point = _projector_view(rig, i, p_camera)
+    own_depth = (own_point * anchors.d_camera[:, None, :]).sum(-1)
+
+    j, a = observations.frame, observations.anchor
+    p_world = transform(rig.T_world_camera[i], p_camera)[a]
+    d_world = rotate(rig.T_world_camera[i], anchors.d_camera)[a]
+    T_camera_world = inverse(rig.T_world_camera)[j]
+    p_j = transform(T_camera_world, p_world)
+    uv_camera, in_front = project(rig.camera[j], p_j)
+    seen = maps.look_up(j, uv_camera)
+    uv_projector, cross_rho, by_point = _projector_view(rig, j, p_j)
+    by_point = by_point - seen.jacobian @ project_jacobian(rig.camera[j], p_j)
+    by_world = by_point @ T_camera_world[:, :3, :3]
+    by_delta = torch.cat([by_world, -by_world @ hat(p_world)], -1)
+    own_columns, cross_columns = _pose_columns(anchors, observations, rig.frames)
+    return Linearisation(
+        residuals=Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front),
+        own=own_rho,
+        own_columns=own_columns,
+        own_depth=own_depth,
+        cross=torch.cat([by_delta, -by_delta, cross_rho], -1),
+        cross_columns=cross_columns,
+        cross_depth=(by_world * d_world[:, None, :]).sum(-1),
+        unknowns=12 * rig.frames,
+    )
+
+
+def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Residuals:
+    """Residuals alone."""
+    i, j, a = anchors.frame, observations.frame, observations.anchor
+    p_camera = anchors.depth[:, None] * anchors.d_camera
+    own = project(rig.projector, transform(inverse(rig.T_camera_projector)[i], p_camera))[0]
+    p_j = transform(inverse(rig.T_world_camera)[j], transform(rig.T_world_camera[i], p_camera)[a])
+    uv_camera, in_front = project(rig.camera[j], p_j)
+    seen = maps.look_up(j, uv_camera)
+    uv_projector = project(rig.projector, transform(inverse(rig.T_camera_projector)[j], p_j))[0]
+    return Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front)
+
+
+def _projector_view(
+    rig: Rig, frame: Int[Tensor, "n"], p_camera: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 6"], Float[Tensor, "n 2 3"]]:
+    """Projector pixel of points in camera axes; its derivative by rho and by the point."""
+    T_projector_camera = inverse(rig.T_camera_projector)[frame]
+    p_projector = transform(T_projector_camera, p_camera)
+    uv, _ = project(rig.projector, p_projector)
+    by_point = project_jacobian(rig.projector, p_projector) @ T_projector_camera[:, :3, :3]
+    return uv, torch.cat([-by_point, by_point @ hat(p_camera)], -1), by_point
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Gauss-Newton equations of all unknowns but the depths, which are eliminated."""
+
+    H: Float[Tensor, "unknowns unknowns"]
+    g: Float[Tensor, "unknowns"]
+    depth_by_rest: Float[Tensor, "anchors unknowns"]
+    H_depth: Float[Tensor, "anchors"]
+    g_depth: Float[Tensor, "anchors"]
+
+    def depth_step(self, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "anchors"]:
+        """Change of the depths that goes with a step of the other unknowns."""
+        return -(self.g_depth + self.depth_by_rest @ step) / self.H_depth
+
+
+def _pose_columns(
+    anchors: Anchors, observations: Observations, frames: int
+) -> tuple[Int[Tensor, "anchors 6"], Int[Tensor, "rows 18"]]:
+    """The unknowns (delta of all frames, then rho of all frames) that own and cross residuals depend on."""
+    n, columns = frames, torch.arange(6)
+    i, j = observations.pairs(anchors)[..., None]
+    own = 6 * n + 6 * anchors.frame[:, None] + columns
+    return own, torch.cat([6 * i + columns, 6 * j + columns, 6 * (n + j) + columns], -1)
+
+
+def normal_equations(
+    linear: Linearisation,
+    observations: Observations,
+    own_weight: Float[Tensor, "anchors"],
+    cross_weight: Float[Tensor, "rows"],
+) -> NormalEquations:
+    """Weighted normal equations with the Schur complement of the depths."""
+    size, rows, r_of = linear.unknowns, observations.anchor, linear.residuals
+    H = torch.zeros(size, size, dtype=torch.float64)
+    g = torch.zeros(size, dtype=torch.float64)
+    depth_by_rest = torch.zeros(len(own_weight) * size, dtype=torch.float64)
+    H_depth = own_weight * (linear.own_depth**2).sum(-1)
+    g_depth = own_weight * (linear.own_depth * r_of.own).sum(-1)
+    groups = (
+        (linear.own, linear.own_depth, r_of.own, own_weight, linear.own_columns, torch.arange(len(own_weight))),
+        (linear.cross, linear.cross_depth, r_of.cross, cross_weight, linear.cross_columns, rows),
+    )
+    for J, J_depth, r, w, cols, anchor in groups:
+        wJ = w[:, None, None] * J
+        g.index_add_(0, cols.reshape(-1), (wJ[:, 0] * r[:, :1] + wJ[:, 1] * r[:, 1:]).reshape(-1))
+        coupling = wJ[:, 0] * J_depth[:, :1] + wJ[:, 1] * J_depth[:, 1:]
+        depth_by_rest.index_add_(0, (anchor[:, None] * size + cols).reshape(-1), coupling.reshape(-1))
+        partial = np.zeros((torch.get_num_threads(), size, size))
+        _accumulate(J.numpy(), w.numpy(), cols.numpy(), partial)
+        H += torch.from_numpy(partial.sum(0))
+    H = torch.tril(H) + torch.tril(H, -1).T
+    H_depth = H_depth.index_add(0, rows, cross_weight * (linear.cross_depth**2).sum(-1))
+    g_depth = g_depth.index_add(0, rows, cross_weight * (linear.cross_depth * linear.residuals.cross).sum(-1))
+    H_depth = H_depth.clamp_min(1e-12)
+    V = depth_by_rest.reshape(-1, size)
+    scaled = V / H_depth[:, None]
+    return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
+
+
+@compiled_parallel
+def _accumulate(J, weight, columns, partial):
+    """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
+    threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]
+    for t in numba.prange(threads):
+        for n in range(t * rows // threads, (t + 1) * rows // threads):
+            w = weight[n]
+            if w > 0:
+                for a in range(width):
+                    x, y, ca = w * J[n, 0, a], w * J[n, 1, a], columns[n, a]
+                    for b in range(width):
+                        if columns[n, b] <= ca:
+                            partial[t, ca, columns[n, b]] += x * J[n, 0, b] + y * J[n, 1, b]

@@ -1,0 +1,72 @@
+"""The robust kernel of the joint adjustment: wrong decodings end without influence, frames that lag are not given up.
+
+Its width follows the residuals down (graduated non-convexity: Yang et al., RA-L 2020), for every frame
+apart: while most frames fit, one that does not yet keeps a kernel wide enough to be pulled in.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.residuals import Residuals
+
+NOISE_FLOOR_PX = 0.01  # projector pixels: residuals are not believed to be better than this
+_SHRINK = 1.4  # of the kernel in one step, at most
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Geman-McClure's, with a width for each frame; wrong by far costs the same whatever the width."""
+
+    width: Float[Tensor, "frames"]  # projector pixels
+    frame: Int[Tensor, "anchors"]
+    pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks for it
+
+    @property
+    def narrowest(self) -> float:
+        """Width of the frames that fit best."""
+        return float(self.width.min())
+
+    def weights(self, r: Residuals) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
+        """Of own and cross residuals, for the normal equations."""
+        parts = []
+        for value, width2 in zip((r.own, r.cross), self._squares(), strict=True):
+            relative = 1 / (1 + (value * value).sum(-1) / width2)
+            parts.append(self.narrowest**2 / width2 * relative**2)
+        own, cross = parts
+        return own, torch.where(r.cross_valid, cross, torch.zeros_like(cross))
+
+    def cost(self, r: Residuals, valid: Bool[Tensor, "rows"]) -> float:
+        """What a step must lower."""
+        own2, cross2 = self._squares()
+        own = ((r.own**2).sum(-1), own2)
+        cross = ((r.cross**2).sum(-1)[valid], cross2[valid])
+        return self.narrowest**2 * sum(float((r2 / (w2 + r2)).sum()) for r2, w2 in (own, cross))
+
+    def _squares(self) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
+        return self.width[self.frame] ** 2, self.width[self.pair].amax(0) ** 2
+
+
+def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
+    """Median cross residual of what each frame takes part in; infinite where it takes part in nothing."""
+    size, out = r.cross.norm(dim=-1), torch.full((frames,), float("inf"), dtype=torch.float64)
+    for k in range(frames):
+        mine = r.cross_valid & (pair == k).any(0)
+        if mine.any():
+            out[k] = size[mine].median()
+    return out
+
+
+def narrowed(width: Float[Tensor, "frames"], target: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
+    """Kernel widths on their way to a narrower target, not in one leap: a part may fit before the whole does."""
+    gently = torch.where(width.isfinite(), width / _SHRINK, torch.zeros_like(width))
+    return torch.minimum(width, torch.maximum(target, gently))
+
+
+def noise_of(r: Residuals, width: float) -> float:
+    """Robust 1 sigma of one residual component among those that the kernel keeps."""
+    inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
+    values = r.cross[inliers].reshape(-1).abs()
+    return max(float(values.median()) * 1.4826, NOISE_FLOOR_PX)

@@ -1,0 +1,175 @@
+"""Decoding of Gray-code sequences with inverse images.
+
+A bit is read by comparing an image with its inverse; what light of the scene itself (interreflection, scattering)
+does to it is judged as in Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light" (2007),
+from the direct and the global light of the finest stripes (Nayar et al. 2006).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8, UInt16
+from numpy import ndarray
+
+from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.graycode.subcell import LEVELS, Cells, subcell_coordinates
+from sl_nerfstudio.decoding.regions import drop_small_regions
+from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
+from sl_nerfstudio.scan.images import as_grey
+
+Image = UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]
+_FINEST = 4  # bits of each axis whose stripes tell direct from global light; the finest alone may be out of focus
+_LEAST_DIRECT = 0.02  # of full scale: with less light no bit can be told from noise
+_UNCERTAIN = 0.08  # of the direct light: an image and its inverse nearer to each other than this tell nothing
+_LEAST_SIGNAL = 4.0  # times the noise
+_LEAST_LIT = 0.002  # of the image: with less, the pattern counts as not seen
+_LEAST_DECODED = 0.02  # of what is lit
+_LARGEST_STEP = 3.0  # cells between neighbouring pixels of one surface
+_LEAST_REGION = 60  # pixels
+
+
+@dataclass(frozen=True)
+class Light:
+    """Direct and global light of every pixel, of full scale."""
+
+    direct: Float32[ndarray, "h w"]
+    ambient: Float32[ndarray, "h w"]  # global light: of the whole scene, not of the pixel's own ray
+    signal: Float32[ndarray, "h w"]  # mean difference of the images from their inverse
+    noise: float  # standard deviation of an image
+
+    @property
+    def lit(self) -> Bool[ndarray, "h w"]:
+        """Pixels that the projector reaches."""
+        return self.signal > max(_LEAST_DIRECT, _LEAST_SIGNAL * self.noise)
+
+
+def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
+    """Coordinates of every pixel from the photographs of one sequence, in the order they were projected.
+
+    Grey or RGB, 8 or 16 bit, all of one size. Coordinates are refined below the size of a cell by the places where the
+    difference of an image and its inverse changes sign. Raises DecodingError if the sequence is not complete or of
+    several sizes, or if nothing can be read from it.
+    """
+    _check_sequence(images, layout)
+    light = separate(images, layout)
+    _check_light(images, light)
+    coords = np.full((*light.lit.shape, 2), np.nan, dtype=np.float32)
+    stripes: list[Float32[ndarray, "h w"]] = []
+    for axis in (0, 1):
+        cells = _read_cells(images, layout, axis, light)
+        coords[..., axis] = subcell_coordinates(cells, (layout.columns, layout.rows)[axis]) * layout.cell
+        stripes.append(_stripe_image(images, layout, axis, light))
+    known = np.isfinite(coords).all(-1) & light.lit
+    coords[~known] = np.nan
+    coords = drop_small_regions(coords, _LARGEST_STEP * layout.cell, _LEAST_REGION)
+    decoded = Decoded(coords, light.lit, np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32))
+    if decoded.rate < _LEAST_DECODED:
+        raise DecodingError(
+            f"only {decoded.rate:.1%} of the lit pixels could be decoded",
+            "the images are not in the order of the sequence, belong to another sequence, or something moved",
+            "give white, black, then the bits of the column and of the row, coarse to fine, each followed by its "
+            "inverse, named so that sorting puts them in that order",
+        )
+    return decoded
+
+
+def separate(images: Sequence[Image], layout: GrayCode) -> Light:
+    """Light of every pixel; direct and global from the finest stripes, whose dark and bright halves are equal."""
+    pairs = [layout.bit_images(axis) for axis in (0, 1)]
+    highest = signal = np.zeros(images[0].shape[:2], dtype=np.float32)
+    lowest = np.full_like(highest, np.inf)
+    sums: list[Float32[ndarray, "h w"]] = []
+    for axis in (0, 1):
+        fine = len(pairs[axis]) - _FINEST
+        for k, (direct, inverse) in enumerate(pairs[axis]):
+            p, q = as_grey(images[direct]), as_grey(images[inverse])
+            signal = signal + np.abs(p - q)
+            if k == 0:
+                sums.append(p + q)  # the same light by two pairs of images: what differs is noise
+            if k >= fine:
+                highest = np.maximum(highest, np.maximum(p, q))
+                lowest = np.minimum(lowest, np.minimum(p, q))
+    noise = 1.4826 / 2 * float(np.median(np.abs(sums[0] - sums[1])))
+    ambient = 2 * np.clip(lowest - as_grey(images[1]), 0, None)
+    return Light(highest - lowest, ambient, signal / sum(layout.bits), noise)
+
+
+def check_count(count: int, layout: GrayCode) -> None:
+    """Raise DecodingError unless `count` images are one for each pattern of the sequence."""
+    if count != layout.images:
+        raise DecodingError(
+            f"holds {count} images, the sequence of the pattern has {layout.images}",
+            "images are missing or too many, or the pattern file describes another sequence "
+            f"({layout.w} x {layout.h} pixels in cells of {layout.cell})",
+            f"give one image of each of the {layout.images} patterns, or the pattern file that they were made with",
+        )
+
+
+def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
+    check_count(len(images), layout)
+    sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
+    if len(sizes) > 1:
+        raise DecodingError(
+            f"holds images of several sizes ({', '.join(sizes)})",
+            "pictures of another camera or resolution lie between those of the sequence",
+            "keep one folder for each frame, with nothing but its own images",
+        )
+
+
+def _check_light(images: Sequence[Image], light: Light) -> None:
+    share = float(light.lit.mean())
+    if share >= _LEAST_LIT:
+        return
+    brightness = float(as_grey(images[0]).mean())
+    what = "black" if brightness < _LEAST_DIRECT else "white" if brightness > 1 - _LEAST_DIRECT else "not changing"
+    raise DecodingError(
+        f"no stripes are seen: the images are {what} (lit: {share:.2%} of the pixels)",
+        {"black": "the exposure was far too short, the lens covered, or the projector off",
+         "white": "the exposure was far too long",
+         "not changing": "the projector was off, or its light missed what the camera sees"}[what],
+        "take this frame again, so that stripes are seen on the object in every image but white and black",
+    )  # fmt: skip
+
+
+def _read_cells(images: Sequence[Image], layout: GrayCode, axis: int, light: Light) -> Cells:
+    """Cells of all pixels along an axis."""
+    places = layout.bit_images(axis)
+    bits = len(places)
+    code = np.zeros(light.lit.shape, dtype=np.int32)
+    doubtful = np.zeros_like(code)
+    differences = np.empty((bits, *code.shape), dtype=np.int16)
+    for k, (direct, inverse) in enumerate(places):
+        p, q = as_grey(images[direct]), as_grey(images[inverse])
+        difference = p - q
+        value = np.int32(1 << (bits - 1 - k))
+        code += value * (difference > 0)
+        doubtful += value * _doubtful(p, q, light)
+        differences[k] = np.rint(difference * 32767)
+    cell = ungray(code, bits)
+    level = np.full(code.shape, -1, dtype=np.int8)
+    for coarser in reversed(range(LEVELS)):
+        # A bit in doubt does no harm where the cell ends and its neighbour differs in just that bit.
+        c = cell >> coarser
+        harmless = ((code >> coarser) ^ gray(c - 1)) | ((code >> coarser) ^ gray(c + 1))
+        level[(doubtful >> coarser) & ~harmless == 0] = coarser
+    level[~light.lit | (cell >= (layout.columns, layout.rows)[axis])] = -1
+    return Cells(cell, level, differences)
+
+
+def _doubtful(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Light) -> Bool[ndarray, "h w"]:
+    """Where a bit cannot be told from image `p` and inverse `q`.
+
+    Their difference is the direct light plus a share of the global light between -1 and 1 (or minus the first): its
+    sign is certain if it is larger than global light could make it with the wrong sign.
+    """
+    difference = np.abs(p - q)
+    noise = 2 * np.sqrt(2) * light.noise
+    return (difference <= light.ambient - light.direct) | (difference < np.maximum(_UNCERTAIN * light.direct, noise))
+
+
+def _stripe_image(images: Sequence[Image], layout: GrayCode, axis: int, light: Light) -> Float32[ndarray, "h w"]:
+    """The finest stripes of an axis in [0, 1], free of albedo and shading."""
+    direct, inverse = layout.bit_images(axis)[-1]
+    difference = as_grey(images[direct]) - as_grey(images[inverse])
+    return np.clip(0.5 + difference / (2 * np.maximum(light.direct, _LEAST_DIRECT)), 0, 1).astype(np.float32)

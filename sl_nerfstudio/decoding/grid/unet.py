@@ -1,0 +1,64 @@
+"""The U-Net that reads a captured image: where the pattern is, the phase in its grid, and the symbols."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sl_nerfstudio.decoding.grid.channels import CHANNELS
+from sl_nerfstudio.pattern.codes import SYMBOLS
+
+STRIDE = 2
+"""Pixels of the image per pixel of the network's maps."""
+_WIDTHS = (16, 32, 64, 96)
+MULTIPLE = STRIDE * 2 ** (len(_WIDTHS) - 1)
+"""Width and height of the image must be multiples of this."""
+
+
+class Reading(NamedTuple):
+    """What the network sees, at half the resolution of its input; places lie where four pixels meet."""
+
+    mask: Float[Tensor, "b h w"]  # logit of: the pattern falls here
+    phase: Float[Tensor, "b 4 h w"]  # cosine and sine of the phase in x, then in y; both 0 where unknown
+    symbol: Float[Tensor, "b 5 h w"]  # logits of the symbol of the nearest node
+
+
+class UNet(nn.Module):
+    """Four levels of two 3 x 3 convolutions; the image enters with 2 x 2 pixels folded into channels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = _WIDTHS
+        self.down = nn.ModuleList(_Pair(n_in, n_out) for n_in, n_out in pairwise((CHANNELS * STRIDE**2, *widths)))
+        self.up = nn.ModuleList(_Pair(deep + own, own) for own, deep in pairwise(widths))
+        self.head = nn.Conv2d(widths[0], 1 + 4 + SYMBOLS, 1)
+
+    def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> Reading:
+        """Read images whose sides are multiples of `MULTIPLE`."""
+        x = F.pixel_unshuffle(channels, STRIDE)
+        kept: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(x if level == 0 else F.max_pool2d(x, 2))
+            kept.append(x)
+        for level in reversed(range(len(self.up))):
+            larger = F.interpolate(x, scale_factor=2.0, mode="nearest")
+            x = self.up[level](torch.cat([larger, kept[level]], 1))
+        out = self.head(x)
+        return Reading(out[:, 0], out[:, 1:5], out[:, 5:])
+
+
+class _Pair(nn.Sequential):
+    """Two convolutions, each followed by batch normalisation and a rectifier."""
+
+    def __init__(self, n_in: int, n_out: int) -> None:
+        super().__init__(
+            nn.Conv2d(n_in, n_out, 3, padding=1, bias=False),
+            nn.BatchNorm2d(n_out),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(n_out, n_out, 3, padding=1, bias=False),
+            nn.BatchNorm2d(n_out),
+            nn.ReLU(inplace=True),
+        )

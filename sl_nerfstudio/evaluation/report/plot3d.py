@@ -1,0 +1,110 @@
+"""The surface as an interactive plot that works without a network."""
+
+import base64
+import gzip
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from sl_nerfstudio.evaluation.report.pictures import CLAY, ColourScale
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.meshing.mesh import Mesh
+
+MOST_TRIANGLES = 40_000  # about 1 MB in the page
+
+
+def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
+    """The mesh with at most about `most` triangles, and for each of its vertices the nearest one of the original."""
+    if len(mesh.faces) <= most:
+        return mesh, np.arange(len(mesh.vertices))
+    centre = mesh.vertices.mean(0)
+    size = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
+    plain = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector((mesh.vertices - centre) / size),
+        o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
+    )
+    if len(mesh.faces) > 5 * most:  # a quick coarse pass: the good decimation takes 10 s for a million triangles
+        cell = float(np.sqrt(Surface(mesh).area / (2 * most))) / size
+        plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Quadric)
+    small = plain.simplify_quadric_decimation(most)
+    vertices = np.asarray(small.vertices) * size + centre
+    used = np.unique(mesh.faces)
+    nearest = used[np.asarray(KDTree(mesh.vertices[used]).query(vertices)[1])]
+    return Mesh(vertices, np.asarray(small.triangles).astype(np.int64)), nearest
+
+
+def mesh_figure(
+    mesh: Mesh,
+    values: Float[ndarray, "v"] | None,
+    scale: ColourScale | None,
+    units: str,
+    T_world_camera: Float[ndarray, "n 4 4"],
+    T_world_projector: Float[ndarray, "n 4 4"],
+) -> str:
+    """Plotly figure (JSON): the surface, coloured by `values` if given, with cameras and projectors as dots."""
+    import plotly.graph_objects as go
+
+    small, nearest = decimated(mesh)
+    x, y, z = small.vertices.astype(np.float32).T
+    i, j, k = small.faces.astype(np.int32).T
+    look: dict[str, Any] = {"color": f"rgb{tuple(int(255 * c) for c in CLAY)}"}
+    if values is not None and scale is not None:
+        stops = np.linspace(0, 1, 11)
+        colours = scale(scale.lower + stops * (scale.upper - scale.lower))
+        look = {
+            "intensity": values[nearest].astype(np.float32),
+            "colorscale": [
+                [float(s), f"rgb{tuple(int(255 * c) for c in rgb)}"] for s, rgb in zip(stops, colours, strict=True)
+            ],
+            "cmin": scale.lower,
+            "cmax": scale.upper,
+            "colorbar": {"title": {"text": units, "side": "right"}, "thickness": 12, "len": 0.7},
+            "hovertemplate": f"%{{intensity:.3g}} {units}<extra></extra>",
+        }
+    else:
+        look["hoverinfo"] = "skip"
+    figure = go.Figure(
+        go.Mesh3d(
+            x=x, y=y, z=z, i=i, j=j, k=k, name="surface", showlegend=False, flatshading=False,
+            lighting={"ambient": 0.55, "diffuse": 0.6, "specular": 0.05, "roughness": 0.9}, **look,
+        )
+    )  # fmt: skip
+    for name, T, colour, symbol in (
+        ("cameras", T_world_camera, "#2563a8", "circle"),
+        ("projectors", T_world_projector, "#c2571a", "diamond"),
+    ):
+        cx, cy, cz = T[:, :3, 3].T
+        labels = [f"{name[:-1]} of frame {index}" for index in range(len(T))]
+        figure.add_scatter3d(
+            x=cx, y=cy, z=cz, mode="markers", name=name, visible="legendonly", text=labels, hoverinfo="text",
+            marker={"size": 3, "color": colour, "symbol": symbol},
+        )  # fmt: skip
+    up = T_world_camera[:, :3, 1].mean(0)
+    eye = T_world_camera[0, :3, 3] - small.vertices.mean(0)
+    axis = {"visible": False}
+    figure.update_layout(
+        template="none", height=560, margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        scene={
+            "xaxis": axis, "yaxis": axis, "zaxis": axis, "aspectmode": "data",
+            "camera": {"up": _xyz(up), "eye": _xyz(eye)},
+        },
+        legend={"orientation": "h", "x": 0, "y": 0},
+        font={"family": "inherit", "size": 12},
+    )  # fmt: skip
+    return str(figure.to_json()).replace("<", "\\u003c")  # it will stand in a <script> element
+
+
+def _xyz(v: Float[ndarray, "3"]) -> dict[str, float]:
+    length = float(np.linalg.norm(v)) or 1.0
+    return {axis: 1.5 * float(value) / length for axis, value in zip("xyz", v, strict=True)}
+
+
+def compressed_script() -> str:
+    """Plotly's JavaScript, gzipped, in base64: a third of its size; the page unpacks it."""
+    from plotly.offline import get_plotlyjs
+
+    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 9, mtime=0)).decode()

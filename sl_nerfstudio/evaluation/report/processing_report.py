@@ -1,0 +1,99 @@
+"""The report of `sl-process`: what became of every capture, as one HTML file that needs no network."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
+from sl_nerfstudio.evaluation.report.pages import page
+from sl_nerfstudio.evaluation.report.pictures import data_uri
+from sl_nerfstudio.processing.advice import first_line
+from sl_nerfstudio.processing.preview import Preview
+from sl_nerfstudio.processing.result import FrameRecord, ProcessResult
+
+_TEMPLATE = "processing.html.j2"
+_MANY_WEAK = 0.25  # of the frames
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """A frame as the page shows it."""
+
+    record: FrameRecord
+    image: str  # data addresses; "" where there is no picture
+    coords: str
+
+
+def render_processing_report(result: ProcessResult, previews: Sequence[Preview]) -> str:
+    """The page as text."""
+    rows = [FrameRow(record, *_pictures(preview)) for record, preview in zip(result.frames, previews, strict=True)]
+    values = {
+        "result": result,
+        "rows": rows,
+        "band": _band(result),
+        "sentence": _sentence(result),
+        "charts": _charts(result),
+        "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
+        "settings": sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
+        "made_at": datetime.now(),
+    }
+    return page(_TEMPLATE, {"figure": _figure, "percent": _percent, "first_line": first_line}, values)
+
+
+def _band(result: ProcessResult) -> str:
+    """good, acceptable or poor."""
+    lost = len(result.frames) - result.registered
+    weak = sum(bool(f.degeneracies) for f in result.frames if f.in_scan)
+    if result.registered < 2 or lost > len(result.frames) / 4:
+        return "poor"
+    if lost or weak > _MANY_WEAK * result.registered or result.remarks:
+        return "acceptable"
+    return "good"
+
+
+def _sentence(result: ProcessResult) -> str:
+    lost = len(result.frames) - result.registered
+    begin = f"{result.registered} of {len(result.frames)} frames are in the scan"
+    if result.registered < 2:
+        return f"{begin}: no scan could be written."
+    length = f"its lengths are {result.units}, known by {result.scale_source}" if result.scale_source else (
+        "no length is known, so its unit is arbitrary"
+    )  # fmt: skip
+    return f"{begin}{f'; {lost} were left out' if lost else ''}; {length}."
+
+
+def _charts(result: ProcessResult) -> list[tuple[str, str]]:
+    """Caption and drawing of every chart over the frames."""
+    frames = result.frames
+
+    def values(key: str, factor: float = 1.0) -> list[float]:
+        return [math.nan if getattr(f, key) is None else factor * getattr(f, key) for f in frames]
+
+    drawn = [
+        ("Decode rate: share of the pattern seen in the image that has coordinates", "% of the pattern",
+         [charts.Bars("decoded", values("decode_rate", 100.0))]),
+        ("Epipolar residual: how well coordinates fit the frame's own calibration", "pattern px",
+         [charts.Bars("epipolar", values("epipolar_px"))]),
+        ("Calibration uncertainty (1 sigma): projector against camera", "degrees",
+         [charts.Bars("rotation", values("sigma_rotation_deg")),
+          charts.Bars("baseline's direction", values("sigma_direction_deg"))]),
+        ("Agreement with the frames it overlaps", "% of the points",
+         [charts.Bars("agreement", values("fitness", 100.0))]),
+    ]  # fmt: skip
+    known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]
+    return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]
+
+
+def _pictures(preview: Preview) -> tuple[str, str]:
+    image, coords = (("" if p is None else data_uri(p)) for p in (preview.image, preview.coords))
+    return image, coords
+
+
+def _figure(value: float | None, decimals: int = 2) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{100 * value:.0f} %"

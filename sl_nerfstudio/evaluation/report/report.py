@@ -1,0 +1,249 @@
+"""The report: one HTML file by which a person can judge a scan, without a network."""
+
+import math
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from sl_nerfstudio.evaluation.evaluate import Evaluation, Poses
+from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
+from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
+from sl_nerfstudio.evaluation.report.pages import page
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, data_uri, render, views_of
+from sl_nerfstudio.evaluation.report.plot3d import compressed_script, mesh_figure
+from sl_nerfstudio.evaluation.report.thumbnails import COORDINATE, EPIPOLAR, PATTERN, FrameThumbnails
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.verdict import judge
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.scan import PoseSigma, Scan
+
+_TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """What the report is made of."""
+
+    evaluation: Evaluation
+    scan: Scan
+    mesh: Mesh
+    poses: Poses
+    thumbnails: list[FrameThumbnails]
+    mesh_name: str
+    poses_name: str  # "" where the scan's own poses were evaluated
+    pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # posterior, one per frame, or empty
+    training: dict[str, Any] | None = None  # settings, versions and curves of the run, and doubts of the intrinsics
+    made_at: datetime = field(default_factory=datetime.now)
+
+
+@dataclass(frozen=True)
+class SurfacePictures:
+    """Shaded views of the surface, with error colours where there is a reference."""
+
+    views: list[str]  # data addresses
+    figure: str  # Plotly's JSON
+    scale: ColourScale | None
+    histogram: str  # SVG, "" without a reference
+
+
+def render_report(report: ReportInput) -> str:
+    """The page as text."""
+    evaluation, scan = report.evaluation, report.scan
+    surface = Surface(report.mesh)
+    comparisons: list[Comparison] = compare_frames(
+        surface, scan, evaluation.fit, report.poses.T_world_camera, report.poses.T_world_projector
+    )
+    values = {
+        "report": report,
+        "evaluation": evaluation,
+        "scan": scan,
+        "fit": evaluation.fit,
+        "units": evaluation.units,
+        "truth_units": evaluation.truth_units,
+        "verdict": judge(evaluation, str((report.training or {}).get("intrinsics", ""))),
+        "surface": _surface_pictures(report, surface),
+        "comparisons": comparisons,
+        "coordinate_scale": COORDINATE,
+        "epipolar_scale": EPIPOLAR,
+        "pattern_scale": PATTERN,
+        "fit_chart": _fit_chart(evaluation),
+        "outliers": _outliers(evaluation),
+        "changes": _pose_changes(report),
+        "truth": _truth_rows(evaluation),
+        "training": _training(report.training),
+        "summary": _summary(report),
+        "plotly": compressed_script(),
+    }
+    return page(_TEMPLATE, {"number": _number, "percent": _percent, "fixed": _fixed}, values)
+
+
+def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
+    values, scale = _errors(report, surface, surface.vertices)
+    colours = None if values is None or scale is None else scale(values)
+    views = views_of(report.poses.T_world_camera, surface.centre)
+    units = report.evaluation.truth_units
+    figure = mesh_figure(report.mesh, values, scale, units, report.poses.T_world_camera, report.poses.T_world_projector)
+    histogram = ""
+    if scale is not None:
+        errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])
+        if errors is not None:
+            title = "Signed distance of the surface from the reference"
+            histogram = charts.histogram(title, units, errors, scale.lower, scale.upper)
+    return SurfacePictures([data_uri(render(surface, v, colours)) for v in views], figure, scale, histogram)
+
+
+def _errors(
+    report: ReportInput, surface: Surface, points: Float[ndarray, "n 3"]
+) -> tuple[Float[ndarray, "n"] | None, ColourScale | None]:
+    """Signed errors of points of the result after alignment, and their colour scale; None without reference."""
+    reference = report.evaluation.reference
+    if reference is None:
+        return None, None
+    score = report.evaluation.surface[report.evaluation.alignment]
+    exact = isinstance(reference, MeshReference)
+    limit = charts.nice_limit((score.accuracy if exact else score.completeness).p95)
+    return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
+
+
+def _fit_chart(evaluation: Evaluation) -> str:
+    frames = evaluation.fit.frames
+    return charts.frame_bars(
+        "Median residuals by frame",
+        "pattern px",
+        [
+            charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
+            charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
+        ],
+        wide=True,
+    )
+
+
+def _outliers(evaluation: Evaluation) -> set[str]:
+    """Frames whose coordinate residual is more than twice the scan's."""
+    limit = 2 * evaluation.fit.coordinate_px_median
+    return {f.name for f in evaluation.fit.frames if not f.coordinate_px_median <= limit}
+
+
+@dataclass(frozen=True)
+class PoseChanges:
+    """How far the evaluated poses lie from the scan's own, and how well they are known."""
+
+    change: PoseErrors
+    sigma: list[PoseSigma | None]
+    charts: list[str]
+
+
+def _pose_changes(report: ReportInput) -> PoseChanges | None:
+    """None where the scan's own poses were evaluated."""
+    if not report.poses_name:
+        return None
+    scan, poses = report.scan, report.poses
+    change = compare_poses(poses.T_world_camera, poses.T_world_projector, scan.T_world_camera, scan.T_world_projector)
+    sigma = report.pose_sigma if any(s is not None for s in report.pose_sigma) else []
+    camera, projector = change.camera, change.projector
+    figures = [
+        charts.frame_bars(title, unit, [charts.Bars("camera", list(c)), charts.Bars("projector", list(p))])
+        for title, unit, c, p in (
+            ("Change of position by frame", scan.units, camera.translation, projector.translation),
+            ("Change of rotation by frame", "degrees", camera.rotation_deg, projector.rotation_deg),
+        )
+    ]
+    if sigma:
+        for title, unit, keys in (
+            ("Uncertainty of position (1 sigma) by frame", scan.units, ("camera_translation", "relative_translation")),
+            ("Uncertainty of rotation (1 sigma) by frame", "degrees", ("camera_rotation_deg", "relative_rotation_deg")),
+        ):
+            labels = ("frame in the world", "projector against camera")
+            series = [
+                charts.Bars(label, [getattr(s, key) if s else math.nan for s in sigma])
+                for key, label in zip(keys, labels, strict=True)
+            ]
+            figures.append(charts.frame_bars(title, unit, series))
+    return PoseChanges(change, sigma, figures)
+
+
+def _truth_rows(evaluation: Evaluation) -> list[tuple[str, PoseErrors]]:
+    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
+    return [(name, errors) for name, errors in rows if errors is not None]
+
+
+@dataclass(frozen=True)
+class TrainingSection:
+    """Curves, settings and versions of the run."""
+
+    curves: list[str]
+    settings: list[tuple[str, str]]
+    versions: list[tuple[str, str]]
+
+
+def _training(training: dict[str, Any] | None) -> TrainingSection | None:
+    if training is None:
+        return None
+    curves = {k: v for k, v in _dict(training.get("curves")).items() if isinstance(v, list) and len(v) > 0}
+    step = curves.pop("step", [])
+    drawn = [
+        charts.curve(name, step if len(step) == len(values) else range(len(values)), values)
+        for name, values in curves.items()
+    ]
+    return TrainingSection(drawn, _flat(_dict(training.get("settings"))), _flat(_dict(training.get("versions"))))
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as dotted names."""
+    rows: list[tuple[str, str]] = []
+    for key, value in settings.items():
+        name = f"{prefix}{key}"
+        rows += _flat(value, f"{name}.") if isinstance(value, dict) and value else [(name, str(value))]
+    return rows
+
+
+def _summary(report: ReportInput) -> list[tuple[str, str]]:
+    scan, fit, poses = report.scan, report.evaluation.fit, report.poses
+    baseline = np.linalg.norm(poses.T_world_camera[:, :3, 3] - poses.T_world_projector[:, :3, 3], axis=1)
+    centre = (report.mesh.vertices.min(0) + report.mesh.vertices.max(0)) / 2
+    distance = np.linalg.norm(poses.T_world_camera[:, :3, 3] - centre, axis=1)
+    size = np.ptp(report.mesh.vertices, axis=0)
+    cameras = sorted({f"{f.camera.w} × {f.camera.h}" for f in scan.frames})
+    decoded = np.mean([f.decoded_share for f in fit.frames])
+    scale = f"known ({scan.scale.source})" if scan.scale.known else "not known: all lengths are relative"
+    return [
+        ("Frames", str(len(scan.frames))),
+        ("Image size", ", ".join(cameras) + " pixels"),
+        ("Projector", f"{scan.projector.w} × {scan.projector.h} pixels, model {scan.projector.model}"),
+        ("Unit", scan.units),
+        ("Scale", scale if scan.scale.source or not scan.scale.known else "known"),
+        ("Pixels with pattern", f"{sum(f.pixels for f in fit.frames):,}, of which {decoded:.0%} were decoded"),
+        ("Distance of the cameras", f"{np.median(distance):.4g} {scan.units} (median)"),
+        ("Camera to projector", f"{np.median(baseline):.4g} {scan.units} (median), "
+         f"{np.min(baseline):.4g} to {np.max(baseline):.4g}"),
+        ("Mesh", f"{len(report.mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
+    ]  # fmt: skip
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    """Three significant digits, a dash where there is no value."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0 or 1e-4 <= abs(value) < 1e5:
+        return f"{value:#.{digits}g}".rstrip(".") if value else "0"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def _fixed(value: float | None, decimals: int = 2) -> str:
+    """A fixed number of decimals, a dash where there is no value."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
+
+
+def _percent(value: float | None, decimals: int = 1) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{100 * value:.{decimals}f} %"

@@ -1,0 +1,115 @@
+"""The field as torch operations: values, and values with gradients, both differentiable once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sl_nerfstudio.field.backend import FieldBackend, FieldState
+from sl_nerfstudio.field.table_gradient import TableGradient, Wanted, wanted
+
+
+@dataclass(frozen=True)
+class _Target:
+    """Where a backward pass puts the parameters' gradients."""
+
+    parameters: bool
+    """Whether any parameter's gradient is wanted."""
+    table: Tensor | None
+    """What the table's gradient is added to."""
+    marks: Tensor | None
+    """Marks of its rows, if it is the persistent buffer."""
+    returned: Tensor | None
+    """The table's gradient as a result of the backward function."""
+
+
+def _target(ctx: Any) -> _Target:
+    table, *mlp = ctx.parameters
+    table_wanted = wanted(table)
+    if table_wanted == Wanted.NO:
+        return _Target(any(wanted(x) != Wanted.NO for x in mlp), None, None, None)
+    buffer: TableGradient | None = ctx.buffer
+    if table_wanted == Wanted.ACCUMULATED and buffer is not None:
+        return _Target(True, buffer.attach(table), buffer.marks, None)
+    fresh = torch.zeros_like(table)
+    return _Target(True, fresh, None, fresh)
+
+
+def _keep(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, tensors: tuple[Tensor, ...]) -> FieldState:
+    p, level_weights, table, *mlp = tensors
+    ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
+    ctx.save_for_backward(p, level_weights.clone(), table, *mlp)  # checks that none is changed before the backward pass
+    return FieldState(table, level_weights, tuple(mlp))
+
+
+def _kept(ctx: Any) -> tuple[Tensor, FieldState]:
+    p, level_weights, table, *mlp = ctx.saved_tensors
+    return p, FieldState(table, level_weights, tuple(mlp))
+
+
+class _Value(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, *tensors: Tensor) -> Tensor:
+        return backend.evaluate(_keep(ctx, backend, buffer, tensors), tensors[0], False)[0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        p, state = _kept(ctx)
+        to = _target(ctx)
+        result = ctx.backend.pull_back(
+            state, p, grad_outputs[0], ctx.needs_input_grad[2], to.parameters, to.table, to.marks
+        )
+        return (None, None, result.points, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
+
+
+class _ValueAndGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        f, n = backend.evaluate(_keep(ctx, backend, buffer, tensors), tensors[0], True)
+        assert n is not None
+        return f, n
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        p, state = _kept(ctx)
+        to = _target(ctx)
+        mlp: tuple[Tensor | None, ...] = (None,) * len(state.mlp)
+        if to.parameters:
+            mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to.table, to.marks)
+        return (None, None, None, None, to.returned, *mlp)
+
+
+def value(
+    backend: FieldBackend,
+    buffer: TableGradient | None,
+    state: FieldState,
+    p: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n"]:
+    """Values at `p`, differentiable with respect to parameters and points.
+
+    `backward()` adds the table's gradient to `buffer`, if there is one, which is or becomes its `.grad`.
+    """
+    return _apply(_Value, backend, buffer, state, p)
+
+
+def value_and_gradient(
+    backend: FieldBackend,
+    buffer: TableGradient | None,
+    state: FieldState,
+    p: Float[Tensor, "n 3"],
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
+    return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
+
+
+def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
+    """Call an autograd function in the parameters' precision, also where mixed precision is switched on."""
+    with torch.autocast(p.device.type, enabled=False):
+        return function.apply(backend, buffer, p.to(state.table.dtype), state.level_weights, state.table, *state.mlp)

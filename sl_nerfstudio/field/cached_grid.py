@@ -1,0 +1,49 @@
+"""A coarse grid of the field's values: tells at next to no cost where a ray meets the surface."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sl_nerfstudio.field.sdf_field import SDFField
+
+_BAND_CELLS = 3.0  # vertices this near to the surface are kept up to date
+_AT_ONCE = 131072
+
+
+class CachedGrid(nn.Module):
+    """Values of a field on a grid of [-1, 1]^3. Part of a checkpoint: a resumed run samples as it would have."""
+
+    values: Tensor
+    filled: Tensor
+
+    def __init__(self, resolution: int = 96) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.register_buffer("values", torch.zeros(resolution, resolution, resolution))
+        self.register_buffer("filled", torch.tensor(False))
+
+    @property
+    def cell(self) -> float:
+        """Distance between neighbouring vertices."""
+        return 2 / (self.resolution - 1)
+
+    @torch.no_grad()
+    def refresh(self, field: SDFField, everywhere: bool = False) -> None:
+        """Evaluate the field again: near its cached surface, or everywhere (always so at first)."""
+        flat = self.values.reshape(-1)
+        if everywhere or not self.filled:
+            index = torch.arange(len(flat), device=flat.device)
+        else:
+            index = (flat.abs() < _BAND_CELLS * self.cell).nonzero()[:, 0]
+        n = self.resolution
+        for part in index.split(_AT_ONCE):
+            xyz = torch.stack([part % n, part // n % n, part // (n * n)], -1)
+            flat[part] = field.sdf(xyz * self.cell - 1.0)
+        self.filled.fill_(True)
+
+    def look_up(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Trilinear values at points; the border's value outside."""
+        grid = p.reshape(1, -1, 1, 1, 3)
+        found = F.grid_sample(self.values[None, None], grid, padding_mode="border", align_corners=True)
+        return found.reshape(-1)

@@ -1,0 +1,250 @@
+"""The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features a level.
+
+A chunk of points is encoded into `e` [POINTS, depth]: columns 0..2 the point, 3 the constant 1 (it carries the first
+layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS, 3, depth]
+holds the derivatives of the level columns with respect to the three coordinates.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy import ndarray
+
+from sl_nerfstudio.field.hash_grid import PRIMES
+from sl_nerfstudio.field.kernels.simd import (
+    FEATURES,
+    gather,
+    gather_jacobian,
+    kernel,
+    part,
+    prefetch,
+    scatter,
+    scatter_pair,
+)
+
+POINTS = 128
+"""Points a chunk: its activations stay in the core's own cache."""
+FIRST = 8
+"""Column of the first level."""
+_AHEAD = 8  # points: so early are rows asked for
+_Y, _Z = np.int64(PRIMES[1]), np.int64(PRIMES[2])
+_ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
+
+
+class Grid(NamedTuple):
+    """A feature grid as the kernels see it."""
+
+    table: ndarray
+    """float32 [rows * 8], flat."""
+    weights: ndarray
+    """float32 [levels]; levels of weight 0 are not touched."""
+    resolutions: ndarray
+    """int64 [levels]."""
+    offsets: ndarray
+    """int64 [levels]: first row."""
+    sizes: ndarray
+    """int64 [levels]: rows."""
+    hashed: ndarray
+    """bool [levels]."""
+    smooth: bool
+    """Smoothstep interpolation."""
+
+
+@part
+def clamped(x):
+    """`x` in [-1, 1]; NaN becomes -1, so that nothing is read outside the table."""
+    x = x if x > -_ONE else -_ONE
+    return x if x < _ONE else _ONE
+
+
+@part
+def inside(x):
+    """1 where `clamped` is the identity, else 0: its derivative."""
+    return _ONE if -_ONE <= x <= _ONE else _ZERO
+
+
+@part
+def along(x, resolution):
+    """Cell and fraction of a coordinate in [-1, 1]."""
+    u = (x + _ONE) * (_HALF * np.float32(resolution))
+    cell = np.int64(u)
+    cell = cell if cell < resolution else resolution - 1
+    return cell, u - np.float32(cell)
+
+
+@part
+def eased(t, smooth):
+    """`t` and its slope 1, or with `smooth` = 1 (instead of 0) smoothstep `3 t^2 - 2 t^3` and its slope."""
+    bent = t * t * (np.float32(3) - np.float32(2) * t)
+    return t + smooth * (bent - t), _ONE + smooth * (np.float32(6) * t * (_ONE - t) - _ONE)
+
+
+@part
+def positions(x, y, z, resolution, offset, size, hashed):
+    """Positions in the flat table of the eight corners of a cell; x varies fastest."""
+    if hashed:
+        mask = size - 1
+        y0, y1, z0, z1 = y * _Y, (y + 1) * _Y, z * _Z, (z + 1) * _Z
+        a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        w = x + 1
+        return (
+            ((x ^ a) & mask) + offset << 3,
+            ((w ^ a) & mask) + offset << 3,
+            ((x ^ b) & mask) + offset << 3,
+            ((w ^ b) & mask) + offset << 3,
+            ((x ^ c) & mask) + offset << 3,
+            ((w ^ c) & mask) + offset << 3,
+            ((x ^ d) & mask) + offset << 3,
+            ((w ^ d) & mask) + offset << 3,
+        )
+    side = resolution + 1
+    a = x + side * (y + side * z) + offset
+    b, c = a + side, a + side * side
+    d = c + side
+    return a << 3, a + 1 << 3, b << 3, b + 1 << 3, c << 3, c + 1 << 3, d << 3, d + 1 << 3
+
+
+@part
+def locate(px, py, pz, level):
+    """Corners and fractions of a point in [-1, 1]^3 on a level (see `level_of`)."""
+    resolution, offset, size, hashed = level
+    x, tx = along(px, resolution)
+    y, ty = along(py, resolution)
+    z, tz = along(pz, resolution)
+    return positions(x, y, z, resolution, offset, size, hashed), tx, ty, tz
+
+
+@part
+def level_of(grid, level):
+    """What `locate` needs to know of a level."""
+    return grid.resolutions[level], grid.offsets[level], grid.sizes[level], grid.hashed[level]
+
+
+@part
+def encode_level(grid, level, count, e, depth):
+    """Write one level's columns of `e`."""
+    place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
+    column = FIRST + FEATURES * level
+    for i in range(count):
+        row = i * depth
+        if i + _AHEAD < count:
+            ahead = row + _AHEAD * depth
+            prefetch(grid.table, locate(e[ahead], e[ahead + 1], e[ahead + 2], place)[0])
+        corners, tx, ty, tz = locate(e[row], e[row + 1], e[row + 2], place)
+        t = eased(tx, smooth)[0], eased(ty, smooth)[0], eased(tz, smooth)[0]
+        gather(grid.table, corners, t, weight, e, row + column)
+
+
+@part
+def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
+    """Write one level's columns of `e` and `jac`."""
+    place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
+    column = FIRST + FEATURES * level
+    slope = weight * _HALF * np.float32(grid.resolutions[level])
+    for i in range(count):
+        row = i * depth
+        if i + _AHEAD < count:
+            ahead = row + _AHEAD * depth
+            prefetch(grid.table, locate(e[ahead], e[ahead + 1], e[ahead + 2], place)[0])
+        corners, tx, ty, tz = locate(e[row], e[row + 1], e[row + 2], place)
+        tx, dx = eased(tx, smooth)
+        ty, dy = eased(ty, smooth)
+        tz, dz = eased(tz, smooth)
+        dx *= slope * inside(p[start + i, 0])
+        dy *= slope * inside(p[start + i, 1])
+        dz *= slope * inside(p[start + i, 2])
+        at = 3 * row + column
+        gather_jacobian(grid.table, corners, (tx, ty, tz), weight, e, row + column, (dx, dy, dz), jac, at, depth)
+
+
+@part
+def encode(grid, p, start, count, e, depth, used, jac, want_jacobian):
+    """Encode points `start .. start + count` of `p` [n, 3] into `e`, and their derivatives into `jac`.
+
+    Columns from `used` (see `Network`) up to the next multiple of 16 are zero, further ones are left as they are.
+    """
+    end = min((used + 15) // 16 * 16, depth)
+    for i in range(count):
+        row = i * depth
+        for a in range(3):
+            e[row + a] = clamped(p[start + i, a])
+        e[row + 3] = _ONE
+        for j in range(4, FIRST):
+            e[row + j] = _ZERO
+        for j in range(used, end):
+            e[row + j] = _ZERO
+    for level in range((used - FIRST) // FEATURES):
+        if grid.weights[level] == _ZERO:
+            column = FIRST + FEATURES * level
+            for i in range(count):
+                for j in range(column, column + FEATURES):
+                    e[i * depth + j] = _ZERO
+                    for a in range(3):
+                        jac[(3 * i + a) * depth + j] = _ZERO
+        elif want_jacobian:
+            encode_level_jacobian(grid, level, count, e, depth, jac, p, start)
+        else:
+            encode_level(grid, level, count, e, depth)
+
+
+@part
+def corner_weights(tx, ty, tz, scale):
+    """Trilinear weights, times `scale`, of the eight corners; x varies fastest."""
+    ux, uy, uz = _ONE - tx, _ONE - ty, _ONE - tz
+    ux, tx = ux * scale, tx * scale
+    a, b, c, d = uy * uz, ty * uz, uy * tz, ty * tz
+    return ux * a, tx * a, ux * b, tx * b, ux * c, tx * c, ux * d, tx * d
+
+
+@part
+def corner_slopes(tx, ty, tz, vx, vy, vz):
+    """Derivatives of the trilinear weights in the direction `v` (of the fractions)."""
+    ux, uy, uz = _ONE - tx, _ONE - ty, _ONE - tz
+    a, b, c, d = uy * uz, ty * uz, uy * tz, ty * tz
+    va, vb = -vy * uz - uy * vz, vy * uz - ty * vz
+    vc, vd = -vy * tz + uy * vz, vy * tz + ty * vz
+    return (
+        ux * va - vx * a,
+        tx * va + vx * a,
+        ux * vb - vx * b,
+        tx * vb + vx * b,
+        ux * vc - vx * c,
+        tx * vc + vx * c,
+        ux * vd - vx * d,
+        tx * vd + vx * d,
+    )
+
+
+@kernel
+def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slopes, with_slopes):
+    """Add one level's gradients to the table's, and mark the rows.
+
+    Point i adds `weight * corner_weights * values[level, i]`, and, `with_slopes`, also the directional derivative of
+    the corner weights along `v` [n, 3] times `slopes[level, i]`; values and slopes are [levels, n, 8].
+    """
+    weight = grid.weights[level]
+    if weight == _ZERO:
+        return
+    place, smooth = level_of(grid, level), np.float32(grid.smooth)
+    slope = weight * _HALF * np.float32(grid.resolutions[level])
+    flat, flat_slopes = values[level].reshape(-1), slopes[level].reshape(-1)
+    for i in range(count):
+        if i + _AHEAD < count:
+            px, py, pz = p[start + i + _AHEAD, 0], p[start + i + _AHEAD, 1], p[start + i + _AHEAD, 2]
+            prefetch(gradient, locate(clamped(px), clamped(py), clamped(pz), place)[0])
+        px, py, pz = p[start + i, 0], p[start + i, 1], p[start + i, 2]
+        corners, tx, ty, tz = locate(clamped(px), clamped(py), clamped(pz), place)
+        tx, dx = eased(tx, smooth)
+        ty, dy = eased(ty, smooth)
+        tz, dz = eased(tz, smooth)
+        weights = corner_weights(tx, ty, tz, weight)
+        if with_slopes:
+            vx = v[start + i, 0] * inside(px) * dx * slope
+            vy = v[start + i, 1] * inside(py) * dy * slope
+            vz = v[start + i, 2] * inside(pz) * dz * slope
+            changes = corner_slopes(tx, ty, tz, vx, vy, vz)
+            scatter_pair(gradient, corners, FEATURES * i, weights, flat, changes, flat_slopes)
+        else:
+            scatter(gradient, corners, FEATURES * i, weights, flat)
+        for corner in corners:
+            marks[corner // FEATURES] = 1

@@ -1,0 +1,76 @@
+"""Kernels over the marked rows of the table: clear a gradient, and Adam.
+
+A batch of points marks a small part of the rows, scattered all over: what costs time is waiting for memory, so the
+marked rows are listed first, and asked for before their turn.
+"""
+
+import numpy as np
+
+from sl_nerfstudio.field.kernels.simd import FEATURES, kernel, part, prefetch
+
+LIST = 1024
+"""Rows listed at a time."""
+_AHEAD = 12
+_ONE, _ZERO = np.float32(1), np.float32(0)
+
+
+@part
+def list_marked(marks, start, stop, rows):
+    """Take marks away, from `start` on, until `rows` is full; gives the number of rows and where to go on."""
+    words, n, row = marks.view(np.int64), 0, start
+    while row < stop and n <= len(rows) - 8:
+        if words[row // 8] != 0:
+            for i in range(row, min(row + 8, stop)):
+                if marks[i]:
+                    marks[i] = 0
+                    rows[n] = i
+                    n += 1
+        row += 8
+    return n, row
+
+
+@kernel
+def clear(gradient, marks, start, stop, rows):
+    """Zero the marked rows `start .. stop` of a flat gradient, and their marks; `start` is a multiple of 8."""
+    while start < stop:
+        n, start = list_marked(marks, start, stop, rows)
+        for k in range(n):
+            if k + _AHEAD < n:
+                prefetch(gradient, (rows[k + _AHEAD] * FEATURES,))
+            for i in range(FEATURES):
+                gradient[rows[k] * FEATURES + i] = _ZERO
+
+
+@kernel
+def adam(table, gradient, moments, steps, marks, start, stop, rows, corrections, lr, beta1, beta2, eps):
+    """One step of Adam for every marked row whose gradient is not exactly zero; clears the gradient and the marks.
+
+    `moments` [row, 2, 8], flat: mean and mean square of the gradient. `steps` counts the steps of each row, and
+    `corrections[t]` holds what step t's mean, and the root of its mean square, are multiplied with.
+    """
+    last = len(corrections) - 1
+    while start < stop:
+        n, start = list_marked(marks, start, stop, rows)
+        for k in range(n):
+            if k + _AHEAD < n:
+                at = rows[k + _AHEAD] * FEATURES
+                prefetch(gradient, (at,))
+                prefetch(table, (at,))
+                prefetch(moments, (2 * at,))
+            row = rows[k]
+            at = row * FEATURES
+            seen = False
+            for i in range(at, at + FEATURES):
+                seen |= gradient[i] != _ZERO
+            if not seen:
+                continue
+            t = min(np.int64(steps[row]) + 1, last)
+            steps[row] = t
+            rate, root = lr * corrections[t, 0], corrections[t, 1]
+            for i in range(FEATURES):
+                g = gradient[at + i]
+                m = beta1 * moments[2 * at + i] + (_ONE - beta1) * g
+                s = beta2 * moments[2 * at + FEATURES + i] + (_ONE - beta2) * g * g
+                moments[2 * at + i], moments[2 * at + FEATURES + i] = m, s
+                table[at + i] -= rate * m / (np.sqrt(s) * root + eps)
+                gradient[at + i] = _ZERO

@@ -1,0 +1,110 @@
+"""Adam for feature tables: a row is stepped only when it has a gradient.
+
+A batch of points touches a fraction of the table. As Müller et al. (Instant Neural Graphics Primitives, 2022) do, rows
+whose gradient is exactly zero are skipped: moments and bias correction count a row's own steps. On the CPU the skipped
+rows are not even read, and a step leaves the gradient cleared: the next backward pass need not do it.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+from torch.optim import Optimizer
+
+from sl_nerfstudio.field.kernels.rows import LIST, adam
+from sl_nerfstudio.field.kernels.threads import parallel, split
+from sl_nerfstudio.field.table_gradient import TableGradient
+
+
+class RowAdam(Optimizer):
+    """Adam that skips the rows (first dimension) of a parameter whose gradient is exactly zero."""
+
+    def __init__(
+        self, params: Any, lr: float = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-15
+    ) -> None:
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
+        """One step for all rows that have a gradient; gives the closure's value."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    beta1, beta2 = group["betas"]
+                    self._step(parameter, group["lr"], beta1, beta2, group["eps"])
+        return loss
+
+    def _step(self, parameter: nn.Parameter, lr: float, beta1: float, beta2: float, eps: float) -> None:
+        state = self.state[parameter]
+        if not state:
+            state["moments"] = parameter.new_zeros(len(parameter), 2, *parameter.shape[1:])  # mean, mean square
+            state["steps"] = torch.zeros(len(parameter), device=parameter.device)
+        corrections = _corrections(beta1, beta2)
+        buffer = TableGradient.known(parameter)
+        if buffer is not None and buffer.holds(parameter.grad):
+            _step_marked(parameter, buffer, state, corrections, lr, beta1, beta2, eps)
+        else:
+            _step_any(parameter, state, torch.from_numpy(corrections), lr, beta1, beta2, eps)
+
+
+@lru_cache(maxsize=4)
+def _corrections(beta1: float, beta2: float) -> np.ndarray:
+    """Row t: factors that free step t's moments of their start at zero; constant from the last row on."""
+    until = max(math.log(2**-24) / math.log(beta) if 0 < beta < 1 else 1 for beta in (beta1, beta2))
+    t = np.arange(1, math.ceil(until) + 1)
+    rows = np.stack([1 / (1 - beta1**t), np.sqrt(1 / (1 - beta2**t))], -1)
+    return np.concatenate([np.ones((1, 2)), rows]).astype(np.float32)
+
+
+def _step_marked(
+    parameter: Tensor,
+    buffer: TableGradient,
+    state: dict[str, Tensor],
+    corrections: np.ndarray,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """The compiled step of a table whose gradient lies in its own buffer."""
+    marks = buffer.trusted_marks().numpy()
+    arrays = [t.detach().numpy().reshape(-1) for t in (parameter, buffer.buffer, state["moments"], state["steps"])]
+    constants = [np.float32(x) for x in (lr, beta1, beta2, eps)]
+
+    def work(start: int, stop: int) -> None:
+        adam(*arrays, marks, start, stop, np.empty(LIST, np.int64), corrections, *constants)
+
+    parallel([partial(work, start, stop) for start, stop in split(len(parameter), 16, 64)])
+    increment_version(parameter)
+
+
+def _step_any(
+    parameter: nn.Parameter,
+    state: dict[str, Tensor],
+    corrections: Tensor,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """The same in torch, for any device, shape and precision."""
+    g, steps = parameter.grad, state["steps"]
+    mean, square = state["moments"].unbind(1)
+    assert g is not None
+    some = (g != 0).reshape(len(g), -1).any(1)
+    shape = (-1,) + (1,) * (g.ndim - 1)
+    mean.copy_(mean.lerp(g, 1 - beta1).where(some.view(shape), mean))
+    square.copy_(square.lerp(g * g, 1 - beta2).where(some.view(shape), square))
+    steps.add_(some).clamp_max_(len(corrections) - 1)
+    rate, root = corrections.to(g)[steps.long()].unbind(-1)
+    step = lr * rate.view(shape) * mean / (square.sqrt() * root.view(shape) + eps)
+    parameter.sub_(step.where(some.view(shape), torch.zeros_like(step)))

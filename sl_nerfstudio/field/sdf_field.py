@@ -1,0 +1,158 @@
+"""The signed distance field: feature grid and small MLP, with an analytic gradient.
+
+Inside the box [-1, 1]^3 the field is `f(p) = MLP(p, features(p))`. Outside it is continued by the distance to the
+box: `f(p) = f(q) + |p - q|` with `q` the nearest point of the box.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.field.autograd import value, value_and_gradient
+from sl_nerfstudio.field.backend import BackendName, FieldBackend, FieldState, numba_cannot
+from sl_nerfstudio.field.hash_grid import GridLayout, HashGrid
+from sl_nerfstudio.field.table_gradient import TableGradient
+from sl_nerfstudio.field.torch_backend import TorchField, knee
+
+
+@dataclass
+class FieldConfig:
+    """Size and start of the field; the defaults are the paper's sizes."""
+
+    levels: int = 5
+    """Levels of the feature grid."""
+    min_resolution: int = 16
+    """Cells per axis of the coarsest level."""
+    max_resolution: int = 256
+    """Cells per axis of the finest level; levels grow geometrically (by 2 with the defaults)."""
+    features: int = 8
+    """Numbers stored at each grid corner."""
+    log2_table_size: int = 19
+    """Levels with more corners than 2 to this power share rows by hashing."""
+    smooth: bool = False
+    """Smoothstep instead of linear interpolation: the gradient is then continuous across cells."""
+    hidden: int = 128
+    """Width of the MLP's hidden layers."""
+    hidden_layers: int = 2
+    """Number of the MLP's hidden layers."""
+    knee: float = 0.02
+    """Half-width of the rounded corner of the activation, a ReLU that is twice continuously differentiable."""
+    sphere_radius: float = 0.5
+    """Radius, in scene units, of the sphere the field starts from."""
+    backend: BackendName = "auto"
+    """numba: compiled for this CPU; torch: any device and precision; auto: numba wherever it can."""
+
+
+class SDFField(nn.Module):
+    """Signed distance, in scene units, negative inside; points in [-1, 1]^3."""
+
+    def __init__(self, config: FieldConfig):
+        super().__init__()
+        self.config = config
+        self.encoding = HashGrid(
+            GridLayout.build(
+                config.levels,
+                config.min_resolution,
+                config.max_resolution,
+                config.features,
+                config.log2_table_size,
+                config.smooth,
+            )
+        )
+        widths = [3 + self.encoding.layout.width] + [config.hidden] * config.hidden_layers + [1]
+        self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+        self._torch = TorchField(self.encoding.layout, config.knee)
+        self._numba: FieldBackend | None = None
+        self._start_as_sphere(config.sphere_radius)
+
+    def _start_as_sphere(self, radius: float) -> None:
+        """Weights for which `f(p) ~ |p| - radius`: random hidden layers, last layer by ridge regression.
+
+        The hidden layers are drawn as in SAL (Atzmon and Lipman, CVPR 2020), whose closed form for the last layer
+        holds for infinite width; at width 128 it is wrong by up to 0.4, the regression by a few thousandths.
+        """
+        with torch.no_grad():
+            for layer in self.hidden:
+                layer.weight.normal_(0, math.sqrt(2 / layer.out_features))
+                layer.bias.zero_()
+            n = self.last.in_features
+            start = torch.full((n + 1,), math.sqrt(math.pi / n), dtype=torch.float64)
+            start[n] = -radius
+            p = torch.rand(8192, 3) * 2 - 1
+            h = self._hidden(torch.cat([p, p.new_zeros(len(p), self.encoding.layout.width)], -1))
+            h = F.pad(h, (0, 1), value=1.0).double()
+            wanted = p.double().norm(dim=-1) - radius
+            normal = h.T @ h + 1e-3 * torch.eye(n + 1, dtype=torch.float64)
+            start += torch.linalg.solve(normal, h.T @ (wanted - h @ start))
+            self.last.weight.copy_(start[None, :n])
+            self.last.bias.fill_(start[n].item())
+
+    @property
+    def hidden(self) -> list[nn.Linear]:
+        """The MLP's hidden layers."""
+        return [layer for layer in list(self.mlp)[:-1] if isinstance(layer, nn.Linear)]
+
+    @property
+    def last(self) -> nn.Linear:
+        """The MLP's output layer."""
+        layer = self.mlp[-1]
+        assert isinstance(layer, nn.Linear)
+        return layer
+
+    def _hidden(self, h: Float[Tensor, "n w"]) -> Float[Tensor, "n hidden"]:
+        for layer in self.hidden:
+            h = knee(layer(h), self.config.knee)
+        return h
+
+    def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
+        """Fade the grid's levels in, coarse to fine: one weight in [0, 1] a level."""
+        self.encoding.set_level_weights(weights)
+
+    def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance; differentiable (once) with respect to the parameters and `p`."""
+        state = self._state()
+        return value(self._backend(state), self._buffer(state), state, p)
+
+    def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+        """`sdf` as a column, under the name by which `ns-export marching-cubes` asks for it."""
+        return self.sdf(p)[:, None]
+
+    def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+        """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
+        state = self._state()
+        return value_and_gradient(self._backend(state), self._buffer(state), state, p)
+
+    def _state(self) -> FieldState:
+        mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
+        return FieldState(self.encoding.table, self.encoding.level_weights, mlp)
+
+    def _backend(self, state: FieldState) -> FieldBackend:
+        name = self.config.backend
+        obstacle = numba_cannot(self.encoding.layout, state.table)
+        if name == "torch" or (name == "auto" and obstacle is not None):
+            return self._torch
+        if obstacle is not None:
+            raise UserError(f"{obstacle}; choose the backend auto or torch")
+        if self._numba is None:
+            self._numba = _numba_field(self.encoding.layout, self.config.knee)
+        return self._numba
+
+    def _buffer(self, state: FieldState) -> TableGradient | None:
+        """The table's persistent gradient buffer, where one is used: compiled kernels, one process."""
+        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+        if distributed or self._backend(state) is self._torch:
+            return None
+        return TableGradient.of(self.encoding.table)
+
+
+def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:
+    """The compiled backend; numba is imported only when it is needed (it takes a second)."""
+    from sl_nerfstudio.field.numba_backend import NumbaField
+
+    return NumbaField(layout, knee)

@@ -1,0 +1,23 @@
+"""Cameras and projectors: how a direction becomes a pixel, and back. One file a model.
+
+Device axes: a device looks along its own -z, +x to the right, +y up (OpenGL, as nerfstudio).
+Pixels: continuous, the centre of the first pixel is (0.5, 0.5), x to the right, y down.
+"""
+
+from sl_nerfstudio.geometry.devices.changes import UNCHANGED, DeviceChange, IntrinsicsChange
+from sl_nerfstudio.geometry.devices.device import DEVICE_FIELDS, PARAMETERS, Device, DeviceKind, Intrinsics
+from sl_nerfstudio.geometry.devices.projection import project, project_jacobian, unproject
+
+__all__ = [
+    "DEVICE_FIELDS",
+    "PARAMETERS",
+    "UNCHANGED",
+    "Device",
+    "DeviceChange",
+    "DeviceKind",
+    "Intrinsics",
+    "IntrinsicsChange",
+    "project",
+    "project_jacobian",
+    "unproject",
+]

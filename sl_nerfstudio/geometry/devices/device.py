@@ -1,0 +1,75 @@
+"""Intrinsics of one device, and of a batch of them as a tensor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+DeviceKind = Literal["OPENCV", "DOE"]
+"""Names of the device models, as `models.MODELS` has them."""
+PARAMETERS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Device:
+    """Intrinsics of one camera or projector; focal lengths and principal point in pixels."""
+
+    w: int
+    h: int
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    model: DeviceKind = "OPENCV"
+
+    def scaled(self, factor: float) -> "Device":
+        """The same device with its image resized by `factor` (no half pixel: centres are at .5)."""
+        return replace(
+            self,
+            w=round(self.w * factor),
+            h=round(self.h * factor),
+            **{k: getattr(self, k) * factor for k in ("fl_x", "fl_y", "cx", "cy")},
+        )
+
+
+DEVICE_FIELDS = tuple(f.name for f in fields(Device))
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A batch of devices of one model as a tensor; `params` holds PARAMETERS in the last dimension."""
+
+    params: Float[Tensor, "*batch 8"]
+    model: DeviceKind
+    distorted: bool
+
+    @staticmethod
+    def of(devices: Device | Sequence[Device], dtype: torch.dtype = torch.float32) -> "Intrinsics":
+        """Batch of shape () of one device, or (n,) of a sequence. Raises ValueError for mixed models."""
+        if isinstance(devices, Device):
+            one = Intrinsics.of([devices], dtype)
+            return Intrinsics(one.params[0], one.model, one.distorted)
+        models: list[DeviceKind] = sorted({d.model for d in devices})
+        if len(models) != 1:
+            raise ValueError(f"devices of one batch must share a model, got {models}")
+        params = torch.tensor([[getattr(d, k) for k in PARAMETERS] for d in devices], dtype=dtype)
+        return Intrinsics(params, models[0], bool((params[:, 4:] != 0).any()))
+
+    def __getitem__(self, index: Int[Tensor, "*n"] | int | slice) -> "Intrinsics":
+        """Devices chosen along the first batch dimension."""
+        return Intrinsics(self.params[index], self.model, self.distorted)
+
+    def to(self, *args: torch.device | torch.dtype | str) -> "Intrinsics":
+        """On another device or of another dtype."""
+        return Intrinsics(self.params.to(*args), self.model, self.distorted)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    def reshape(self, *shape: int) -> "Intrinsics":
+        """With another batch shape, for broadcasting against points."""
+        return Intrinsics(self.params.reshape(*shape, 8), self.model, self.distorted)

@@ -1,0 +1,47 @@
+"""The device models by name. A new one is a file beside `pinhole` and a line in each table."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.geometry.devices import doe, pinhole
+from sl_nerfstudio.geometry.devices.device import DeviceKind
+from sl_nerfstudio.geometry.devices.distortion import distort
+
+
+@dataclass(frozen=True)
+class DeviceModel:
+    """What a model adds to what all share: distortion of normalised coordinates, focal lengths, principal point."""
+
+    code: int  # in compiled loops
+    normalised_anywhere: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+    jacobian: Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+    direction: Callable[[Tensor, Tensor], Tensor]
+
+
+MODELS: dict[DeviceKind, DeviceModel] = {
+    "OPENCV": DeviceModel(0, pinhole.normalised_anywhere, pinhole.jacobian, pinhole.direction),
+    "DOE": DeviceModel(1, doe.normalised_anywhere, doe.jacobian, doe.direction),
+}
+
+_pinhole, _pinhole_in_front = compiled(pinhole.normalised), compiled(pinhole.in_front)
+_doe, _doe_in_front = compiled(doe.normalised), compiled(doe.in_front)
+_distort = compiled(distort)
+
+
+@compiled
+def pixel_of(code, x, y, z, parameters):
+    """`project` of one point in a compiled loop: column, row, and whether it lies in front; `parameters` as PARAMETERS.
+
+    Like `project` but for one thing: where the distortion polynomial turns back is not looked for.
+    """
+    if code == 0:
+        front = _pinhole_in_front(x, y, z)
+        xn, yn = _pinhole(x, y, z if front else -1.0)
+    else:
+        front = _doe_in_front(x, y, z)
+        xn, yn = _doe(x, y, z)
+    xd, yd = _distort(xn, yn, parameters[4], parameters[5], parameters[6], parameters[7])
+    return parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3], front

@@ -1,0 +1,129 @@
+"""One frame's surface in camera axes, in units of its own baseline, with the uncertainty of every point."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.relative_pose.epipolar_fit import moved
+from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, ray_pairs
+
+_STEP = 1e-4  # radian: for differences by the relative pose
+_FEWEST = 50  # points
+
+
+@dataclass(frozen=True)
+class FrameCloud:
+    """Points of one frame in camera axes (looking along -z), baseline one, and the maps they come from."""
+
+    name: str
+    camera: Device
+    projector: Device
+    pose: RelativePose
+    coords: Float32[ndarray, "h w 2"]  # decoded coordinates that agree with the pose; NaN elsewhere
+    uv_camera: Float64[ndarray, "n 2"]
+    points: Float64[ndarray, "n 3"]
+    sigma_noise: Float64[ndarray, "n"]  # along the camera ray, of decoding noise: independent of other cells
+    sigma_pose: Float64[ndarray, "n"]  # along the camera ray, of the pose's uncertainty: all points err together
+
+    @property
+    def sigma(self) -> Float64[ndarray, "n"]:
+        """One standard deviation along the camera ray, of everything but the unknown length of the baseline."""
+        return np.hypot(self.sigma_noise, self.sigma_pose)
+
+    @property
+    def centroid(self) -> Float64[ndarray, "3"]:
+        """Mean of the points."""
+        return self.points.mean(0)
+
+    @property
+    def radius(self) -> float:
+        """Root mean square distance of the points from their mean."""
+        return float(np.sqrt(((self.points - self.centroid) ** 2).sum(-1).mean()))
+
+
+def frame_cloud(
+    name: str, coords: Float32[ndarray, "h w 2"], camera: Device, projector: Device, pose: RelativePose
+) -> FrameCloud:
+    """Triangulate one frame with its calibration. `coords` are those that `pose` was found from.
+
+    Raises CalibrationError where hardly any point lies in front of both devices.
+    """
+    uv_camera, uv_projector = correspondences_of(coords)
+    keep = pose.inliers
+    if keep.sum() < _FEWEST:
+        raise RelativePoseError(
+            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {_FEWEST})\n"
+            "    cause:  too little of the pattern was decoded\n"
+            "    remedy: capture this view again"
+        )
+    T = torch.from_numpy(pose.T_camera_projector)
+    found = triangulate(
+        Intrinsics.of(camera, torch.float64),
+        torch.eye(4, dtype=torch.float64),
+        torch.from_numpy(uv_camera[keep]),
+        Intrinsics.of(projector, torch.float64),
+        T,
+        torch.from_numpy(uv_projector[keep]),
+    )
+    agreeing = np.full_like(coords, np.nan)
+    row, column = np.floor(uv_camera[keep]).astype(np.int64).T[::-1]
+    agreeing[row, column] = coords[row, column]
+    # On the camera ray, not halfway to the projector's: camera pixels are exact, coordinates are not.
+    points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
+    return FrameCloud(
+        name,
+        camera,
+        projector,
+        pose,
+        agreeing,
+        uv_camera[keep],
+        points,
+        sigma_noise=pose.residual_px * found.sigma_depth.numpy(),
+        sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+    )
+
+
+def _sigma_of_pose(
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+) -> Float64[ndarray, "n"]:
+    """Standard deviation of depth by the pose's covariance, by differences of the rays' closest approach."""
+    rays, _ = ray_pairs(uv_camera, uv_projector, camera, projector)
+    R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
+    slopes = []
+    for k in range(5):
+        step = _STEP * np.eye(5)[k]
+        ahead, behind = (camera_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
+        slopes.append((ahead - behind) / (2 * _STEP))
+    J = np.stack(slopes, 1)
+    return np.sqrt(np.einsum("ni,ij,nj->n", J, pose.covariance, J).clip(0))
+
+
+def camera_depth(
+    R: Float64[ndarray, "3 3"],
+    t: Float64[ndarray, "3"],
+    d_camera: Float64[ndarray, "n 3"],
+    d_projector: Float64[ndarray, "n 3"],
+) -> Float64[ndarray, "n"]:
+    """Depth along camera rays where they come nearest to projector rays, each in its device's axes.
+
+    `R`, `t` lead from the projector to the camera.
+    """
+    d_p = d_projector @ R.T
+    normal = np.cross(d_camera, d_p)
+    return (np.cross(t, d_p) * normal).sum(-1) / (normal * normal).sum(-1).clip(1e-300)
+
+
+def well_known(cloud: FrameCloud, times_median: float = 4.0) -> Bool[ndarray, "n"]:
+    """Points whose uncertainty is not far above the frame's median: those next to an epipole are left out."""
+    sigma = cloud.sigma
+    return sigma < times_median * np.median(sigma)

@@ -1,0 +1,123 @@
+"""One known length makes a registration metric: a frame's baseline, or the distance between two pixels' points."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth
+from sl_nerfstudio.relative_pose.ray_pairs import directions
+
+_NEAR = 3.0  # pixels around a picked one whose points are averaged
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+_NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
+_PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
+_BASELINE = re.compile(rf"baseline of frame (\S+) *= *{_NUMBER} *(\w+)")
+_BAR = re.compile(rf"distance (?:between|from) {_PIXEL} (?:and|to) {_PIXEL} *= *{_NUMBER} *(\w+)")
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """A length in metres, and what it is the length of: a baseline, or a distance between two picked pixels."""
+
+    metres: float
+    unit: str
+    frames: tuple[str, ...]  # number or name of the frame, or of the two frames
+    pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y) as in DATA: first pixel's centre is (.5, .5)
+
+    @property
+    def source(self) -> str:
+        """What a scan says its scale is known by."""
+        if self.pixels:
+            return "scale bar between frame {} and frame {}".format(*self.frames)
+        return f"baseline of frame {self.frames[0]}"
+
+
+def parse_known_length(text: str) -> KnownLength:
+    """`baseline of frame 0 = 85 mm` or `distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm`.
+
+    Raises UserError where the text is neither, the unit is unknown or the length is not above zero.
+    """
+    text = " ".join(text.split())
+    if baseline := _BASELINE.fullmatch(text):
+        frames, pixels, length, unit = (baseline[1],), (), float(baseline[2]), baseline[3]
+    elif bar := _BAR.fullmatch(text):
+        frames, length, unit = (bar[1], bar[4]), float(bar[7]), bar[8]
+        pixels = ((float(bar[2]), float(bar[3])), (float(bar[5]), float(bar[6])))
+    else:
+        raise UserError(
+            f'known length "{text}" is not understood\n    remedy: write "baseline of frame 0 = 85 mm" or '
+            '"distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm" (pixels x, y)'
+        )
+    if unit not in _METRES:
+        raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
+    if length <= 0:
+        raise UserError(f'known length "{text}": a length is above zero')
+    return KnownLength(length * _METRES[unit], unit, frames, pixels)
+
+
+def scale_to(
+    known: KnownLength,
+    unit: str,
+    clouds: Sequence[FrameCloud],
+    T_world_camera: Float64[ndarray, "n 4 4"],
+    T_world_projector: Float64[ndarray, "n 4 4"],
+) -> float:
+    """Factor by which all positions must be multiplied for the length to be true, in `unit` ("m", "cm", "mm", "um").
+
+    Raises UserError where a frame does not exist or was not registered, or where nothing was decoded at a pixel.
+    """
+    index = [_frame_index(frame, clouds) for frame in known.frames]
+    for k in index:
+        if not np.isfinite(T_world_camera[k]).all():
+            raise UserError(
+                f"{clouds[k].name} was not registered, so a length in it says nothing\n"
+                "    remedy: give a length that involves registered frames"
+            )
+    if known.pixels:
+        ends = [
+            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k])
+            for k, pixel in zip(index, known.pixels, strict=True)
+        ]
+        found = float(np.linalg.norm(ends[0] - ends[1]))
+    else:
+        k = index[0]
+        found = float(np.linalg.norm(T_world_camera[k, :3, 3] - T_world_projector[k, :3, 3]))
+    if found <= 0:
+        raise UserError(f"{known.source}: the two ends are the same point\n    remedy: pick two places apart")
+    return known.metres / _METRES[unit] / found
+
+
+def _frame_index(frame: str, clouds: Sequence[FrameCloud]) -> int:
+    names = [c.name for c in clouds]
+    if frame in names:
+        return names.index(frame)
+    if frame.isdigit() and int(frame) < len(names):
+        return int(frame)
+    raise UserError(f'there is no frame "{frame}"\n    remedy: give its number (0 to {len(names) - 1}) or its name')
+
+
+def _point_at(
+    cloud: FrameCloud,
+    pixel: tuple[float, float],
+    T_world_camera: Float64[ndarray, "4 4"],
+    T_world_projector: Float64[ndarray, "4 4"],
+) -> Float64[ndarray, "3"]:
+    """World point of a picked pixel: the median depth of what was decoded within three pixels of it."""
+    near = np.linalg.norm(cloud.uv_camera - pixel, axis=1) < _NEAR
+    if not near.any():
+        raise UserError(
+            f"{cloud.name}: nothing was decoded within {_NEAR:g} pixels of ({pixel[0]:g}, {pixel[1]:g})\n"
+            "    remedy: pick a place where the pattern is"
+        )
+    # The cloud's points have baseline one; the adjusted one may point elsewhere by a little, which depth feels.
+    T = np.linalg.inv(T_world_camera) @ T_world_projector
+    row, column = np.floor(cloud.uv_camera[near]).astype(int).T[::-1]
+    d_projector = directions(cloud.projector, cloud.coords[row, column].astype(np.float64))
+    depth = camera_depth(T[:3, :3], T[:3, 3], directions(cloud.camera, cloud.uv_camera[near]), d_projector)
+    ray = directions(cloud.camera, np.array([pixel], dtype=np.float64))[0]
+    return T_world_camera[:3, :3] @ (float(np.median(depth)) * ray) + T_world_camera[:3, 3]

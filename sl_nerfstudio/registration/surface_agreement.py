@@ -1,0 +1,151 @@
+"""How well two frames' surfaces agree under a similarity, and how to move it: sums over looked-up points.
+
+Points of one frame are projected into the other's camera and compared with the tangent plane of the surface seen
+there, both ways. Unlike nearest neighbours this also tells what speaks *against* a similarity: a point in front of a
+surface that the other camera saw would have hidden it.
+
+A similarity maps the source's points to the target's axes. Increments (v, w, l) act there, about the target's centroid
+c: `p <- c + exp(l) exp(w) (p - c) + v`.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.compiled import compiled_parallel
+from sl_nerfstudio.geometry.devices.models import pixel_of
+from sl_nerfstudio.registration.surface_map import SurfaceMap
+
+_HIDDEN = 0.35  # radii behind a surface: farther back a point is hidden by it, nearer it contradicts it
+_FACING = 0.3  # cosine between normals of places that may be the same
+
+
+@dataclass(frozen=True)
+class Side:
+    """One frame of a pair: its map, and some of its points with normals."""
+
+    map: SurfaceMap
+    points: Float64[ndarray, "n 3"]
+    normals: Float64[ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Sums for each of k similarities; distances in units of the target's baseline."""
+
+    H: Float64[ndarray, "k 7 7"]  # of robustly weighted point-to-plane distances
+    g: Float64[ndarray, "k 7"]
+    agreeing: Float64[ndarray, "k"]  # fraction of the points that lie on the other surface
+    in_front: Float64[ndarray, "k"]  # that would hide what the other camera saw
+    behind: Float64[ndarray, "k"]  # a little below what the other camera saw
+    squares: Float64[ndarray, "k"]  # mean squared distance of those that agree
+
+    @property
+    def fitness(self) -> Float64[ndarray, "k"]:
+        """Of the points that could be judged, the fraction that agree."""
+        return self.agreeing / (self.agreeing + self.in_front + self.behind).clip(1e-9)
+
+    @property
+    def score(self) -> Float64[ndarray, "k"]:
+        """What speaks for a similarity less what speaks against it."""
+        return self.agreeing - self.in_front - 0.5 * self.behind
+
+
+def agreement(
+    source: Side, target: Side, scale: Float64[ndarray, "k"], R: Float64[ndarray, "k 3 3"], t: Float64[ndarray, "k 3"],
+    tolerance: float, width: float,
+) -> Agreement:  # fmt: skip
+    """Both ways, for k similarities `p_target = scale R p_source + t`.
+
+    `tolerance` is the distance up to which points agree, `width` that of the robust kernel, both in radii of the
+    target's points.
+    """
+    k, radius = len(scale), target.map.radius
+    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 4))
+    tolerances = np.array([tolerance, width, _HIDDEN]) * radius
+    for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
+        m = seen.map
+        _sums(
+            mover.points, mover.normals, scale, np.ascontiguousarray(R), np.ascontiguousarray(t), bool(reverse),
+            m.point, m.normal, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
+            H, g, counts[reverse],
+        )  # fmt: skip
+    shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
+    squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
+    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares)
+
+
+@compiled_parallel
+def _sums(
+    points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances, H, g, counts
+):
+    """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
+    h, w = valid.shape
+    tau, width, hidden = tolerances[0], tolerances[1], tolerances[2]
+    for k in numba.prange(len(scale)):
+        s = scale[k]
+        J = np.zeros(7)
+        for n in range(len(points)):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            a, b, d = normals[n, 0], normals[n, 1], normals[n, 2]
+            if reverse:
+                x, y, z = (x - t[k, 0]) / s, (y - t[k, 1]) / s, (z - t[k, 2]) / s
+                X = R[k, 0, 0] * x + R[k, 1, 0] * y + R[k, 2, 0] * z
+                Y = R[k, 0, 1] * x + R[k, 1, 1] * y + R[k, 2, 1] * z
+                Z = R[k, 0, 2] * x + R[k, 1, 2] * y + R[k, 2, 2] * z
+                A = R[k, 0, 0] * a + R[k, 1, 0] * b + R[k, 2, 0] * d
+                B = R[k, 0, 1] * a + R[k, 1, 1] * b + R[k, 2, 1] * d
+                C = R[k, 0, 2] * a + R[k, 1, 2] * b + R[k, 2, 2] * d
+            else:
+                X = s * (R[k, 0, 0] * x + R[k, 0, 1] * y + R[k, 0, 2] * z) + t[k, 0]
+                Y = s * (R[k, 1, 0] * x + R[k, 1, 1] * y + R[k, 1, 2] * z) + t[k, 1]
+                Z = s * (R[k, 2, 0] * x + R[k, 2, 1] * y + R[k, 2, 2] * z) + t[k, 2]
+                A = R[k, 0, 0] * a + R[k, 0, 1] * b + R[k, 0, 2] * d
+                B = R[k, 1, 0] * a + R[k, 1, 1] * b + R[k, 1, 2] * d
+                C = R[k, 2, 0] * a + R[k, 2, 1] * b + R[k, 2, 2] * d
+            if A * X + B * Y + C * Z > 0:  # turned away from the camera
+                continue
+            column, row, in_front = pixel_of(code, X, Y, Z, camera)
+            if not (in_front and column >= 0 and row >= 0 and column < w and row < h):
+                continue
+            i, j = int(row), int(column)
+            if not valid[i, j]:
+                continue
+            na, nb, nc = map_normal[i, j, 0], map_normal[i, j, 1], map_normal[i, j, 2]
+            r = na * (X - map_point[i, j, 0]) + nb * (Y - map_point[i, j, 1]) + nc * (Z - map_point[i, j, 2])
+            if reverse:
+                r *= s
+            facing = na * A + nb * B + nc * C
+            if abs(r) < tau and facing > _FACING:
+                counts[k, 0] += 1
+                counts[k, 3] += r * r
+            elif r > tau:
+                counts[k, 1] += 1
+            elif r > -hidden:
+                counts[k, 2] += 1
+            if facing < _FACING or abs(r) > 4 * width:
+                continue
+            q = 1 / (1 + (r / width) ** 2)
+            weight = q * q * facing
+            if reverse:  # the normal, in the target's axes and against the motion of the source
+                ma = -(R[k, 0, 0] * na + R[k, 0, 1] * nb + R[k, 0, 2] * nc)
+                mb = -(R[k, 1, 0] * na + R[k, 1, 1] * nb + R[k, 1, 2] * nc)
+                mc = -(R[k, 2, 0] * na + R[k, 2, 1] * nb + R[k, 2, 2] * nc)
+                X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
+            else:
+                ma, mb, mc = na, nb, nc
+            X, Y, Z = X - c[0], Y - c[1], Z - c[2]
+            J[0], J[1], J[2] = ma, mb, mc
+            J[3], J[4], J[5] = Y * mc - Z * mb, Z * ma - X * mc, X * mb - Y * ma
+            J[6] = ma * X + mb * Y + mc * Z
+            for p in range(7):
+                wp = weight * J[p]
+                g[k, p] += wp * r
+                for m in range(p + 1):
+                    H[k, p, m] += wp * J[m]
+        for p in range(7):
+            for m in range(p):
+                H[k, m, p] = H[k, p, m]

@@ -1,0 +1,86 @@
+"""What a person must know to make a run again: settings, versions, convergence; as plain JSON values."""
+
+import math
+import platform
+from dataclasses import fields, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+
+from sl_nerfstudio.runs.trained_run import TrainedRun
+from sl_nerfstudio.scan import Scan
+
+_PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", "open3d")
+_SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
+
+
+def training_record(run: TrainedRun) -> dict[str, Any]:
+    """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
+
+    The last says how intrinsics were changed, and what the captures say against them ("": nothing).
+    """
+    return {
+        "settings": {"step": run.step, **run_settings(run.config)},
+        "versions": {
+            **package_versions(),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "device": _device(run.model.device),
+        },
+        "curves": {name: plain(values) for name, values in run.model.history().items()},
+        "intrinsics": "\n".join(filter(None, (_changed(run.model.scan), run.model.intrinsics_doubt()))),
+    }
+
+
+def _changed(scan: Scan) -> str:
+    """That the run's intrinsics are not those of the scan folder; "" if they are."""
+    if not scan.intrinsics_change:
+        return ""
+    camera, projector = 100 * scan.intrinsics_change.camera.focal, 100 * scan.intrinsics_change.projector.focal
+    return (
+        f"The intrinsics are not those of the scan folder: focal length of the camera {camera:+.2f} %, of the "
+        f"projector {projector:+.2f} %. The transforms.json of the refined poses holds them"
+    )
+
+
+def run_settings(config: Any) -> dict[str, Any]:
+    """The settings of a run that its result depends on, from nerfstudio's trainer configuration."""
+    chosen = {name: plain(getattr(config, name)) for name in _SETTINGS if hasattr(config, name)}
+    return {
+        **chosen,
+        "data": str(config.pipeline.datamanager.data),
+        "rays": config.pipeline.datamanager.train_num_rays_per_batch,
+        "intrinsics_change": plain(config.pipeline.datamanager.dataparser.intrinsics_change),
+        "model": plain(config.pipeline.model),
+    }
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that compute."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, paths, types, numbers and containers as JSON has them; what is not finite becomes None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")}
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return value.__name__ if isinstance(value, type) else str(value)
+
+
+def _device(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"

@@ -1,0 +1,199 @@
+"""Pixels of a scan: coordinates, masks, pattern images. One frame in memory at a time."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.scan.check.coordinate_problems import coordinate_problems
+from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
+from sl_nerfstudio.scan.check.pattern_shift import pattern_shift
+from sl_nerfstudio.scan.coordinates import read_coords
+from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.headers import relative
+from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.partial_scan import PartialFrame, PartialScan
+from sl_nerfstudio.scan.problem import Faults, Problem
+
+
+@dataclass(frozen=True)
+class FrameContent:
+    """What is remembered of a frame after its pixels were looked at."""
+
+    name: str
+    digest: bytes | None  # of image and coordinates; None if either could not be read
+    masked: float  # share of the image under the mask
+    decoded: float  # share of the masked pixels that have coordinates
+    correspondences: Correspondences | None  # None if the frame cannot be triangulated
+    shift: Float64[ndarray, "2"] | None  # what to add to the coordinates for the pattern to fit; None if unclear
+
+
+def check_pattern(draft: PartialScan, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
+    """The projected pattern in [0, 1]; None after adding a fault."""
+    if draft.pattern_path is None or draft.pattern_path not in good:
+        return None
+    pattern = _read_image(draft.pattern_path, draft, None, faults)
+    if pattern is None:
+        return None
+    if pattern.min() == pattern.max():
+        faults.add(_nothing_in_it("the pattern"), relative(draft.pattern_path, draft.root))
+        return None
+    return as_grey(pattern)
+
+
+def check_content(
+    frame: PartialFrame,
+    draft: PartialScan,
+    pattern: Float32[ndarray, "rows columns"] | None,
+    good: set[Path],
+    faults: Faults,
+) -> FrameContent:
+    """Decode all files of a frame that are in `good`, and add what is wrong with their pixels."""
+    image_path, pattern_path, coords_path, mask_path = (
+        path if (path := frame.paths.get(key)) in good else None
+        for key in ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path")
+    )
+    coords = None if coords_path is None else _check_coords(coords_path, frame, draft, faults)
+    mask = None if mask_path is None else _check_mask(mask_path, frame, draft, faults)
+    decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
+    where = decoded if mask is None else mask
+    both = None if decoded is None else (decoded if mask is None else decoded & mask)
+    if mask_path and coords_path and mask is not None and decoded is not None:
+        for problem in _together_problems(mask, decoded):
+            faults.add(problem, relative(mask_path, draft.root), frame.name)
+    image = None if image_path is None else _read_image(image_path, draft, frame.name, faults)
+    shown, shown_path = image, image_path
+    if "sl_pattern_path" in frame.paths:
+        shown_path = pattern_path
+        shown = None if pattern_path is None else _read_image(pattern_path, draft, frame.name, faults)
+    compared = where if both is None else both
+    if shown is not None and shown_path is not None and compared is not None and compared.shape == shown.shape[:2]:
+        inside = shown[compared]
+        if inside.size and inside.min() == inside.max():
+            faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, draft.root), frame.name)
+    digest = None if image is None or coords is None else _digest(image, coords)
+    shift = None
+    if coords is not None and both is not None and shown is not None and pattern is not None:
+        shift = pattern_shift(coords, both, as_grey(shown), pattern)
+    return FrameContent(
+        frame.name,
+        digest,
+        0.0 if where is None else float(where.mean()),
+        0.0 if both is None or where is None or not where.any() else float(both.sum() / where.sum()),
+        _correspondences(frame, draft, coords, both),
+        shift,
+    )
+
+
+def duplicate_problems(contents: list[FrameContent]) -> Iterator[tuple[str, Problem]]:
+    """(frame, problem) of each frame with the same image and the same coordinates as an earlier one."""
+    seen: dict[bytes, str] = {}
+    for content in contents:
+        if content.digest is None:
+            continue
+        first = seen.setdefault(content.digest, content.name)
+        if first != content.name:
+            yield (
+                content.name,
+                Problem(
+                    f"has the very image and coordinates of frame {first}",
+                    "a frame was copied under another name",
+                    "remove the copy; a frame counted twice weighs twice and makes uncertainties look too small",
+                ),
+            )
+
+
+def _check_coords(
+    path: Path, frame: PartialFrame, draft: PartialScan, faults: Faults
+) -> Float32[ndarray, "h w 2"] | None:
+    name = relative(path, draft.root)
+    try:
+        coords = read_coords(path)
+    except FileError as error:
+        faults.add(error, name, frame.name)
+        return None
+    problems = list(coordinate_problems(coords, draft.projector))
+    for problem in problems:
+        faults.add(problem, name, frame.name)
+    return None if problems else coords
+
+
+def _check_mask(path: Path, frame: PartialFrame, draft: PartialScan, faults: Faults) -> Bool[ndarray, "h w"] | None:
+    mask = _read_image(path, draft, frame.name, faults)
+    if mask is None:
+        return None
+    full = np.iinfo(mask.dtype).max
+    values = np.flatnonzero(np.bincount(mask.ravel(), minlength=2))
+    problem = None
+    if values.max() == 0:
+        problem = Problem(
+            "is 0 everywhere",
+            "the pattern was not found in this image, or the mask was never drawn",
+            "mark the pixels where the pattern falls on the object with 255, or leave the frame out",
+        )
+    elif values.max() == 1:
+        problem = Problem(
+            "has 0 and 1 instead of 0 and 255", "truth values were saved as they are", "multiply it by 255"
+        )
+    elif not set(values.tolist()) <= {0, full}:
+        between = [value for value in values.tolist() if value not in (0, full)]
+        problem = Problem(
+            f"has grey levels between black and white ({between[0]}{', ..' if len(between) > 1 else ''})",
+            "it was resized or saved with loss, or is another kind of image",
+            f"save it with 0 and {full} alone, without loss",
+        )
+    if problem is None:
+        return mask == full
+    faults.add(problem, relative(path, draft.root), frame.name)
+    return None
+
+
+def _together_problems(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "h w"]) -> Iterator[Problem]:
+    if mask.shape == decoded.shape and decoded.any() and not (mask & decoded).any():
+        yield Problem(
+            "leaves out every pixel that has coordinates",
+            "it is inverted, or belongs to another frame",
+            "mark with 255 where the pattern falls on the object, with 0 elsewhere",
+        )
+
+
+def _read_image(path: Path, draft: PartialScan, frame: str | None, faults: Faults) -> ndarray | None:
+    try:
+        return read_image(path)
+    except FileError as error:
+        faults.add(error, relative(path, draft.root), frame)
+        return None
+
+
+def _nothing_in_it(what: str) -> Problem:
+    return Problem(
+        f"has one and the same value everywhere in {what}",
+        "an empty export, a covered lens, or a projector that was off",
+        "give the picture of the pattern; without contrast nothing can be compared with it",
+    )
+
+
+def _digest(image: ndarray, coords: Float32[ndarray, "h w 2"]) -> bytes:
+    digest = blake2b(image.tobytes(), digest_size=16)
+    digest.update(coords[np.isfinite(coords[..., 0])].tobytes())
+    return digest.digest()
+
+
+def _correspondences(
+    frame: PartialFrame,
+    draft: PartialScan,
+    coords: Float32[ndarray, "h w 2"] | None,
+    where: Bool[ndarray, "h w"] | None,
+) -> Correspondences | None:
+    if coords is None or where is None or not where.any() or draft.projector is None:
+        return None
+    if frame.camera is None or frame.T_world_camera is None or frame.T_world_projector is None:
+        return None
+    uv_camera, uv_projector = sample_pixels(coords, where)
+    return Correspondences(
+        frame.name, frame.camera, frame.T_world_camera, frame.T_world_projector, uv_camera, uv_projector
+    )

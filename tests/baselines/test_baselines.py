@@ -1,0 +1,81 @@
+"""The classical baseline must be a fair one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.baselines.depth import drop_islands, triangulated_depth
+from benchmarks.baselines.icp_registration import register
+from benchmarks.baselines.tsdf import TsdfConfig, backprojected, fuse
+from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
+from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.synthesise import synthesise
+from tests.evaluation.faceted_scan import FacetedScan
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Exact coordinates and exact relative poses; each frame as a whole is off by a degree and 3 mm."""
+    root = tmp_path_factory.mktemp("tsdf") / "scan"
+    config = SynthConfig(
+        frames=6, resolution=120, supersampling=1, noise=0.0, missing=0.0, wrong=0.0,
+        pose_error=(1.0, 3.0), autocalibration_error=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    synthesise(config, root)
+    return read_scan(root)
+
+
+def true_poses(scan: Scan) -> Poses:
+    truth = read_ground_truth(scan)
+    assert truth.T_world_camera is not None and truth.T_world_projector is not None
+    return Poses(truth.T_world_camera, truth.T_world_projector)
+
+
+def test_depth_maps_of_exact_coordinates_lie_on_the_truth(clean_scan: Path) -> None:
+    scan, truth = read_scan(clean_scan), Surface(FacetedScan().truth())
+    for frame in scan.frames:
+        depth = triangulated_depth(frame, scan, frame.T_world_camera, frame.T_world_projector)
+        points = backprojected(depth)
+        p_world = points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+        assert len(points) > 0.95 * frame.read_mask().sum()
+        assert truth.distance(p_world).max() < 1e-3
+
+
+def test_islands_are_dropped_and_slopes_kept() -> None:
+    depth = np.tile(np.linspace(100, 110, 60), (60, 1))
+    depth[:, 50:] = 0
+    depth[20:22, 20:22] = 130
+    depth[40, 55] = 105
+    kept = drop_islands(depth, 0.01)
+    assert (kept[20:22, 20:22] == 0).all() and kept[40, 55] == 0
+    depth[20:22, 20:22], depth[40, 55] = 0, 0
+    np.testing.assert_array_equal(kept, depth)
+
+
+def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repairs_the_frames(disturbed: Scan) -> None:
+    true, initial = true_poses(disturbed), Poses(disturbed.T_world_camera, disturbed.T_world_projector)
+    registered = register(disturbed, initial)
+    mesh_path = read_ground_truth(disturbed).mesh_path
+    assert mesh_path is not None
+    reference = mesh_reference(read_mesh(mesh_path), disturbed, true, 20_000)
+    config = TsdfConfig(voxel=1 / 120)
+    rmse = {}
+    for name, poses in (("initial", initial), ("registered", registered), ("true", true)):
+        surface = Surface(fuse(disturbed, poses, config))
+        rmse[name] = score_alignments(surface, reference, poses, true, samples=20_000)["rigid"].accuracy.median
+    assert rmse["true"] < 0.1
+    assert rmse["registered"] < 3 * rmse["true"] < rmse["initial"]
+
+    def errors(poses: Poses) -> float:
+        found = compare_poses(
+            poses.T_world_camera, poses.T_world_projector, true.T_world_camera, true.T_world_projector
+        )
+        assert found.relative.rotation_rmse_deg < 1e-5  # frames move as a whole
+        return found.camera.rotation_rmse_deg
+
+    assert errors(registered) < 0.3 * errors(initial)

@@ -1,0 +1,134 @@
+"""Rigs and coordinate maps by formula: balls over a disk, rays met exactly in float64."""
+
+from dataclasses import dataclass
+from math import cos, radians, sin
+
+import torch
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
+from sl_nerfstudio.geometry.se3 import inverse, pose, transform
+
+BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
+DISK_HEIGHT, DISK_RADIUS = -0.3, 0.9
+PROJECTORS = {
+    "pinhole": Device(400, 400, 520.0, 520.0, 200.0, 200.0),
+    "DOE": Device(400, 400, 560.0, 560.0, 200.0, 200.0, model="DOE"),
+}
+
+
+def camera_of(size: int) -> Device:
+    """A square camera whose image the scene fills, seen from three scene units away."""
+    return Device(size, size, 1.35 * size, 1.35 * size, size / 2, size / 2)
+
+
+def look_at(eye: tuple[float, float, float]) -> Tensor:
+    """Pose of a device at `eye` that looks along its -z at the origin."""
+    back = torch.tensor(eye, dtype=torch.float64)
+    t, back = back, back / back.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), back)
+    right = right / right.norm()
+    return pose(torch.stack([right, torch.linalg.cross(back, right), back], 1), t)
+
+
+def rig_of(frames: int, size: int, projector: str = "pinhole") -> Rig:
+    """Cameras around the scene at two heights, each with a projector about 20 degrees beside it."""
+    eyes = []
+    for k in range(frames):
+        turn, high = 360 * k / frames, 42 + 16 * (k % 2)
+        for t, e in ((turn, high), (turn + 20 + k, high + 3)):
+            a, b = radians(t), radians(e)
+            eyes.append(look_at((3 * cos(a) * cos(b), 3 * sin(a) * cos(b), 3 * sin(b))))
+    camera, light = torch.stack(eyes[::2]), torch.stack(eyes[1::2])
+    return Rig(
+        Intrinsics.of([camera_of(size)] * frames, torch.float64),
+        Intrinsics.of(PROJECTORS[projector], torch.float64),
+        camera,
+        inverse(camera) @ light,
+    )
+
+
+def static_rig(frames: int, size: int) -> Rig:
+    """Cameras on a ring around one projector that stays where it is."""
+    light = look_at((0.6, -0.5, 3.0))
+    turns = [radians(360 * k / frames) for k in range(frames)]
+    camera = torch.stack([look_at((0.6 + 0.9 * cos(a), -0.5 + 0.9 * sin(a), 2.7)) for a in turns])
+    intrinsics = Intrinsics.of([camera_of(size)] * frames, torch.float64)
+    projector = Intrinsics.of(PROJECTORS["pinhole"], torch.float64)
+    return Rig(intrinsics, projector, camera, inverse(camera) @ light)
+
+
+def cast(o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance of unit rays to what they meet first (infinite: nothing), and which part of the scene it is."""
+    distances = []
+    for *centre, radius in BALLS:
+        m = o - o.new_tensor(centre)
+        b, c = (m * d).sum(-1), (m * m).sum(-1) - radius**2
+        t = -b - (b * b - c).sqrt()  # NaN: missed
+        distances.append(torch.where(t > 1e-9, t, torch.full_like(t, float("inf"))))
+    t = (DISK_HEIGHT - o[..., 2]) / d[..., 2]
+    hit = (t > 1e-9) & ((o + t[..., None] * d)[..., :2].norm(dim=-1) < DISK_RADIUS)
+    distances.append(torch.where(hit, t, torch.full_like(t, float("inf"))))
+    found = torch.stack(distances).min(0)
+    return found.values, found.indices
+
+
+def seen(rig: Rig, frame: Tensor, uv_camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Pattern coordinates of camera pixels (NaN: nothing, shadow, off the pattern) and the part of the scene."""
+    o, d = pixel_rays(rig.camera[frame], rig.T_world_camera[frame], uv_camera)
+    t, part = cast(o, d)
+    p = o + t[:, None].nan_to_num(posinf=1.0) * d
+    T = rig.T_world_projector[frame]
+    uv, in_front = project(rig.projector, transform(inverse(T), p))
+    way = T[:, :3, 3] - p
+    length = way.norm(dim=-1)
+    way = way / length[:, None]
+    lit = cast(p + 1e-6 * way, way)[0] > length
+    good = t.isfinite() & lit & in_front & (uv > 0).all(-1) & (uv < 400).all(-1)
+    return torch.where(good[:, None], uv, torch.full_like(uv, float("nan"))), part
+
+
+def images_of(rig: Rig, size: int) -> list[Tensor]:
+    """What an errorless decoder gives: one coordinate image for each frame."""
+    uv = pixel_centres(camera_of(size), torch.float64).reshape(-1, 2)
+    out = [seen(rig, torch.full((len(uv),), k), uv)[0].reshape(size, size, 2).float() for k in range(rig.frames)]
+    return out
+
+
+@dataclass(frozen=True)
+class ExactMaps(CoordinateMaps):
+    """Maps without pixels: every look-up is a ray, exact to rounding; invalid within 0.01 px of an edge."""
+
+    rig: Rig
+
+    @staticmethod
+    def around(rig: Rig, size: int) -> "ExactMaps":
+        """Maps that know the true poses."""
+        m = CoordinateMaps.of(images_of(rig, size))
+        return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.max_roughness, rig)
+
+    def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
+        uv, part = seen(self.rig, frame, uv_camera)
+        valid = uv.isfinite().all(-1) & (uv_camera > 0).all(-1) & (uv_camera < int(self.widths[0])).all(-1)
+        columns = []
+        for step in torch.eye(2, dtype=torch.float64):
+            h = 1e-4
+            (a, part_a), (b, part_b) = (seen(self.rig, frame, uv_camera + s * h * step) for s in (1, -1))
+            far = [seen(self.rig, frame, uv_camera + s * 1e-2 * step) for s in (1, -1)]
+            columns.append((a - b) / (2 * h))
+            valid = valid & (part_a == part) & (part_b == part) & columns[-1].isfinite().all(-1)
+            for value, near in far:
+                valid = valid & (near == part) & value.isfinite().all(-1)
+        return MapSample(uv.nan_to_num(), torch.stack(columns, -1).nan_to_num(), valid)
+
+
+def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03, relative: float = 0.0) -> Rig:
+    """Each frame turned and shifted as a whole (RMS), its projector by a share `relative` of that."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(2, rig.frames, 6, generator=generator, dtype=torch.float64)
+    x = x / x.reshape(2, -1, 2, 3).pow(2).sum(-1).mean(1).sqrt().repeat_interleave(3, -1)[:, None]
+    size = torch.tensor([shift] * 3 + [radians(degrees)] * 3, dtype=torch.float64)
+    return rig.moved(x[0] * size, x[1] * size * relative)

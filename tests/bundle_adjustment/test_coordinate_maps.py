@@ -1,0 +1,153 @@
+"""Look-ups between pixels: exact where a map is plane, refused where it is torn, undecoded or not there."""
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.rays import pixel_centres
+
+SIZES = ((30, 20), (17, 25))
+SLOPES = torch.tensor([[[2.0, -0.5], [0.25, 1.5]], [[-1.0, 0.125], [0.5, 3.0]]], dtype=torch.float64)
+CONSTANTS = torch.tensor([[100.0, 50.0], [300.0, 7.0]], dtype=torch.float64)
+NAN = float("nan")
+
+
+def plane_images() -> list[torch.Tensor]:
+    """Values that float32 holds exactly, another plane and size for each frame."""
+    out = []
+    for (w, h), J, c in zip(SIZES, SLOPES, CONSTANTS, strict=True):
+        uv = pixel_centres(Device(w, h, 1.0, 1.0, 0.0, 0.0), torch.float64)
+        out.append((uv @ J.T + c).float())
+    return out
+
+
+def positions(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    frame = torch.randint(2, (300,), generator=generator)
+    size = torch.tensor(SIZES, dtype=torch.float64)[frame]
+    return frame, torch.rand(300, 2, generator=generator, dtype=torch.float64) * size
+
+
+def window_pixels(frame: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
+    """Pixels of a 7 x 7 window that lie in the image."""
+    size, at = torch.tensor(SIZES)[frame], uv.long()
+    return ((at + 4).minimum(size) - (at - 3).clamp_min(0)).prod(-1)
+
+
+def test_a_plane_is_met_exactly_everywhere_with_its_slope():
+    frame, uv = positions()
+    found = CoordinateMaps.of(plane_images()).look_up(frame, uv)
+    expected = (SLOPES[frame] @ uv[..., None]).squeeze(-1) + CONSTANTS[frame]
+    enough = window_pixels(frame, uv) >= 24
+    assert torch.equal(found.valid, enough) and 0 < int(enough.sum()) < len(uv)
+    assert torch.allclose(found.uv_projector[enough], expected[enough], rtol=0, atol=1e-9)
+    assert torch.allclose(found.jacobian[enough], SLOPES[frame][enough], rtol=0, atol=1e-9)
+
+
+def test_a_paraboloid_is_met_exactly_with_its_slope():
+    bend = torch.tensor([[0.25, -0.125, 0.0625], [-0.5, 0.25, 0.125]], dtype=torch.float64)  # xx, xy, yy
+
+    def value(uv: torch.Tensor) -> torch.Tensor:
+        x, y = uv[..., :1], uv[..., 1:]
+        return bend[:, 0] * x * x + bend[:, 1] * x * y + bend[:, 2] * y * y + uv @ SLOPES[0].T
+
+    image = value(pixel_centres(Device(*SIZES[0], 1.0, 1.0, 0.0, 0.0), torch.float64)).float()
+    image[::3, ::4] = NAN
+    uv = 4 + 12 * torch.rand(200, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    found = CoordinateMaps.of([image]).look_up(torch.zeros(200, dtype=torch.long), uv)
+    x, y = uv[:, 0], uv[:, 1]
+    slopes = [torch.stack([2 * a * x + b * y, b * x + 2 * c * y], -1) for a, b, c in bend]
+    assert found.valid.all()
+    assert torch.allclose(found.uv_projector, value(uv), rtol=0, atol=1e-8)
+    assert torch.allclose(found.jacobian, torch.stack(slopes, 1) + SLOPES[0], rtol=0, atol=1e-8)
+
+
+def test_undecoded_pixels_change_nothing_as_long_as_enough_remain():
+    images = plane_images()
+    images[0][::2, ::2] = NAN
+    images[0][7, 9, 1] = NAN  # one component missing: not decoded
+    frame, uv = positions(1)
+    found = CoordinateMaps.of(images).look_up(frame, uv)
+    whole = CoordinateMaps.of(plane_images()).look_up(frame, uv)
+    size = torch.tensor(SIZES, dtype=torch.float64)[frame]
+    assert found.valid[((uv > 3) & (uv < size - 3)).all(-1)].all()
+    ok = found.valid
+    assert torch.allclose(found.uv_projector[ok], whole.uv_projector[ok], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "uv", [(-1e-9, 5.0), (5.0, -0.1), (30.0, 5.0), (5.0, 20.0), (NAN, 5.0), (float("inf"), 5.0), (1e300, -1e300)]
+)
+def test_outside_the_image_nothing_is_valid(uv):
+    maps, frame = CoordinateMaps.of(plane_images()), torch.tensor([0])
+    at = torch.tensor([uv], dtype=torch.float64)
+    assert not maps.look_up(frame, at).valid.any()
+    assert maps.decoded_at(frame, at).isnan().all()
+
+
+def test_torn_undecoded_and_narrow_windows_are_refused():
+    images = plane_images()
+    images[0][:, 15:] += 40  # a depth edge between columns 14 and 15
+    images[1][5:, :] = NAN
+    images[1][16:20, 3:9] = images[1].new_tensor([1.0, 2.0])  # twenty-four pixels: just enough
+    maps = CoordinateMaps.of(images)
+
+    def valid(frame: int, u: float, v: float) -> bool:
+        return bool(maps.look_up(torch.tensor([frame]), torch.tensor([[u, v]], dtype=torch.float64)).valid[0])
+
+    across = [valid(0, u + 0.5, 10.5) for u in range(10, 20)]
+    assert across == [True, True, False, False, False, False, False, False, True, True]
+    assert valid(1, 8.5, 1.5) and not valid(1, 8.5, 6.5) and not valid(1, 8.5, 12.5)
+    assert valid(1, 6.5, 17.5)
+    images[1][17, 7] = NAN
+    maps = CoordinateMaps.of(images)
+    assert not valid(1, 6.5, 17.5)
+
+
+def test_pixels_on_a_conic_give_no_slope():
+    """Two rows, however long: a bend across them cannot be told from a slope."""
+    image = torch.full((9, 40, 2), NAN)
+    image[3:5] = 1.0
+    maps = CoordinateMaps.of([image])
+    assert not maps.look_up(torch.tensor([0]), torch.tensor([[20.0, 4.0]], dtype=torch.float64)).valid[0]
+
+
+def test_the_pixel_under_a_position():
+    images = plane_images()
+    images[1][3, 4] = NAN
+    maps = CoordinateMaps.of(images)
+    at = torch.tensor([[0.0, 0.0], [16.999, 24.999], [4.2, 3.9], [5.0, 3.9]], dtype=torch.float64)
+    found = maps.decoded_at(torch.ones(4, dtype=torch.long), at)
+    assert torch.equal(found[0], images[1][0, 0].double()) and torch.equal(found[1], images[1][24, 16].double())
+    assert found[2].isnan().all() and torch.equal(found[3], images[1][3, 5].double())
+
+
+def test_drawn_pixels_are_decoded_spread_out_and_the_same_for_one_seed():
+    images = plane_images()
+    images[0][:, :10] = NAN
+    maps = CoordinateMaps.of(images)
+    uv = maps.draw(0, 40, torch.Generator().manual_seed(3))
+    assert torch.equal(uv, maps.draw(0, 40, torch.Generator().manual_seed(3)))
+    assert len(uv) == 40 and len(torch.unique(uv, dim=0)) == 40
+    assert torch.equal(uv.frac(), torch.full_like(uv, 0.5)) and (uv[:, 0] > 10).all()
+    squares = torch.unique((uv / 3).long(), dim=0)  # 400 decoded pixels for 40: one of each 3 x 3
+    assert len(squares) == 40
+    few = maps.draw(0, 1000, torch.Generator())
+    assert len(few) == 400
+    images[0][:] = NAN
+    assert maps.__class__.of(images).draw(0, 40, torch.Generator()).shape == (0, 2)
+
+
+def test_maps_that_are_noisy_all_over_are_used_and_their_tears_still_found():
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[:80, :80]
+    image = np.stack([2.0 * x + 0.01 * x * y, 2.0 * y], -1) + rng.normal(0, 2.0, (80, 80, 2))
+    image[:, 40:] += 60  # a tear
+    maps = CoordinateMaps.of([torch.from_numpy(image)])
+    uv = torch.from_numpy(rng.uniform(5, 75, (500, 2)))
+    valid = maps.look_up(torch.zeros(500, dtype=torch.int64), uv).valid
+    torn = (uv[:, 0] - 40).abs() < 2
+    assert valid[(uv[:, 0] - 40).abs() > 5].float().mean() > 0.99
+    assert not valid[torn].any()

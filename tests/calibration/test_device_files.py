@@ -1,0 +1,145 @@
+"""Intrinsics of every format: the same lens gives the same pixels, and the first pixel's centre is where it belongs."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.calibration.device_files import read_device_file, read_entries
+from sl_nerfstudio.calibration.distortion_fit import reduce_distortion
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+
+K = np.array([[900.0, 0, 322.3], [0, 905.0, 236.8], [0, 0, 1]])
+LENS = np.array([0.08, -0.12, 0.001, -0.0007])
+SIZE = (640, 480)
+
+
+def _storage(path, **values):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in values.items():
+        storage.write(key, value)
+    storage.release()
+    return path
+
+
+def _same_pixels(device: Device, lens, shift):
+    """Whether points (OpenCV axes) fall where OpenCV puts them, `shift` pixels on."""
+    p = np.random.default_rng(0).uniform([-0.3, -0.2, 1], [0.3, 0.2, 1.2], (50, 3))
+    expected = cv2.projectPoints(p, np.zeros(3), np.zeros(3), K, lens)[0][:, 0] + shift
+    uv, _ = project(Intrinsics.of(device, torch.float64), torch.from_numpy(p * [1, -1, -1]))
+    return np.abs(uv.numpy() - expected).max()
+
+
+@pytest.mark.parametrize("ending", ["yml", "yaml", "xml"])
+def test_opencv_counts_from_the_middle_of_the_first_pixel(tmp_path, ending):
+    path = _storage(
+        tmp_path / f"kämera.{ending}", image_width=640, image_height=480, camera_matrix=K, avg_error=0.2,
+        calibration_time="today", distortion_coefficients=np.append(LENS, 0.0)[None],
+    )  # fmt: skip
+    device = read_device_file(path, "camera", SIZE)
+    assert (device.w, device.h) == SIZE
+    assert _same_pixels(device, LENS, 0.5) < 1e-9
+
+
+def test_opencv_stereo_files_hold_camera_and_projector(tmp_path):
+    other = K * [[2], [2], [1]]
+    path = _storage(tmp_path / "intrinsics.yml", M1=K, D1=LENS[None], M2=other, D2=np.zeros((1, 8)))
+    assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, 0.5) < 1e-9
+    projector = read_device_file(path, "projector", (1280, 960), model="DOE")
+    assert (projector.w, projector.cx, projector.model) == (1280, 2 * 322.3 + 0.5, "DOE")
+
+
+def test_procam_calibration_stores_rows_first_and_measures_the_first_pixel_of_a_cell(tmp_path):
+    path = _storage(
+        tmp_path / "calibration_result.xml", img_shape=(480, 640), rms=0.3, cam_int=K, cam_dist=LENS[None],
+        proj_int=K, proj_dist=np.zeros((1, 5)), roration=np.eye(3), translation=np.ones((3, 1)),
+    )  # fmt: skip
+    camera = read_device_file(path, "camera", SIZE)
+    assert (camera.w, camera.h) == SIZE and _same_pixels(camera, LENS, 0.5) < 1e-9
+    # cell number 7 of 4 pixels was measured at 28; it reaches from 28 to 32 and its middle is 30
+    for step in (1, 2, 4):
+        projector = read_device_file(path, "projector", (800, 600), procam_step=step)
+        assert projector.cx == pytest.approx(322.3 + step / 2) and projector.cy == pytest.approx(236.8 + step / 2)
+        assert (projector.w, projector.h) == (800, 600)
+    with pytest.raises(UserError, match=r"calibrated at 640 x 480, but the images are 480 x 640 \(rows and columns"):
+        read_device_file(path, "camera", (480, 640))
+
+
+def test_colmap_counts_from_the_corner_of_the_first_pixel(tmp_path):
+    path = tmp_path / "cameras.txt"
+    lens = " ".join(map(str, LENS))
+    path.write_text(f"# Camera list\n1 OPENCV 640 480 900 905 322.3 236.8 {lens}\n")
+    assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, 0.0) < 1e-9
+    path.write_text("3 SIMPLE_RADIAL 640 480 900 320 240 0.05\n7 PINHOLE 800 600 700 710 400 300\n")
+    assert read_device_file(path, "camera", SIZE) == Device(640, 480, 900.0, 900.0, 320.0, 240.0, 0.05)
+    assert read_device_file(path, "projector", (800, 600)) == Device(800, 600, 700.0, 710.0, 400.0, 300.0)
+
+
+def test_plain_json_says_where_the_first_pixel_is(tmp_path):
+    path = tmp_path / "intrinsics.json"
+    camera = {"w": 640, "h": 480, "fl_x": 900, "fl_y": 905, "cx": 322.3, "cy": 236.8}
+    lens = dict(zip(("k1", "k2", "p1", "p2"), LENS.tolist(), strict=True))
+    for extra, shift in (({}, 0.0), ({"pixel_centre": 0.5}, 0.0), ({"pixel_centre": 0}, 0.5)):
+        path.write_text(json.dumps({"camera": {**camera, **lens}, "projector": {**camera, "model": "DOE"}, **extra}))
+        assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, shift) < 1e-9
+        assert read_device_file(path, "projector", SIZE).model == "DOE"
+    path.write_text(json.dumps({"units": "mm", "camera_model": "OPENCV", **camera, "projector": camera}))
+    assert read_device_file(path, "camera", SIZE) == read_device_file(path, "projector", SIZE)
+
+
+def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
+    small = [*LENS, 0.02]
+    path = _storage(
+        tmp_path / "c.yml", image_width=640, image_height=480, camera_matrix=K,
+        distortion_coefficients=np.array([small]),
+    )  # fmt: skip
+    device = read_device_file(path, "camera", SIZE)
+    assert _same_pixels(device, np.array(small), 0.5) < 0.1
+    assert device.k2 != LENS[1]
+    reduced, miss = reduce_distortion([*LENS.tolist(), 0.0, 0.0, 0.0, 0.0], K, SIZE)
+    assert np.allclose(reduced, LENS) and miss == 0
+    fish = _storage(tmp_path / "d.yml", camera_matrix=K * [[0.4], [0.4], [1]],
+                    distortion_coefficients=np.array([[-0.3, 0.1, 0, 0, 0.8]]))  # fmt: skip
+    with pytest.raises(UserError, match=r"beyond k1, k2, p1, p2, without which it is .* px off") as caught:
+        read_device_file(fish, "camera", (256, 192))
+    assert "CALIB_FIX_K3" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", '{"camera": {"w": 640}}', r"camera\.h: is missing|h: is missing"),
+        ("a.json", '{"camera": 3}', "camera"),
+        ("a.json", '{"frames": []}', "describes neither a camera nor a projector"),
+        ("a.json", "{", "no valid JSON"),
+        ("a.txt", "1 OPENCV 640 480 900\n", "camera 1 has model OPENCV with 1 parameters"),
+        ("a.txt", "1 FOV 640 480 900 900 320 240 0.1\n", "has model FOV with 5 parameters"),
+        ("a.txt", "hello\n", "line 1 is no camera"),
+        ("a.txt", "# nothing\n", "holds no camera"),
+        ("a.yml", "camera_matrix: 3", "cannot be read as an OpenCV file"),
+        ("a.yml", "%YAML:1.0\n---\nfocus: 3\n", r"holds no camera matrix \(it has: focus\)"),
+        ("a.xml", "<html></html>", "cannot be read as an OpenCV file"),
+        ("a.toml", "x = 1", r"is of no known kind \(\.toml\)"),
+        ("a.txt", "1 PINHOLE 640 480 0.9 0.9 320 240\n", "fl_x is 0.9 pixels, which no lens has"),
+        ("a.txt", "1 PINHOLE 320 240 900 900 160 120\n", "was calibrated at 320 x 240, but the images are 640 x 480"),
+        ("a.txt", "1 PINHOLE 640 480 9 9 3 2\n2 PINHOLE 640 480 9 9 3 2\n", "leaves open which device is the camera"),
+    ],
+)
+def test_faults_name_file_cause_and_remedy(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(UserError, match=message) as caught:
+        read_device_file(path, "camera", SIZE)
+    assert name in str(caught.value) and "cause:" in str(caught.value) and "remedy:" in str(caught.value)
+
+
+def test_a_file_without_the_wanted_device(tmp_path):
+    path = tmp_path / "i.json"
+    path.write_text(json.dumps({"camera": {"w": 640, "h": 480, "fl_x": 900, "fl_y": 905, "cx": 322.3, "cy": 236.8}}))
+    with pytest.raises(UserError, match="describes no projector, only camera") as caught:
+        read_device_file(path, "projector", SIZE)
+    assert "--projector-intrinsics" in str(caught.value)
+    assert [entry.role for entry in read_entries(path)] == ["camera"]

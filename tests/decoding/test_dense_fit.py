@@ -1,0 +1,71 @@
+"""Sharpening coordinates on images whose coordinates are known."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sl_nerfstudio.decoding.grid.dense_fit import draw_sharpnesses, fit_densely
+from sl_nerfstudio.pattern.grid import GridPattern
+
+GRID = GridPattern(w=400, h=400, codes=np.random.default_rng(3).integers(0, 5, (20, 20)).astype(np.int8))
+
+
+def surface(pixels_a_period, size=160):
+    """A curved surface: pattern pixels at pixel centres."""
+    x, y = (np.stack(np.meshgrid(*[np.arange(size) + 0.5] * 2), 0) - size / 2) * (20 / pixels_a_period)
+    roll = 0.2
+    u = np.cos(roll) * x - np.sin(roll) * y + 0.0004 * y * y + 190
+    v = np.sin(roll) * x + np.cos(roll) * y + 4 * np.sin(x / 70) + 210
+    return np.stack([u, v], -1).astype(np.float32)
+
+
+def photograph(coords, blur, noise, rng):
+    fine = cv2.resize(coords, None, fx=3, fy=3, interpolation=cv2.INTER_LINEAR)
+    light = cv2.resize(GRID.intensity(fine).astype(np.float32), None, fx=1 / 3, fy=1 / 3, interpolation=cv2.INTER_AREA)
+    y, x = np.mgrid[: len(coords), : len(coords)] / len(coords)
+    shaded = cv2.GaussianBlur(0.1 + (0.3 + 0.5 * x) * light + 0.1 * y, (0, 0), blur)
+    return (shaded + noise * rng.standard_normal(shaded.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "pixels, blur, noise, bound", [(10, 0.6, 0.01, 0.10), (20, 1.0, 0.01, 0.05), (12, 1.6, 0.05, 0.4)]
+)
+def test_errors_of_the_network_are_taken_out(pixels, blur, noise, bound):
+    rng = np.random.default_rng(0)
+    truth = surface(pixels)
+    image = photograph(truth, blur, noise, rng)
+    wave = np.sin(np.mgrid[:160, :160] / (1.5 * pixels)).transpose(1, 2, 0)
+    start = truth + 1.2 * wave + rng.normal(0, 0.7, truth.shape)
+    out, agreement = fit_densely(image, start.astype(np.float32), draw_sharpnesses(GRID.render(), 20.0), float(pixels))
+    error = np.linalg.norm(out - truth, axis=-1)[8:-8, 8:-8]
+    assert np.median(error) < bound < np.median(np.linalg.norm(start - truth, axis=-1))
+    assert np.median(agreement) > (0.9 if noise < 0.02 else 0.6)
+
+
+def test_a_dark_photograph_is_sharpened_as_a_bright_one():
+    """Lit to one side by twice as much as to the other, and exposed by a fifth of the light."""
+    truth = surface(14)
+    image = photograph(truth, 0.8, 0.002, np.random.default_rng(0))
+    grids = draw_sharpnesses(GRID.render(), 20.0)
+    bright, _ = fit_densely(image, truth + np.float32(0.4), grids, 14.0)
+    dark, _ = fit_densely(image / 5, truth + np.float32(0.4), grids, 14.0)
+    assert np.nanmax(np.abs(bright - dark)) < 0.02
+
+
+def test_what_shows_another_part_of_the_pattern_does_not_agree():
+    truth = surface(14)
+    image = photograph(truth, 0.6, 0.01, np.random.default_rng(0))
+    right, agreement = fit_densely(image, truth, draw_sharpnesses(GRID.render(), 20.0), 14.0)
+    wrong, other = fit_densely(image, truth + np.float32(20), draw_sharpnesses(GRID.render(), 20.0), 14.0)
+    assert np.isfinite(right).all() and np.isfinite(wrong).all()
+    assert np.quantile(agreement, 0.05) > np.median(other) + 0.1
+
+
+def test_unknown_stays_unknown_and_a_tear_is_not_smoothed():
+    truth = surface(14)
+    truth[:, 80:] += (31, 17)
+    truth[100:104] = np.nan
+    image = photograph(np.nan_to_num(truth), 0.4, 0.005, np.random.default_rng(0))
+    out, _ = fit_densely(image, truth, draw_sharpnesses(GRID.render(), 20.0), 14.0)
+    assert (np.isnan(out) == np.isnan(truth)).all()
+    assert np.nanmax(np.linalg.norm(out - truth, axis=-1)[:95, 82:]) < 1.5

@@ -1,0 +1,115 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.evaluation.capture_fit import CaptureFit, frame_pixels, look_up
+from sl_nerfstudio.evaluation.evaluate import Poses, evaluate
+from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.scan import read_scan
+
+from .faceted_scan import FacetedScan
+from .shapes import turn
+
+DOE = Device(w=96, h=80, fl_x=210.0, fl_y=205.0, cx=48.0, cy=41.0, model="DOE")
+
+
+def fit_of(root: Path, mesh: Mesh, poses: Poses | None = None) -> CaptureFit:
+    scan = read_scan(root)
+    return evaluate(mesh, scan, poses or Poses(scan.T_world_camera, scan.T_world_projector)).fit
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        FacetedScan(),
+        FacetedScan(projector=DOE),
+        FacetedScan(units="m", scale=0.04, offset=(3.0, -2.0, 1.0)),
+        FacetedScan(offset=(5000.0, 2000.0, -3000.0)),
+    ],
+    ids=["pinhole", "DOE", "metres", "far from the origin"],
+)
+def test_truth_explains_a_clean_scan_perfectly(made: FacetedScan, tmp_path: Path) -> None:
+    fit = fit_of(made.write(tmp_path / "scan"), made.truth())
+    assert fit.coordinate_px_median < 1e-3
+    assert fit.coordinate_px_p95 < 1e-2
+    assert fit.epipolar_px_median < 1e-3
+    assert fit.pattern_cosine > 0.9999  # 8 bits
+    assert fit.hit_share == 1.0
+    assert [frame.name for frame in fit.frames] == ["frame_00000", "frame_00001", "frame_00002"]
+    for frame in fit.frames:
+        assert frame.lit_share > 0.97 and frame.decoded_share == 1.0
+
+
+def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    frame, made = scan.frames[0], FacetedScan()
+    coords = frame.read_coords()
+    shifted = np.where(np.isfinite(coords), coords + np.float32([0.3, -0.4]), np.nan)
+    path = clean_scan.parent / "shifted.npz"
+    np.savez(path, coords=shifted)
+    from dataclasses import replace
+
+    moved = replace(frame, coords_path=path)
+    pixels = frame_pixels(
+        Surface(made.truth()), moved, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector
+    )
+    np.testing.assert_allclose(np.median(pixels.offset, axis=0), [-0.3, 0.4], atol=1e-3)
+    assert np.median(pixels.coordinate) == pytest.approx(0.5, abs=1e-3)
+    assert np.nanmax(np.abs(pixels.epipolar)) <= 0.5 + 1e-3  # a shift has a part along the curve, too
+
+
+def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    projectors = scan.T_world_projector.copy()
+    projectors[:, :3, :3] = projectors[:, :3, :3] @ turn((1, 0, 0), 1.0)  # 1 degree is 3.2 pattern pixels
+    poses = Poses(scan.T_world_camera, projectors)
+    sphere_fit = fit_of(clean_scan, Mesh(FacetedScan().truth().vertices * 0.8, FacetedScan().truth().faces), poses)
+    true_fit = fit_of(clean_scan, FacetedScan().truth(), poses)
+    assert 1.5 < true_fit.epipolar_px_median < 3.5
+    assert sphere_fit.epipolar_px_median == true_fit.epipolar_px_median
+    assert true_fit.pattern_cosine < 0.99
+
+
+def test_world_moved_with_mesh_and_poses_leaves_the_fit(clean_scan: Path) -> None:
+    scan, made = read_scan(clean_scan), FacetedScan()
+    S = Similarity(1.0, turn((1, -2, 0.3), 70.0), np.array([10.0, 500.0, -3.0]))
+    fit = fit_of(
+        clean_scan, made.truth().mapped(S), Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
+    )
+    assert fit.coordinate_px_p95 < 1e-2
+
+
+def test_depth_of_a_pixel_and_ray_angle_follow_from_the_set_up(clean_scan: Path) -> None:
+    fit = fit_of(clean_scan, FacetedScan().truth())
+    camera, projector = (T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1)[:, None] for T in FacetedScan().true_poses())
+    radius = 32.0  # the surface is nearer to the devices than the centre they look at
+    angle = np.median(np.arccos((camera * projector).sum(1))) * 250 / (250 - radius)
+    assert fit.ray_angle_deg == pytest.approx(np.degrees(angle), rel=0.1)
+    assert fit.depth_per_px == pytest.approx((240 - radius) / 190 / np.sin(angle), rel=0.15)
+
+
+def test_a_hole_in_the_mesh_lowers_the_share_that_is_hit(clean_scan: Path) -> None:
+    truth = FacetedScan().truth()
+    fit = fit_of(clean_scan, truth.with_faces(truth.vertices[truth.faces].mean(1)[:, 2] > 0))
+    assert 0.3 < fit.hit_share < 0.9
+    assert fit.coordinate_px_median < 1e-3  # what is there is right
+
+
+def test_look_up_is_bilinear_between_pixel_centres() -> None:
+    image = np.array([[0.0, 1.0], [2.0, 4.0]])
+    uv = np.array([[0.5, 0.5], [1.5, 0.5], [1.0, 0.5], [1.0, 1.0], [0.0, 0.0], [np.nan, 0.5]])
+    np.testing.assert_allclose(look_up(image, uv), [0, 1, 0.5, 1.75, 0, np.nan])
+
+
+def test_large_frames_are_thinned_on_a_grid(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    frame, surface = scan.frames[0], Surface(FacetedScan().truth())
+    args = (surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
+    every, few = frame_pixels(*args), frame_pixels(*args, max_pixels=len(frame_pixels(*args).row) // 4 + 1)
+    assert (every.stride, few.stride) == (1, 2)
+    assert len(few.row) == pytest.approx(len(every.row) / 4, rel=0.1)
+    assert not (few.row % 2).any() and not (few.column % 2).any()

@@ -1,0 +1,83 @@
+"""RowAdam: torch's Adam where rows have gradients, nothing where they have none."""
+
+import pytest
+import torch
+from torch import nn
+
+from sl_nerfstudio.field.row_adam import RowAdam
+from tests.field.fields import make_field, points_around
+
+
+def test_is_adam_for_rows_that_always_have_a_gradient() -> None:
+    torch.manual_seed(0)
+    ours, theirs = nn.Parameter(torch.randn(20, 8)), nn.Parameter(torch.empty(20, 8))
+    theirs.data.copy_(ours)
+    optimisers = RowAdam([ours], lr=0.1, eps=1e-8), torch.optim.Adam([theirs], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    for _ in range(30):
+        gradient = torch.randn(20, 8)
+        for parameter, optimiser in zip((ours, theirs), optimisers, strict=True):
+            parameter.grad = gradient.clone()
+            optimiser.step()
+    torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
+
+
+def test_rows_without_gradient_keep_their_value_and_count_their_own_steps() -> None:
+    torch.manual_seed(0)
+    some, alone = nn.Parameter(torch.ones(2, 3)), nn.Parameter(torch.ones(1, 3))
+    both = RowAdam([some], lr=0.1), RowAdam([alone], lr=0.1)
+    for step in range(6):
+        gradient = torch.randn(1, 3)
+        some.grad = torch.cat([torch.zeros(1, 3), gradient if step % 2 else torch.zeros(1, 3)])
+        both[0].step()
+        if step % 2:
+            alone.grad = gradient
+            both[1].step()
+    assert torch.equal(some[0], torch.ones(3))
+    torch.testing.assert_close(some[1], alone[0])
+
+
+@pytest.mark.parametrize("clip", [False, True])
+def test_the_compiled_step_of_a_table_is_the_plain_one(clip: bool) -> None:
+    compiled, plain, p = make_field("numba"), make_field("torch"), points_around(3000).float()
+    optimisers = [RowAdam([field.encoding.table], lr=1e-2) for field in (compiled, plain)]
+    for step in range(4):
+        for field, optimiser in zip((compiled, plain), optimisers, strict=True):
+            optimiser.zero_grad()
+            f, g = field.sdf_and_gradient(p[step * 700 : (step + 1) * 700])
+            (f.square().sum() + (g.norm(dim=-1) - 1).square().sum()).backward()
+            if clip:  # torch writes to the gradient: the kernels' own marks no longer hold
+                nn.utils.clip_grad_norm_(field.encoding.table, 0.1)
+            optimiser.step()
+    # Adam divides gradients near rounding by themselves, so single numbers may differ by a step
+    error = (compiled.encoding.table - plain.encoding.table).detach().abs()
+    assert float(error.mean()) < 1e-7
+    assert float((error > 1e-5).float().mean()) < 1e-3
+
+
+def test_a_step_leaves_the_gradient_buffer_clear() -> None:
+    field, p = make_field("numba"), points_around(500).float()
+    optimiser = RowAdam([field.encoding.table])
+    field.sdf(p).sum().backward()
+    optimiser.step()
+    assert field.encoding.table.grad is not None
+    assert float(field.encoding.table.grad.abs().max()) == 0
+
+
+def test_state_survives_a_checkpoint() -> None:
+    p = points_around(500).float()
+    fields = [make_field("numba") for _ in range(2)]
+    first, second = (RowAdam([field.encoding.table]) for field in fields)
+
+    def step(field_index: int, optimiser: RowAdam) -> None:
+        optimiser.zero_grad()
+        fields[field_index].sdf(p).square().sum().backward()
+        optimiser.step()
+
+    step(0, first)
+    step(0, first)
+    step(1, second)
+    resumed = RowAdam([fields[1].encoding.table])
+    resumed.load_state_dict(second.state_dict())
+    step(1, resumed)
+    assert torch.equal(fields[0].encoding.table, fields[1].encoding.table)
+    assert resumed.step(lambda: 3.5) == 3.5

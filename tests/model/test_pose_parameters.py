@@ -1,0 +1,142 @@
+"""Poses as parameters: what an increment means, derivatives, and starting anew from other poses."""
+
+import pytest
+import torch
+
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse
+from sl_nerfstudio.model.pose_parameters import (
+    IndependentPoseParameters,
+    PoseParameters,
+    RigPoseParameters,
+    StaticProjectorParameters,
+)
+
+FRAMES = 3
+KINDS = pytest.mark.parametrize("kind", [RigPoseParameters, IndependentPoseParameters])
+
+
+def random_poses(seed: int) -> torch.Tensor:
+    return exp_se3(torch.randn(FRAMES, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+
+
+def make(
+    kind: type[PoseParameters], camera: bool = True, projector: bool = True, shared: bool = False
+) -> PoseParameters:
+    return kind(random_poses(0), random_poses(1), camera, projector, shared).double()
+
+
+def set_steps(poses: PoseParameters, seed: int = 2) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for step in (poses.camera_step, poses.projector_step):
+            step.copy_(0.1 * torch.randn(step.shape, generator=generator, dtype=torch.float64))
+
+
+@KINDS
+def test_without_increments_poses_are_the_base(kind):
+    camera, projector = make(kind)()
+    assert camera.dtype == projector.dtype == torch.float64
+    assert torch.allclose(camera, random_poses(0), atol=1e-14) and torch.allclose(
+        projector, random_poses(1), atol=1e-14
+    )
+
+
+def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_against_the_camera():
+    poses = make(RigPoseParameters)
+    set_steps(poses)
+    camera, projector = poses()
+    delta, rho = exp_se3(poses.camera_step), exp_se3(poses.projector_step)
+    assert torch.allclose(camera, delta @ random_poses(0), atol=1e-13)
+    assert torch.allclose(inverse(camera) @ projector, rho @ inverse(random_poses(0)) @ random_poses(1), atol=1e-13)
+
+
+def test_a_static_projector_stays_while_its_cameras_turn_about_the_scene():
+    poses = make(StaticProjectorParameters, projector=False)
+    set_steps(poses)
+    camera, projector = poses()
+    assert torch.equal(projector, random_poses(1))
+    assert torch.allclose(camera, exp_se3(poses.camera_step) @ random_poses(0), atol=1e-12)
+
+
+def test_independent_devices_turn_about_themselves():
+    poses = make(IndependentPoseParameters)
+    with torch.no_grad():
+        poses.camera_step[:, 3:] = 0.2
+        poses.projector_step[0, 0] = 0.3
+    camera, projector = poses()
+    assert torch.allclose(camera[:, :3, 3], random_poses(0)[:, :3, 3], atol=1e-14)
+    moved = (inverse(random_poses(1)) @ projector)[0, :3, 3]
+    assert torch.allclose(moved, torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64), atol=1e-14)
+    assert torch.allclose(projector[1:], random_poses(1)[1:], atol=1e-14)
+
+
+@KINDS
+@pytest.mark.parametrize("zero", [True, False])
+def test_gradients_are_central_differences(kind, zero):
+    poses = make(kind)
+    if not zero:
+        set_steps(poses)
+    weight = torch.randn(2, FRAMES, 4, 4, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def value() -> torch.Tensor:
+        return (torch.stack(poses()) * weight).sum()
+
+    value().backward()
+    for step in (poses.camera_step, poses.projector_step):
+        expected = torch.zeros_like(step)
+        for i in range(step.numel()):
+            with torch.no_grad():
+                flat = step.view(-1)
+                flat[i] += 1e-6
+                plus = value()
+                flat[i] -= 2e-6
+                expected.view(-1)[i] = (plus - value()) / 2e-6
+                flat[i] += 1e-6
+        assert step.grad is not None and torch.allclose(step.grad, expected, atol=1e-7)
+
+
+@KINDS
+def test_starting_anew_from_other_poses(kind):
+    poses = make(kind)
+    set_steps(poses)
+    poses.rebase(random_poses(5), random_poses(6))
+    camera, projector = poses()
+    assert torch.allclose(camera, random_poses(5), atol=1e-14) and torch.allclose(
+        projector, random_poses(6), atol=1e-14
+    )
+    assert not poses.camera_step.any() and not poses.projector_step.any()
+    assert torch.equal(poses.start_camera, random_poses(0)) and torch.equal(poses.start_projector, random_poses(1))
+
+
+@KINDS
+@pytest.mark.parametrize("camera, projector", [(True, False), (False, True), (False, False)])
+def test_what_is_not_refined_has_no_gradient(kind, camera, projector):
+    poses = make(kind, camera, projector)
+    assert (poses.camera_step.requires_grad, poses.projector_step.requires_grad) == (camera, projector)
+
+
+def test_a_shared_projector_moves_alike_in_all_frames():
+    poses = make(RigPoseParameters, shared=True)
+    assert poses.projector_step.shape == (1, 6)
+    set_steps(poses)
+    camera, projector = poses()
+    relative = inverse(camera) @ projector
+    moved = relative @ inverse(inverse(random_poses(0)) @ random_poses(1))
+    assert torch.allclose(moved, exp_se3(poses.projector_step).expand(FRAMES, 4, 4), atol=1e-13)
+
+
+@KINDS
+def test_a_checkpoint_brings_back_base_start_and_increments(kind):
+    poses = make(kind)
+    poses.rebase(random_poses(5), random_poses(6))
+    set_steps(poses)
+    other = kind(random_poses(8), random_poses(9), True, True).double()
+    other.load_state_dict(poses.state_dict())
+    assert all(torch.equal(a, b) for a, b in zip(poses(), other(), strict=True))
+    assert torch.equal(other.start_camera, random_poses(0)) and other.sigma.isnan().all()
+
+
+def test_training_in_float32_keeps_the_base_in_float64():
+    poses = RigPoseParameters(random_poses(0), random_poses(1), True, True)
+    assert poses.camera_step.dtype == torch.float32
+    assert torch.allclose(poses()[0], random_poses(0), rtol=0, atol=1e-14)

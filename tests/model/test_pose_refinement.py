@@ -1,0 +1,232 @@
+"""From a scan on disk to refined poses: right ones in, right ones out; useless ones refused."""
+
+import copy
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.dataparser.dataparser import LoadedScan
+from sl_nerfstudio.dataparser.samples import build_samples
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
+from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.methods import sl_neus
+from sl_nerfstudio.model.intrinsics_refinement import RefinedIntrinsics, refine_intrinsics
+from sl_nerfstudio.model.pose_refinement import (
+    PriorConfig,
+    ScanAdjustment,
+    adjust_scan,
+    pose_prior,
+    scene_rig,
+    sigmas_in_scan_units,
+)
+from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, read_scan
+
+from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
+
+FRAMES, SIZE, MM = 6, 80, 50.0
+S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
+QUICK = AdjustmentSettings(anchors_per_frame=80, frames_per_anchor=3, max_iterations=14)
+
+
+def in_mm(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    world = S_SCENE_WORLD.inverse()
+    return world.poses(rig.T_world_camera.numpy()), world.poses(rig.T_world_projector.numpy())
+
+
+def with_poses(scan: Scan, rig: Rig) -> Scan:
+    """The same files, other starting poses."""
+    poses = zip(scan.frames, *in_mm(rig), strict=True)
+    return replace(scan, frames=tuple(replace(f, T_world_camera=c, T_world_projector=p) for f, c, p in poses))
+
+
+@pytest.fixture(scope="module")
+def true() -> Rig:
+    return rig_of(FRAMES, SIZE)
+
+
+@pytest.fixture(scope="module")
+def scan(true, tmp_path_factory) -> Scan:
+    root: Path = tmp_path_factory.mktemp("adjust_scan") / "scan"
+    blank = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    blank[::2] = 200
+    with ScanWriter(
+        root,
+        units="mm",
+        scale=Scale(True, "baseline of frame 1"),
+        projector=PROJECTORS["pinhole"],
+        pattern=np.tile(np.arange(0, 200, dtype=np.uint8), (400, 2)),
+        camera=camera_of(SIZE),
+    ) as writer:
+        for k, (coords, c, p) in enumerate(zip(images_of(true, SIZE), *in_mm(true), strict=True)):
+            mask = coords.isfinite().all(-1).numpy()
+            name = f"frame_{k:05d}"
+            writer.add_frame(name, image=blank, coords=coords.numpy(), mask=mask, T_world_camera=c, T_world_projector=p)
+    return read_scan(root)
+
+
+def test_a_rig_in_the_scene_is_the_scan_in_other_units(scan, true):
+    rig = scene_rig(scan, S_SCENE_WORLD)
+    assert torch.allclose(rig.T_world_camera, true.T_world_camera, atol=1e-9)
+    assert torch.allclose(rig.T_camera_projector, true.T_camera_projector, atol=1e-9)
+    assert rig.camera.params.shape == (FRAMES, 8) and rig.camera.params.dtype == torch.float64
+
+
+def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
+    start = disturbed(true, 1)
+    found = adjust_scan(with_poses(scan, start), S_SCENE_WORLD, build_samples(scan), "known-rig", PriorConfig(), QUICK)
+    assert found.verdict.better and found.verdict.after_px < 0.8 * found.verdict.before_px
+    assert found.message().startswith("Poses adjusted: held-out pixels agree to ")
+    relative = inverse(found.T_scene_camera) @ found.T_scene_projector
+    assert torch.allclose(relative, true.T_camera_projector, atol=1e-9)
+    assert (found.sigma[:, :6] > 0).all() and found.sigma.isfinite().all()
+    centres = (found.T_scene_camera[:, :3, 3], true.T_world_camera[:, :3, 3], start.T_world_camera[:, :3, 3])
+    apart = [torch.cdist(c, c) for c in centres]
+    assert (apart[0] - apart[1]).abs().max() < 0.5 * (apart[2] - apart[1]).abs().max()
+
+
+@pytest.mark.parametrize(
+    "scale, size",
+    [(Scale(True, "given camera poses"), 1.0), (Scale(True, "baseline of frame 1"), 1.02)],
+)
+def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
+    """Cameras stand where they are said to stand; all baselines are said to be 2 % longer than they are."""
+    start = rig_of(FRAMES, SIZE)
+    start.T_camera_projector[:, :3, 3] *= 1.02
+    sigma = PoseSigma(0.05, 0.05, 1.0, 0.3)
+    said = with_poses(scan, start)
+    said = replace(said, scale=scale, frames=tuple(replace(f, pose_sigma=sigma) for f in said.frames))
+    found = adjust_scan(said, S_SCENE_WORLD, build_samples(scan), "free", PriorConfig(), QUICK)
+    assert found.verdict.better
+    apart = [torch.cdist(T[:, :3, 3], T[:, :3, 3]).sum() for T in (found.T_scene_camera, true.T_world_camera)]
+    assert float(apart[0] / apart[1]) == pytest.approx(size, abs=5e-3)
+
+
+def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
+    """`off` changes nothing, so nothing is better."""
+    found = adjust_scan(
+        scan, S_SCENE_WORLD, build_samples(scan), "off", PriorConfig(), replace(QUICK, max_iterations=1)
+    )
+    rig = scene_rig(scan, S_SCENE_WORLD)
+    assert not found.verdict.better and torch.equal(found.T_scene_camera, rig.T_world_camera)
+    assert torch.equal(found.T_scene_projector, rig.T_world_projector)
+    prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
+    assert torch.equal(found.sigma[:, 0], prior.frame_translation)  # nothing was learnt
+    assert torch.equal(found.sigma[:, 11], prior.relative_rotation)
+    assert found.message().startswith("Poses NOT changed") and found.message().endswith("starting poses are kept.")
+
+
+def test_the_message_tells_both_figures(true):
+    verdict = CrossValidation(before_px=3.0, after_px=0.25)
+    text = ScanAdjustment(true, torch.zeros(FRAMES, 12), verdict, 0.1).message()
+    assert text == "Poses adjusted: held-out pixels agree to 0.25 px, before 3 px."
+
+
+def test_the_prior_is_what_the_scan_states_else_the_defaults(scan, true):
+    stated = PoseSigma(
+        camera_translation=2.0, camera_rotation_deg=1.5, relative_translation=0.0, relative_rotation_deg=0.1
+    )
+    frames = (replace(scan.frames[0], pose_sigma=stated), *scan.frames[1:])
+    prior = pose_prior(replace(scan, frames=frames), S_SCENE_WORLD, PriorConfig())
+    first = [float(s[0]) for s in (prior.frame_translation, prior.frame_rotation)]
+    assert first == pytest.approx([2.0 / MM, radians(1.5)])
+    assert float(prior.relative_rotation[0]) == pytest.approx(radians(0.1))
+    assert 0 < float(prior.relative_translation[0]) < 1e-6  # known exactly, but not infinitely so
+    assert float(prior.frame_translation[1]) == 0.1 and float(prior.frame_rotation[1]) == pytest.approx(radians(2))
+    baseline = float(true.T_camera_projector[1, :3, 3].norm())
+    assert float(prior.relative_translation[1]) == pytest.approx(0.05 * baseline)
+
+
+def test_sigmas_in_units_for_people():
+    sigma = torch.tensor([[3.0, 4.0, 0.0, 0.1, 0.1, 0.1, 0.0, 0.0, 6.0, 0.0, 0.2, 0.0]]) / 100
+    found = sigmas_in_scan_units(sigma, S_SCENE_WORLD)[0]
+    degree = 180 / np.pi / 100
+    assert found == pytest.approx(
+        [MM * 0.05 / 3**0.5, 0.1 * degree, MM * 0.06 / 3**0.5, 0.2 * degree / 3**0.5], rel=1e-5
+    )
+
+
+MENDABLE = IntrinsicsChange.of((-0.009, 0.003, 0.0, 0.007, 0.0, -0.004))
+
+
+def stated_with(scan: Scan, change: IntrinsicsChange) -> LoadedScan:
+    """The scan as a folder that states other intrinsics would be loaded."""
+    wrong = replace(scan.with_intrinsics_change(change), intrinsics_change=UNCHANGED)
+    return LoadedScan(wrong, build_samples(scan), S_SCENE_WORLD)
+
+
+def relative_error(found: ScanAdjustment, true: Rig) -> float:
+    return float((found.rig.T_camera_projector - true.T_camera_projector).abs().max())
+
+
+@pytest.fixture(scope="module")
+def mended(scan) -> RefinedIntrinsics:
+    return refine_intrinsics(stated_with(scan, MENDABLE), "free", PriorConfig(), QUICK)
+
+
+def test_wrong_intrinsics_are_taken_back_and_poses_with_them(scan, true, mended):
+    """In images of 80 pixels one cannot see that both focal lengths are too long, but that one is against the other."""
+    loaded = stated_with(scan, MENDABLE)
+    assert mended.before.intrinsics is not None and mended.before.intrinsics.serious
+    assert mended.held_out.better and mended.after.verdict.better
+    changed = loaded.scan.with_intrinsics_change(mended.change)
+    ratio = changed.frames[0].camera.fl_x / scan.frames[0].camera.fl_x / (changed.projector.fl_x / scan.projector.fl_x)
+    assert abs(ratio - 1) < 0.1 * abs((1 + MENDABLE.camera.focal) / (1 + MENDABLE.projector.focal) - 1)
+    assert relative_error(mended.after, true) < 0.1 * relative_error(mended.before, true)
+    text = mended.message(loaded.scan)
+    assert text.startswith("Intrinsics changed (chi square ") and "camera: focal length +0." in text
+    assert "projector: focal length -" in text
+
+
+def test_right_intrinsics_stay_exactly_as_they_are(scan):
+    found = refine_intrinsics(stated_with(scan, UNCHANGED), "free", PriorConfig(), QUICK)
+    assert found.change == UNCHANGED and found.after is found.before
+    assert found.message(scan).startswith("Intrinsics NOT changed: the captures agree with them (chi square ")
+
+
+def test_a_run_takes_the_change_into_its_settings(scan, mended, monkeypatch, capsys):
+    """Everything that opens the run later reads those, and so the same devices."""
+    asked = []
+
+    def found(*question) -> RefinedIntrinsics:
+        asked.append(question)
+        return mended
+
+    monkeypatch.setattr("sl_nerfstudio.model.trainer.refine_intrinsics", found)
+    config = copy.deepcopy(sl_neus.config)
+    config.data = config.pipeline.datamanager.data = scan.root
+    model = config.pipeline.model
+    model.refine_intrinsics, model.refine_poses = True, "rigid-rig"
+    config.prepare()
+    assert config.pipeline.datamanager.dataparser.intrinsics_change == mended.change != UNCHANGED
+    ((loaded, *question),) = asked
+    assert loaded.scan.root == scan.root and question == ["rigid-rig", model.prior, model.adjustment]
+    config.prepare()  # as a saved and loaded configuration is: nothing is asked again
+    assert len(asked) == 1 and config.pipeline.datamanager.dataparser.intrinsics_change == mended.change
+    assert "Intrinsics changed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "settings, change, said",
+    [
+        ({"refine_poses": "off"}, UNCHANGED, "those are not to be adjusted"),
+        ({"adjust_poses": False}, UNCHANGED, "those are not to be adjusted"),
+        ({}, MENDABLE, "a change of intrinsics is given, too"),
+    ],
+)
+def test_intrinsics_are_not_refined_without_poses_nor_twice(scan, settings, change, said):
+    config = copy.deepcopy(sl_neus.config)
+    config.data = config.pipeline.datamanager.data = scan.root
+    config.pipeline.datamanager.dataparser.intrinsics_change = change
+    for name, value in {"refine_intrinsics": True, **settings}.items():
+        setattr(config.pipeline.model, name, value)
+    with pytest.raises(UserError, match=said):
+        config.prepare()

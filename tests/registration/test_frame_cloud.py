@@ -1,0 +1,110 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.geometry.rays import pixel_centres
+from sl_nerfstudio.geometry.triangulation import closest_approach
+from sl_nerfstudio.registration.frame_cloud import frame_cloud, well_known
+from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.relative_pose.epipolar_fit import moved
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
+from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, cast, rig_of, seen
+from tests.registration.analytic_clouds import clouds_of
+
+SIZE = 90
+RIG = rig_of(2, SIZE)
+LENGTH = RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy()
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_points_lie_on_the_surface(projector):
+    rig = rig_of(2, SIZE, projector)
+    cloud = clouds_of(rig, SIZE, projector)[0]
+    p = rig.T_world_camera[0, :3, :3].numpy() @ (LENGTH[0] * cloud.points.T)
+    p = p.T + rig.T_world_camera[0, :3, 3].numpy()
+    o = rig.T_world_camera[0, :3, 3]
+    d = rig.T_world_camera.new_tensor(p) - o
+    distance = cast(o.expand_as(d), d / d.norm(dim=-1, keepdim=True))[0]
+    np.testing.assert_allclose(d.norm(dim=-1).numpy(), distance.numpy(), atol=2e-5)  # coordinates are float32
+
+
+def test_the_stated_noise_of_points_is_that_of_their_errors():
+    clean, noisy = (clouds_of(RIG, SIZE, noise=n)[0] for n in (0.0, 0.3))
+    pairs = {tuple(uv): k for k, uv in enumerate(clean.uv_camera)}
+    index = [pairs[tuple(uv)] for uv in noisy.uv_camera]
+    error = np.linalg.norm(noisy.points, axis=1) - np.linalg.norm(clean.points[index], axis=1)
+    assert np.std(error / noisy.sigma_noise) == pytest.approx(1, abs=0.12)
+
+
+def test_the_pose_s_uncertainty_makes_points_uncertain():
+    """Depth is computed again with poses drawn from the covariance."""
+    coords = _image(0) + np.random.default_rng(0).normal(0, 0.3, (SIZE, SIZE, 2)).astype(np.float32)
+    uv = correspondences_of(coords)
+    devices = camera_of(SIZE), PROJECTORS["pinhole"]
+    pose = judge_relative_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices)
+    cloud = frame_cloud("a", coords, *devices, pose)
+    d_camera, d_projector = (
+        torch.from_numpy(directions(device, xy[pose.inliers])) for device, xy in zip(devices, uv, strict=True)
+    )
+    rng, depths = np.random.default_rng(1), []
+    for _ in range(60):
+        R, t = moved(
+            pose.T_camera_projector[:3, :3],
+            pose.T_camera_projector[:3, 3],
+            rng.multivariate_normal(np.zeros(5), pose.covariance),
+        )
+        depth, _ = closest_approach(
+            torch.zeros(3, dtype=torch.float64), d_camera, torch.from_numpy(t), d_projector @ torch.from_numpy(R).T
+        )
+        depths.append(depth.numpy())
+    measured = np.std(depths, axis=0)
+    assert np.median(measured / cloud.sigma_pose) == pytest.approx(1, abs=0.25)
+
+
+def test_what_contradicts_the_pose_is_left_out_of_points_and_coordinates():
+    coords = _image(0)
+    decoded = np.argwhere(np.isfinite(coords).all(-1))
+    wrong = decoded[::10]
+    coords[wrong[:, 0], wrong[:, 1]] += np.float32([30, -25])
+    uv = correspondences_of(coords)
+    devices = camera_of(SIZE), PROJECTORS["pinhole"]
+    cloud = frame_cloud("a", coords, *devices, judge_relative_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices))
+    assert np.isnan(cloud.coords[wrong[:, 0], wrong[:, 1]]).all()
+    assert len(cloud.points) == np.isfinite(cloud.coords).all(-1).sum() == len(decoded) - len(wrong)
+
+
+def test_a_frame_without_points_is_refused_by_name():
+    uv = correspondences_of(_image(0))
+    pose = estimate_relative_pose(*uv, camera_of(SIZE), PROJECTORS["pinhole"])
+    none = replace(pose, inliers=np.zeros_like(pose.inliers))
+    with pytest.raises(RelativePoseError, match="photo_7: only 0 points agree"):
+        frame_cloud("photo_7", _image(0), camera_of(SIZE), PROJECTORS["pinhole"], none)
+
+
+def test_badly_known_points_are_left_out_of_surfaces():
+    cloud = clouds_of(RIG, SIZE, noise=0.1)[0]
+    sigma = cloud.sigma_noise.copy()
+    sigma[:25] *= 100
+    assert not well_known(replace(cloud, sigma_noise=sigma))[:25].any()
+    assert well_known(cloud).mean() > 0.9
+
+
+def test_normals_of_the_map_are_those_of_the_surface():
+    """On the disk they are its axis; everywhere they look at the camera, whatever its lens."""
+    cloud = clouds_of(RIG, SIZE)[0]
+    found = build_surface_map(cloud)
+    R, t = RIG.T_world_camera[0, :3, :3].numpy(), RIG.T_world_camera[0, :3, 3].numpy()
+    p = LENGTH[0] * found.point @ R.T + t
+    on_disk = found.valid & (np.abs(p[..., 2] + 0.3) < 2e-3)
+    assert on_disk.sum() > 300
+    np.testing.assert_allclose((found.normal @ R.T)[on_disk].mean(0), [0, 0, 1], atol=5e-3)
+    assert ((found.normal * found.point).sum(-1)[found.valid] < 0).all()
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=-1)[found.valid], 1)
+
+
+def _image(k: int) -> np.ndarray:
+    uv = pixel_centres(camera_of(SIZE), torch.float64).reshape(-1, 2)
+    return seen(RIG, torch.full((len(uv),), k), uv)[0].reshape(SIZE, SIZE, 2).float().numpy().copy()

@@ -1,0 +1,233 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.epipolar import epipolar_residual
+from sl_nerfstudio.relative_pose.epipolar_fit import (
+    covariance,
+    direction_basis,
+    fit_epipolar,
+    moved,
+    sampson,
+    sampson_jacobian,
+)
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, ray_pairs
+from tests.relative_pose.two_views import PROJECTORS, errors_deg, view
+
+
+def kinds(found) -> set[str]:
+    return {degeneracy.kind for degeneracy in found.degeneracies}
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_exact_coordinates_give_the_exact_pose(projector):
+    frame = view(projector, count=500)
+    found = estimate_relative_pose(*frame.arguments)
+    rotation, direction = errors_deg(found.T_camera_projector, frame.T_camera_projector)
+    assert max(rotation, direction) < 1e-6
+    assert np.linalg.norm(found.T_camera_projector[:3, 3]) == pytest.approx(1, abs=1e-12)
+    assert found.inliers.all()
+    assert not found.degeneracies
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 10**6), st.sampled_from(sorted(PROJECTORS)), st.floats(-180, 180), st.floats(0, 2 * np.pi))
+def test_any_side_and_any_roll_of_the_projector_is_found(seed, projector, roll, bearing):
+    offset = (1.2 * np.cos(bearing), 1.2 * np.sin(bearing), -0.1)
+    frame = view(projector, offset=offset, count=300, seed=seed, roll_deg=roll)
+    found = estimate_relative_pose(*frame.arguments, seed=seed)
+    assert max(errors_deg(found.T_camera_projector, frame.T_camera_projector)) < 1e-6
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_noise_and_wrong_coordinates_leave_the_pose_within_a_tenth_of_a_degree_or_so(projector):
+    frame = view(projector).noisy(0.3, seed=3, wrong=0.2)
+    found = estimate_relative_pose(*frame.arguments)
+    rotation, direction = errors_deg(found.T_camera_projector, frame.T_camera_projector)
+    assert rotation < 0.2
+    assert direction < 0.2
+    assert 0.75 < found.inliers.mean() < 0.85
+    assert found.residual_px == pytest.approx(0.3, rel=0.35)  # a fifth of wrong ones widens the median
+
+
+def test_the_seed_alone_decides_the_result():
+    frame = view(count=300).noisy(0.3, seed=1, wrong=0.1)
+    a, b = (estimate_relative_pose(*frame.arguments, seed=5) for _ in range(2))
+    assert np.array_equal(a.T_camera_projector, b.T_camera_projector)
+    assert np.array_equal(a.covariance, b.covariance)
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_the_residual_is_the_distance_from_the_epipolar_curve(projector):
+    """Against the independent formula of geometry.epipolar, which projects the curve and measures in the image."""
+    frame = view(projector, count=200).noisy(0.05, seed=2)
+    rays, _ = ray_pairs(*frame.arguments)
+    T = frame.T_camera_projector
+    ours = sampson(T[:3, :3], T[:3, 3] / np.linalg.norm(T[:3, 3]), rays)
+    theirs = epipolar_residual(
+        Intrinsics.of(frame.camera, torch.float64),
+        torch.eye(4, dtype=torch.float64),
+        torch.from_numpy(frame.uv_camera),
+        Intrinsics.of(frame.projector, torch.float64),
+        torch.from_numpy(T),
+        torch.from_numpy(frame.uv_projector),
+    ).numpy()
+    np.testing.assert_allclose(np.abs(ours), np.abs(theirs), atol=2e-5)
+
+
+@pytest.mark.parametrize("projector", PROJECTORS)
+def test_derivatives_are_those_of_differences(projector):
+    frame = view(projector, count=30).noisy(1.0, seed=4)
+    rays, _ = ray_pairs(*frame.arguments)
+    R, t = frame.T_camera_projector[:3, :3], frame.T_camera_projector[:3, 3]
+    t = t / np.linalg.norm(t)
+    _, J = sampson_jacobian(R, t, rays)
+    h = 1e-6
+    for k in range(5):
+        step = h * np.eye(5)[k]
+        difference = (sampson(*moved(R, t, step), rays) - sampson(*moved(R, t, -step), rays)) / (2 * h)
+        np.testing.assert_allclose(J[:, k], difference, rtol=1e-6, atol=1e-4)
+
+
+def test_the_direction_s_basis_is_square_to_it():
+    for t in np.random.default_rng(0).standard_normal((20, 3)):
+        t = t / np.linalg.norm(t)
+        B = direction_basis(t)
+        np.testing.assert_allclose(np.c_[B, t].T @ np.c_[B, t], np.eye(3), atol=1e-12)
+
+
+# ------------------------------------------------------------------ uncertainty
+
+
+@pytest.mark.parametrize("correlated", [False, True], ids=["independent errors", "errors shared by each cell"])
+def test_the_stated_covariance_is_that_of_the_errors(correlated):
+    """Fifty noisy copies of one frame: squared errors, in units of the covariance, average to 5."""
+    clean = view(count=1500)
+    true_R, true_t = clean.T_camera_projector[:3, :3], clean.T_camera_projector[:3, 3]
+    true_t = true_t / np.linalg.norm(true_t)
+    distances, inside = [], []
+    for k in range(50):
+        frame = clean.noisy(0.25, seed=100 + k, wrong=0.02)
+        if correlated:
+            cell = np.floor(frame.uv_projector / 16).astype(int)
+            shared = np.random.default_rng(k).standard_normal((80, 80, 2)) * 0.4
+            frame = replace(frame, uv_projector=frame.uv_projector + shared[cell[:, 1] % 80, cell[:, 0] % 80])
+        rays, _ = ray_pairs(*frame.arguments)
+        found = fit_epipolar(true_R, true_t, rays)
+        C = covariance(found, rays)
+        w = Rotation.from_matrix(true_R @ found.R.T).as_rotvec()
+        b = direction_basis(found.t).T @ np.cross(found.t, true_t)
+        e = np.concatenate([w, b])
+        distances.append(e @ np.linalg.solve(C, e))
+        inside += [w @ w < np.trace(C[:3, :3]), b @ b < np.trace(C[3:, 3:])]
+    assert 3.5 < np.mean(distances) < 7.0  # 5 +- 0.45 for errors that are exactly normal
+    assert 0.55 < np.mean(inside) < 0.8
+
+
+def test_the_covariance_of_the_twist_has_no_part_along_the_baseline():
+    found = estimate_relative_pose(*view(count=300).noisy(0.3, seed=0).arguments)
+    C, t = found.covariance_of_twist, found.T_camera_projector[:3, 3]
+    assert t @ C[:3, :3] @ t == pytest.approx(0, abs=1e-18)
+    np.testing.assert_allclose(C[3:, 3:], found.covariance[:3, :3])
+    assert np.trace(C[:3, :3]) == pytest.approx(np.trace(found.covariance[3:, 3:]))
+
+
+# ------------------------------------------------------------------ weak cases
+
+
+def test_a_plane_is_named():
+    found = estimate_relative_pose(*view(relief=0.0).noisy(0.3, seed=0).arguments)
+    assert "planar" in kinds(found)
+    assert "tiny baseline" not in kinds(found)
+
+
+def test_a_tiny_baseline_is_named():
+    found = estimate_relative_pose(*view(offset=(0.004, 0.0, 0.0)).noisy(0.3, seed=0).arguments)
+    assert "tiny baseline" in kinds(found)
+    assert "planar" not in kinds(found)
+
+
+def test_an_epipole_in_view_is_named():
+    found = estimate_relative_pose(*view(offset=(0.05, 0.04, -2.0)).noisy(0.3, seed=0).arguments)
+    assert "epipole in view" in kinds(found)
+
+
+def test_a_few_points_in_a_corner_are_named():
+    frame = view().noisy(0.3, seed=0)
+    corner = (frame.uv_projector - frame.uv_projector.min(0) < 200).all(1)
+    few = replace(frame, uv_camera=frame.uv_camera[corner], uv_projector=frame.uv_projector[corner])
+    assert {"few points", "small part of the pattern"} <= kinds(
+        estimate_relative_pose(few.uv_camera[:60], few.uv_projector[:60], few.camera, few.projector)
+    )
+
+
+def test_many_wrong_coordinates_are_named():
+    found = estimate_relative_pose(*view().noisy(0.3, seed=0, wrong=0.45).arguments)
+    assert "many outliers" in kinds(found)
+
+
+def test_a_good_frame_has_no_weakness():
+    assert estimate_relative_pose(*view().noisy(0.3, seed=0, wrong=0.02).arguments).degeneracies == ()
+
+
+def test_every_weakness_says_what_to_do():
+    for offset, relief in (((0.004, 0.0, 0.0), 1.0), ((1.0, 0.2, 0.0), 0.0), ((0.05, 0.04, -2.0), 1.0)):
+        for degeneracy in estimate_relative_pose(
+            *view(offset=offset, relief=relief).noisy(0.3, seed=0).arguments
+        ).degeneracies:
+            assert len(degeneracy.message) > 30
+
+
+# ------------------------------------------------------------------ what cannot be calibrated
+
+
+def test_too_few_correspondences_are_refused():
+    frame = view(count=12)
+    with pytest.raises(RelativePoseError, match=r"12 decoded pixels are too few(.|\n)*remedy: more light"):
+        estimate_relative_pose(*frame.arguments)
+
+
+def test_coordinates_of_another_pattern_are_refused():
+    frame = view(count=1000)
+    uv = np.random.default_rng(99).uniform(0, 800, frame.uv_projector.shape)
+    with pytest.raises(RelativePoseError, match=r"(.|\n)*pattern file is not the one(.|\n)*remedy: check pattern"):
+        estimate_relative_pose(frame.uv_camera, uv, frame.camera, frame.projector)
+
+
+def test_pixels_without_a_ray_are_no_inliers_and_do_no_harm():
+    frame = view("DOE", count=300)
+    uv = frame.uv_projector.copy()
+    uv[:20] = 5000.0  # beyond 90 degrees
+    uv[20:30] = np.nan
+    found = estimate_relative_pose(frame.uv_camera, uv, frame.camera, frame.projector)
+    assert max(errors_deg(found.T_camera_projector, frame.T_camera_projector)) < 1e-6
+    assert not found.inliers[:30].any()
+    assert found.inliers[30:].all()
+
+
+def test_correspondences_are_the_decoded_pixels():
+    coords = np.full((3, 4, 2), np.nan, dtype=np.float32)
+    coords[1, 2] = 5.0, 7.0
+    coords[2, 0, 0] = 1.0  # half a coordinate is none
+    uv_camera, uv_projector = correspondences_of(coords)
+    assert uv_camera.tolist() == [[2.5, 1.5]]
+    assert uv_projector.tolist() == [[5.0, 7.0]]
+
+
+def test_a_known_pose_is_judged_like_a_found_one():
+    frame = view().noisy(0.3, seed=0)
+    found = estimate_relative_pose(*frame.arguments)
+    known = judge_relative_pose(frame.T_camera_projector, *frame.arguments)
+    assert known.residual_px == pytest.approx(found.residual_px, rel=0.05)
+    assert known.sigma_rotation_deg == pytest.approx(found.sigma_rotation_deg, rel=0.3)
+    assert np.linalg.norm(known.T_camera_projector[:3, 3]) == pytest.approx(1)
+    turned = frame.T_camera_projector.copy()
+    turned[:3, :3] = Rotation.from_euler("x", 2, degrees=True).as_matrix() @ turned[:3, :3]
+    assert judge_relative_pose(turned, *frame.arguments).residual_px > 5

@@ -1,0 +1,155 @@
+"""Losses on triangulated points, with a sphere by formula in place of the trained field."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, pose, transform
+from sl_nerfstudio.model.config import SLModelConfig
+from sl_nerfstudio.rendering.direct_losses import direct_losses
+
+RADIUS = 0.5
+PROJECTOR = Intrinsics.of(Device(400, 400, 520.0, 520.0, 200.0, 200.0), torch.float64)
+
+
+class Sphere:
+    """A signed distance field of slope one, or its negative."""
+
+    def __init__(self, radius: float = RADIUS, sign: float = 1.0) -> None:
+        self.radius, self.sign = radius, sign
+
+    def sdf(self, p: Tensor) -> Tensor:
+        return self.sign * (p.norm(dim=-1) - self.radius)
+
+    def sdf_and_gradient(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self.sdf(p), self.sign * p / p.norm(dim=-1, keepdim=True)
+
+
+def model_with(field: Sphere, step: int = 500) -> SimpleNamespace:
+    """What the losses ask a model for."""
+    config = SLModelConfig()
+    config.schedule_iterations = 1000
+    return SimpleNamespace(
+        config=config,
+        field=field,
+        projector=PROJECTOR,
+        noise_px=torch.tensor(0.3),
+        px_per_length=torch.tensor(150.0),
+        step_now=torch.tensor(step),
+    )
+
+
+def projector_pose() -> Tensor:
+    back = torch.tensor([1.0, 0.2, 2.8], dtype=torch.float64)
+    t, back = back, back / back.norm()
+    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), back)
+    right = right / right.norm()
+    return pose(torch.stack([right, torch.linalg.cross(back, right), back], 1), t)
+
+
+@pytest.fixture
+def views() -> tuple[dict, dict]:
+    """Rays from (0, 0, 3) that meet the sphere, and what an errorless decoder says there."""
+    axis = torch.linspace(-0.25, 0.25, 12, dtype=torch.float64)
+    aim = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    o = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(len(aim), 3)
+    d = torch.cat([aim, torch.zeros(len(aim), 1, dtype=torch.float64)], 1) - o
+    d = d / d.norm(dim=-1, keepdim=True)
+    b = (o * d).sum(-1)
+    p = o + (-b - (b**2 - (o * o).sum(-1) + RADIUS**2).sqrt())[:, None] * d
+    T = projector_pose()
+    coords, lit = project(PROJECTOR, transform(inverse(T), p))
+    assert lit.all()
+    outputs = {"origins": o, "directions": d, "T_scene_projector": T.expand(len(o), 4, 4)}
+    return outputs, {"coords": coords, "decoded": torch.ones(len(o), 1, dtype=torch.bool)}
+
+
+def losses(field: Sphere, outputs: dict, batch: dict, step: int = 500) -> dict[str, Tensor]:
+    torch.manual_seed(0)
+    return direct_losses(model_with(field, step), outputs, batch)
+
+
+def kernel(distance: float, step: int) -> float:
+    width = 0.2 * (0.02 / 0.2) ** (step / 1000)
+    return width * (1 - torch.tensor(-distance / width).exp().item())
+
+
+def test_the_true_field_costs_nothing(views):
+    for name, value in losses(Sphere(), *views).items():
+        assert float(value) < 1e-9, name
+
+
+@pytest.mark.parametrize("step", [0, 500, 1000])
+def test_a_field_that_is_off_by_a_constant_costs_the_kernel_of_it(views, step):
+    found = losses(Sphere(RADIUS + 0.02), *views, step)["surface"]
+    assert float(found) == pytest.approx(kernel(0.02, step), rel=1e-6)
+
+
+def test_a_field_inside_out_costs_signs_but_no_surface(views):
+    found = losses(Sphere(sign=-1.0), *views)
+    assert float(found["free_space"]) > 0.01 and float(found["surface"]) < 1e-9
+
+
+class Folded(Sphere):
+    """Three sheets, `half` apart: the middle one at the sphere, inside out; slope one everywhere, and no sign wrong
+    farther than `half` from the sphere."""
+
+    def __init__(self, half: float) -> None:
+        super().__init__()
+        self.half = half
+
+    def _fold(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        x = super().sdf(p)
+        return x, x.abs() < 0.5 * self.half
+
+    def sdf(self, p: Tensor) -> Tensor:
+        x, middle = self._fold(p)
+        return torch.where(middle, -x, x - self.half * x.sign())
+
+    def sdf_and_gradient(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        _, middle = self._fold(p)
+        slope = torch.where(middle, -1.0, 1.0)[:, None] * p / p.norm(dim=-1, keepdim=True)
+        return self.sdf(p), slope
+
+
+@pytest.mark.parametrize("half", [0.002, 0.01, 0.02])
+def test_a_surface_that_is_folded_about_the_measured_points_costs_signs(views, half):
+    found = losses(Folded(half), *views)
+    assert float(found["surface"]) < 1e-9 and float(found["eikonal"]) < 1e-9
+    assert float(found["free_space"]) > 0.05
+
+
+def test_wrong_and_missing_decodings_do_not_count(views):
+    outputs, batch = views
+    coords, decoded = batch["coords"].clone(), batch["decoded"].clone()
+    coords[::3, 1] += 25.0  # across the epipolar lines, which run along x here
+    coords[1::5], decoded[1::5] = float("nan"), False
+    spoilt = losses(Sphere(RADIUS + 0.02), outputs, {"coords": coords, "decoded": decoded})["surface"]
+    assert float(spoilt) == pytest.approx(kernel(0.02, 500), rel=1e-6)
+
+
+def test_without_weights_only_the_slope_is_asked_for(views):
+    model = model_with(Sphere(RADIUS + 0.1))
+    model.config.losses.surface = model.config.losses.free_space = 0.0
+    found = direct_losses(model, *views)
+    assert list(found) == ["eikonal"] and float(found["eikonal"]) < 1e-9
+
+
+def test_the_gradient_by_the_projector_s_pose_is_a_central_difference(views):
+    outputs, batch = views
+
+    def surface(xi: Tensor) -> Tensor:
+        T = exp_se3(xi) @ projector_pose()
+        return losses(
+            Sphere(RADIUS + 0.02), {**outputs, "T_scene_projector": T.expand(len(batch["coords"]), 4, 4)}, batch
+        )["surface"]
+
+    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(surface(xi), xi)
+    step = 1e-6
+    for k, axis in enumerate(torch.eye(6, dtype=torch.float64)):
+        central = (surface(step * axis) - surface(-step * axis)).item() / (2 * step)
+        assert float(gradient[k]) == pytest.approx(central, abs=2e-5 * float(gradient.abs().max()) + 1e-9)
