@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.machine import write_rows
 from benchmarks.scans import made_once
-from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan
@@ -74,8 +74,8 @@ def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, flo
         AdjustmentSettings(),
     )
     seconds = time.monotonic() - begin
-    S = loaded.S_scene_world.inverse()
-    end = compare_poses(S.poses(found.T_scene_camera.numpy()), S.poses(found.T_scene_projector.numpy()), *truth).camera
+    end_poses = found.rig.poses(loaded.S_scene_world.inverse())
+    end = compare_poses(end_poses.T_world_camera, end_poses.T_world_projector, *truth).camera
     before = compare_poses(start.T_world_camera, start.T_world_projector, *truth).camera
     return Row(
         seed,
@@ -85,7 +85,7 @@ def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, flo
         end.translation_rmse,
         end.rotation_rmse_deg,
         int((np.asarray(end.rotation_deg) > 1).sum()),
-        found.verdict.better,
+        found.adjusted,
         seconds,
     )
 

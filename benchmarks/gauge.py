@@ -16,9 +16,10 @@ import numpy as np
 from benchmarks.accuracy import FRAMES
 from benchmarks.machine import write_rows
 from benchmarks.scans import made_once
-from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings, adjust
+from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
@@ -42,7 +43,7 @@ def rules(loaded: LoadedScan) -> dict[str, Rig]:
     """The starting rig, and the adjusted one under each rule."""
     scan, S = loaded.scan, loaded.S_scene_world
     start, prior = scene_rig(scan, S), pose_prior(scan, S, PriorConfig())
-    maps, _ = maps_and_held_out(scan, loaded.samples)
+    maps, _ = maps_and_held_out(scan, loaded.samples, AdjustmentSettings())
     rig = adjust(start, maps, prior, "free", AdjustmentSettings()).rig
     frame = known_baseline(scan.scale.source, len(scan.frames))
     return {

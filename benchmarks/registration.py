@@ -159,14 +159,13 @@ def measure(root: Path, sequence: bool = True) -> Row:
     middle = time.process_time()
     joint = adjust_registered(clouds, found)
     end = time.process_time()
-    baseline = np.linalg.norm(joint.T_world_camera[:, :3, 3] - joint.T_world_projector[:, :3, 3], axis=1)
     return Row(
         root.name,
         scan.projector.model,
         len(clouds),
         calibration,
         pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
-        pose_errors(joint.T_world_camera, baseline, (camera, projector), end - middle),
+        pose_errors(joint.poses.T_world_camera, joint.poses.baseline, (camera, projector), end - middle),
         found.reasons,
         found.remarks,
     )

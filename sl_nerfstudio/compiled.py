@@ -1,8 +1,13 @@
 """Machine code for loops that numpy cannot express; kept on disk, so that it is made once."""
 
 import inspect
+import os
 from collections.abc import Callable
 from typing import Any
+
+# Read by OpenMP when numba first starts its threads: idle ones sleep. By default they spin at the end of every parallel
+# loop, and beside other busy processes a loop then takes many times its share of the machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
 

@@ -7,8 +7,7 @@ from nerfstudio.configs.base_config import LoggingConfig, MachineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
-from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.model import paper_model
+from sl_nerfstudio.model.config import SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device

@@ -1,1 +1,5 @@
-"""."""
+"""All poses, and on request the intrinsics, adjusted together by second-order steps on decoded coordinates.
+
+In: a `Rig` of starting poses, the coordinate images of all frames, a prior with the stated uncertainties, what is free.
+Out: the adjusted `Rig`, its covariance, and how well the intrinsics agree with the captures; facts only, no messages.
+"""

@@ -2,8 +2,8 @@
 
 A look-up fits a paraboloid to the decoded pixels of a small window: this averages the decoding noise,
 gives the derivative with respect to the pixel, and shows where the map is torn (edges, wrong cells).
-(A plane would average better, but on a curved surface it lies beside the map by the same amount
-everywhere, and joint adjustment makes poses of that.)
+(A plane would average better, but on a curved surface it is off by the same amount everywhere, and the
+adjustment would turn that offset into wrong poses.)
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 from sl_nerfstudio.compiled import compiled, compiled_parallel
-
-_HALF_WINDOW = 3  # pixels: 7 x 7 windows
-_MIN_PIXELS = 24  # decoded pixels a window must hold
-_DEGENERATE = 1e-3  # of a pivot, left after elimination: the window's pixels lie on a conic
-_MAX_ROUGHNESS = 2.0  # projector pixels: RMS distance of a window's pixels from their paraboloid
-_USUAL_ROUGHNESS = 3.0  # or this many times the median window's: maps may be noisy all over
-_SAMPLED = 200  # windows a frame, for that median
 
 
 @dataclass(frozen=True)
@@ -42,20 +36,24 @@ class CoordinateMaps:
     offsets: Int[Tensor, "frames"]
     widths: Int[Tensor, "frames"]
     heights: Int[Tensor, "frames"]
+    settings: LookUpSettings
     max_roughness: float  # projector pixels; rougher windows are torn
 
     @staticmethod
-    def of(images: Sequence[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
+    def of(images: Sequence[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
         """From one image per frame; sizes may differ."""
+        settings = settings or LookUpSettings()
         sizes = torch.tensor([i.shape[0] * i.shape[1] for i in images])
         maps = CoordinateMaps(
             values=torch.cat([i.reshape(-1, 2) for i in images]).float(),
             offsets=torch.cumsum(sizes, 0) - sizes,
             widths=torch.tensor([i.shape[1] for i in images]),
             heights=torch.tensor([i.shape[0] for i in images]),
-            max_roughness=_MAX_ROUGHNESS,
+            settings=settings,
+            max_roughness=settings.roughness_px,
         )
-        return replace(maps, max_roughness=max(_MAX_ROUGHNESS, _USUAL_ROUGHNESS * maps._median_roughness()))
+        usual = settings.roughness_medians * maps._median_roughness()
+        return replace(maps, max_roughness=max(settings.roughness_px, usual))
 
     @property
     def frames(self) -> int:
@@ -97,6 +95,7 @@ class CoordinateMaps:
             self.heights.numpy(),
             frame.numpy(),
             uv_camera.detach().double().numpy(),
+            (self.settings.half_window, self.settings.least_pixels, self.settings.least_pivot),
             fit,
             roughness,
         )
@@ -105,7 +104,7 @@ class CoordinateMaps:
     def _median_roughness(self) -> float:
         """Of windows all over the frames; 0 where nothing is decoded."""
         generator = torch.Generator().manual_seed(0)
-        drawn = [self.draw(k, _SAMPLED, generator) for k in range(self.frames)]
+        drawn = [self.draw(k, self.settings.sampled_windows, generator) for k in range(self.frames)]
         frame = torch.repeat_interleave(torch.arange(self.frames), torch.tensor([len(d) for d in drawn]))
         _, roughness = self._fit(frame, torch.cat(drawn))
         found = roughness[torch.isfinite(roughness)]
@@ -121,8 +120,9 @@ class CoordinateMaps:
 
 
 @compiled_parallel
-def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, roughness):
+def _fit_paraboloids(values, offsets, widths, heights, frame, uv, limits, fit, roughness):
     """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
+    half_window, least_pixels, least_pivot = limits
     for k in numba.prange(len(frame)):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]
         w, h = widths[f], heights[f]
@@ -133,8 +133,8 @@ def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, roughness
         basis = np.ones(6)
         n = aa = 0.0
         origin_a = origin_b = np.nan
-        for y in range(max(row - _HALF_WINDOW, 0), min(row + _HALF_WINDOW + 1, h)):
-            for x in range(max(column - _HALF_WINDOW, 0), min(column + _HALF_WINDOW + 1, w)):
+        for y in range(max(row - half_window, 0), min(row + half_window + 1, h)):
+            for x in range(max(column - half_window, 0), min(column + half_window + 1, w)):
                 pixel = offsets[f] + y * w + x
                 a, b = float(values[pixel, 0]), float(values[pixel, 1])
                 if not (np.isfinite(a) and np.isfinite(b)):
@@ -151,10 +151,10 @@ def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, roughness
                     A[i, 7] += basis[i] * b
                 n += 1.0
                 aa += a * a + b * b
-        if n < _MIN_PIXELS:
+        if n < least_pixels:
             continue
         right = A[:, 6:].copy()
-        if not _solve(A):
+        if not _solve(A, least_pivot):
             continue
         rough2 = aa
         for i in range(6):
@@ -166,14 +166,14 @@ def _fit_paraboloids(values, offsets, widths, heights, frame, uv, fit, roughness
 
 
 @compiled
-def _solve(A):
+def _solve(A, least_pivot):
     """Cholesky of the lower triangle of A[:, :6], then A[:, 6:] <- solution. False where the window is degenerate."""
     for j in range(6):
         d = A[j, j]
         scale = d
         for i in range(j):
             d -= A[j, i] * A[j, i]
-        if not d > _DEGENERATE * scale:
+        if not d > least_pivot * scale:
             return False
         A[j, j] = np.sqrt(d)
         for i in range(j + 1, 6):

@@ -1,10 +1,10 @@
-"""How well refined poses are known.
+"""Covariance of the adjusted poses.
 
-The inverse of the normal matrix supposes that residuals err independently. Those of one corner of one image do not: a
-lens that is modelled a little wrong, or a systematic error of the decoding, pushes all of them one way. So residuals
-are summed over blocks of each image, and the spread of those sums tells how far the poses may be off (the
-cluster-robust "sandwich" estimate: Liang and Zeger, Biometrika 1986). Whichever of the two is larger is stated.
-Intrinsics are uncertain, too (`intrinsics_doubt`).
+The inverse of the normal matrix assumes independent residuals. Those of one corner of one image are not independent: a
+lens that is modelled slightly wrong, or a systematic error of the decoding, pushes all of them the same way. So the
+gradient is summed over blocks of each image, and the spread of those sums gives a second estimate (the cluster-robust
+"sandwich": Liang and Zeger, Biometrika 1986). The larger of the two is stated. Intrinsics are uncertain, too
+(`self_calibration`).
 """
 
 from dataclasses import dataclass
@@ -16,21 +16,15 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
+from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.residuals import (
-    Anchors,
-    Linearisation,
-    NormalEquations,
-    Observations,
-    Rig,
-    normal_equations,
-)
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
-_BLOCKS = 4  # to a side of the decoded part of an image
 _EXACT = 1e-9  # stands for an uncertainty of zero
 
 
@@ -43,14 +37,15 @@ class Evidence:
     rows: Observations
     linear: Linearisation
     kernel: Kernel
+    image_blocks: int  # along each side of the decoded part of an image
 
 
 @dataclass(frozen=True)
 class PoseCovariance:
-    """What is known at the result."""
+    """Covariance of the poses at the result, and what the residuals say about the intrinsics."""
 
-    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho); the freedom of the whole scene taken out
-    intrinsics: SelfCalibration | None  # None where nothing was refined
+    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho); the gauge is projected out
+    intrinsics: SelfCalibration | None  # None where nothing was adjusted
 
 
 def pose_covariance(
@@ -58,7 +53,7 @@ def pose_covariance(
 ) -> PoseCovariance:
     """Second moments of the errors of poses that were found with the present intrinsics.
 
-    `B` spans what was refined, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. What
+    `B` spans the free parameters, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. What
     the poses would still move if the intrinsics followed the captures counts as an error, too.
     """
     e, n = evidence, evidence.rig.frames
@@ -80,7 +75,7 @@ def pose_covariance(
     formal = noise**2 * P @ B @ H_inverse @ B.T @ P.T
     sums = _block_sums(e, equations, *weights) @ B
     blocks = int((sums != 0).any(1).sum())
-    free = max(blocks - B.shape[1], blocks / 4)  # blocks that the fit of the poses has not used up
+    free = max(blocks - B.shape[1], blocks / 4)  # degrees of freedom that the fit of the poses leaves
     spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
     robust = P @ B @ H_inverse @ spread @ H_inverse @ B.T @ P.T
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
@@ -102,8 +97,8 @@ def _block_sums(
     """Gradient of the poses from each block of each image, depths eliminated."""
     n, r, size = e.rig.frames, e.linear.residuals, e.linear.unknowns
     own_block, cross_block = _blocks_of(e)
-    out = torch.zeros(n * _BLOCKS**2 * size, dtype=torch.float64)
-    pull = torch.zeros(n * _BLOCKS**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
+    out = torch.zeros(n * e.image_blocks**2 * size, dtype=torch.float64)
+    pull = torch.zeros(n * e.image_blocks**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
     every = torch.arange(len(e.anchors.frame))
     own, cross = own_weight[:, None] * r.own, cross_weight[:, None] * r.cross
     for block, J, J_depth, wr, cols, anchor in (
@@ -129,8 +124,8 @@ def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]
 
     def block(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
         share = (uv - low[frame]) / (high - low).clamp_min(1e-9)[frame]
-        cell = (share * _BLOCKS).nan_to_num().clamp(0, _BLOCKS - 1).long()
-        return (frame * _BLOCKS + cell[:, 0]) * _BLOCKS + cell[:, 1]
+        cell = (share * e.image_blocks).nan_to_num().clamp(0, e.image_blocks - 1).long()
+        return (frame * e.image_blocks + cell[:, 0]) * e.image_blocks + cell[:, 1]
 
     return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
 
@@ -142,7 +137,7 @@ def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndar
 
 
 def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
-    """`noise^2 / H`, with the freedom of the whole scene projected out: right if residuals err independently."""
+    """`noise^2 / H` with the gauge projected out: right if residuals are independent."""
     if B.shape[1] == 0:
         return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
     P = _without_gauge(rig, len(B))
@@ -150,7 +145,7 @@ def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "u
 
 
 def _without_gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns unknowns"]:
-    """Projection of steps of the poses (and of what follows them) that takes out what moves the whole scene."""
+    """Projection of steps of the poses (and of unknowns after them) that removes what moves the whole scene."""
     G = torch.zeros(unknowns, 7, dtype=torch.float64)
     G[: 12 * rig.frames] = gauge_directions(rig)
     return torch.eye(unknowns, dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)

@@ -1,4 +1,9 @@
-"""Never worse: refined poses are kept only if pixels that took no part in refining them agree better."""
+"""Are adjusted poses better? Pixels that took no part in the adjustment decide, by a paired comparison.
+
+Each held-out pixel has the same residuals under both sets of poses, so their differences are compared with zero, not
+two means with each other. Residuals within a small block of an image depend on each other: blocks are the independent
+samples from which the standard error follows.
+"""
 
 from dataclasses import dataclass
 
@@ -8,12 +13,11 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.observations import observe
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, residuals_of
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
-
-_FRAMES_PER_ANCHOR = 8
-_ROUNDING = 1e-6  # a smaller gain is none
 
 
 @dataclass(frozen=True)
@@ -23,44 +27,78 @@ class HeldOutPixels:
     frame: Int[Tensor, "n"]
     uv_camera: Float[Tensor, "n 2"]
     uv_projector: Float[Tensor, "n 2"]
+    block: Int[Tensor, "n"]  # number of the block of pixels, over all frames
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Robust mean residual of held-out pixels, in projector pixels, before and after."""
+    """How well held-out pixels agree with two sets of poses; robust residuals in projector pixels."""
 
-    before_px: float
+    before_px: float  # robust RMS residual with the poses before
     after_px: float
+    difference: float  # mean of the paired differences of squared robust residuals, after minus before, px^2
+    standard_error: float  # of that mean; infinite for fewer than two blocks
+    standard_errors: float  # by which the difference must lie below zero
 
     @property
     def better(self) -> bool:
-        """Whether the refined poses are to be kept."""
-        return self.after_px < (1 - _ROUNDING) * self.before_px
+        """Whether the poses after are to be kept: better by more than chance."""
+        return self.difference < -self.standard_errors * self.standard_error
 
 
 def cross_validate(
-    before: Rig, after: Rig, held_out: HeldOutPixels, maps: CoordinateMaps, width_px: float
+    before: Rig,
+    after: Rig,
+    held_out: HeldOutPixels,
+    maps: CoordinateMaps,
+    noise_px: float,
+    settings: AdjustmentSettings | None = None,
 ) -> CrossValidation:
-    """Judge two sets of poses by the same pixels and the same pairs of frames.
+    """Compare two sets of poses on the same pixels and the same pairs of frames.
 
-    A residual counts as sqrt(r^2 / (1 + r^2 / width^2)): a wrong decoding costs `width_px` whatever the poses.
+    A residual counts as r^2 / (1 + r^2 / width^2): a wrong decoding costs width^2 whatever the poses. `noise_px` is the
+    decoding noise of one look-up.
     """
-    generator = torch.Generator().manual_seed(0)
+    settings = settings or AdjustmentSettings()
+    s = settings.cross_validation
+    width = max(s.width_noises * noise_px, s.least_width_px)
+    generator = torch.Generator().manual_seed(settings.seed)
     pairs = []
     for rig in (before, after):
-        seen = observe(rig, _anchors(rig, held_out), maps, _FRAMES_PER_ANCHOR, 2 * width_px, generator)
+        anchors = _anchors(rig, held_out)
+        seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator)
         pairs.append(torch.stack([seen.anchor, seen.frame]))
-    rows = torch.unique(torch.cat(pairs, 1), dim=1)
-    observations = Observations(rows[0], rows[1])
-    return CrossValidation(*(_mean_residual(rig, held_out, observations, maps, width_px) for rig in (before, after)))
+    rows = Observations(*torch.unique(torch.cat(pairs, 1), dim=1))
+    block = torch.cat([held_out.block, held_out.block[rows.anchor]])
+    losses = [_robust_squares(rig, held_out, rows, maps, width) for rig in (before, after)]
+    difference, error = mean_and_error(losses[1] - losses[0], block)
+    first, second = (float(loss.mean().sqrt()) for loss in losses)
+    return CrossValidation(first, second, difference, error, s.standard_errors)
 
 
-def _mean_residual(rig: Rig, held_out: HeldOutPixels, rows: Observations, maps: CoordinateMaps, width: float) -> float:
+def _robust_squares(
+    rig: Rig, held_out: HeldOutPixels, rows: Observations, maps: CoordinateMaps, width: float
+) -> Float[Tensor, "residuals"]:
+    """Robust squares of the own residuals, then of the cross residuals; width^2 where there is none."""
     r = residuals_of(rig, _anchors(rig, held_out), rows, maps)
     own2 = torch.nan_to_num((r.own**2).sum(-1), nan=float("inf"))
     cross2 = torch.where(r.cross_valid, (r.cross**2).sum(-1), torch.full_like(r.cross[:, 0], float("inf")))
     r2 = torch.cat([own2, torch.nan_to_num(cross2, nan=float("inf"))])
-    return float((1 / (1 / r2.clamp_min(1e-12) + 1 / width**2)).mean().sqrt())
+    return 1 / (1 / r2.clamp_min(1e-12) + 1 / width**2)
+
+
+def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple[float, float]:
+    """Mean, and its standard error where the values of a block may depend on each other in any way.
+
+    The error of a ratio of sums over blocks (Cochran, Sampling Techniques, 1977, section 6.3).
+    """
+    mean = values.mean()
+    _, index = torch.unique(block, return_inverse=True)
+    blocks = int(index.max()) + 1 if len(index) else 0
+    if blocks < 2:
+        return float(mean), float("inf")
+    sums = torch.zeros(blocks, dtype=values.dtype).index_add(0, index, values - mean)
+    return float(mean), float((blocks / (blocks - 1) * (sums**2).sum()).sqrt() / len(values))
 
 
 def _anchors(rig: Rig, held_out: HeldOutPixels) -> Anchors:
@@ -68,5 +106,6 @@ def _anchors(rig: Rig, held_out: HeldOutPixels) -> Anchors:
     T = rig.T_camera_projector[held_out.frame]
     d_projector = (T[:, :3, :3] @ unproject(rig.projector, held_out.uv_projector)[..., None]).squeeze(-1)
     depth, _ = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
-    # no map around a held-out pixel, so no normal: towards the camera is near enough to choose who else sees it
+    # No map surrounds a held-out pixel, so there is no normal; "towards the camera" is near enough to choose who sees
+    # it.
     return Anchors(held_out.frame, d_camera, held_out.uv_projector, torch.nan_to_num(depth, nan=1.0), -d_camera)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.se3 import adjoint, inverse, pose
 
 RefinePoses = Literal["free", "rigid-rig", "known-rig", "static-projector", "off"]

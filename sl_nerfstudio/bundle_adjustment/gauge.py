@@ -1,8 +1,8 @@
-"""The seven degrees of freedom no measurement fixes: where the world is, and how long a unit is.
+"""The seven degrees of freedom that no measurement fixes: where the world is, and how long a unit is.
 
-After an adjustment the whole scene is moved by one similarity, which changes no residual: the scale
-goes back to what is known of it (a baseline, or all lengths of the starting poses), or to the geometric mean
-of the baselines where nothing is; position and orientation to the least-squares agreement with the starting poses.
+After an adjustment the whole scene is moved by one similarity, which changes no residual. The scale returns to what is
+known of it (a baseline, or all lengths of the starting poses), else to the geometric mean of the baselines; position
+and orientation return to the best agreement, in least squares, with the starting poses.
 """
 
 import math
@@ -13,16 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.se3 import pose, rotate
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
 _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
-
-
-def baselines(rig: Rig) -> Float[Tensor, "frames"]:
-    """Distance between camera and projector of every frame."""
-    return rig.T_camera_projector[:, :3, 3].norm(dim=-1)
 
 
 def known_baseline(source: str, frames: int) -> int | None:
@@ -33,16 +28,16 @@ def known_baseline(source: str, frames: int) -> int | None:
 
 def baseline_scale(start: Rig, rig: Rig, frame: int | None) -> float:
     """The factor that gives `rig` the baseline that `frame` has in `start`; None: the geometric mean of all."""
-    log_ratio = torch.log(baselines(start) / baselines(rig))
+    log_ratio = torch.log(start.baseline / rig.baseline)
     return float(torch.exp(log_ratio.mean() if frame is None else log_ratio[frame]))
 
 
 def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
     """The factor for which all lengths of `rig`, between frames and within them, agree best with the starting poses.
 
-    The maximum of the prior over similarities. A turn of the projectors against their cameras passes for a longer
-    baseline (by distance^2 / baseline: at 270 mm and 26 mm, 0.1 degree is 2 %), so where the places of the frames
-    are known, too, they tell the scale better.
+    The maximum of the prior over similarities. A small rotation of the projectors against their cameras looks like a
+    longer baseline (by distance^2 / baseline: at 270 mm and 26 mm, 0.1 degree is 2 %). Where the positions of the
+    frames are known, too, they determine the scale better.
     """
     scale = baseline_scale(start, rig, None)
     for _ in range(_MOST_STEPS):
@@ -58,7 +53,7 @@ def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
 
 def restore(start: Rig, rig: Rig, scale: float) -> Rig:
     """The adjusted rig, `scale` times as large, placed and turned as the start is."""
-    scaled = _scaled(rig, scale)
+    scaled = rig.scaled(scale)
     ahead = start.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
     S = fit_similarity(_axes_points(scaled, ahead).numpy(), _axes_points(start, ahead).numpy(), with_scale=False)
     T = pose(torch.from_numpy(S.R), torch.from_numpy(S.t))
@@ -66,20 +61,13 @@ def restore(start: Rig, rig: Rig, scale: float) -> Rig:
 
 
 def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
-    """Increments (delta, rho) that move the whole scene by a similarity: no residual feels them."""
+    """Increments (delta, rho) that move the whole scene by a similarity: they change no residual."""
     n = rig.frames
     out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
     out[0, :, :, :6] = torch.eye(6, dtype=torch.float64)
     out[0, :, :3, 6] = rig.T_world_camera[:, :3, 3]
     out[1, :, :3, 6] = rig.T_camera_projector[:, :3, 3]
     return out.reshape(12 * n, 7)
-
-
-def _scaled(rig: Rig, scale: float) -> Rig:
-    camera, relative = rig.T_world_camera.clone(), rig.T_camera_projector.clone()
-    camera[:, :3, 3] *= scale
-    relative[:, :3, 3] *= scale
-    return Rig(rig.camera, rig.projector, camera, relative)
 
 
 def _axes_points(rig: Rig, distance: Float[Tensor, "frames 1"]) -> Float[Tensor, "n 3"]:

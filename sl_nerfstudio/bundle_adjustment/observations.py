@@ -1,4 +1,4 @@
-"""Which decoded pixels the joint adjustment looks at, and in which other frames."""
+"""Which decoded pixels take part in the bundle adjustment, and in which other frames they are looked up."""
 
 from dataclasses import fields
 
@@ -7,12 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
-
-_GRAZING = 0.1  # cosine between a surface and a ray that may still reach it
 
 
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
@@ -52,13 +51,14 @@ def observe(
     maps: CoordinateMaps,
     per_anchor: int,
     gate_px: float,
+    least_cosine: float,
     generator: torch.Generator,
     around: int | None = None,
 ) -> Observations:
     """For every anchor up to `per_anchor` other frames that decoded something near it, within `gate_px` of it.
 
-    Devices behind the anchor's surface are left out: they see, or light, another side of the object. With `around`,
-    only what one frame takes part in.
+    Frames whose camera or projector is behind the anchor's surface, or sees it at a cosine below `least_cosine`, are
+    left out: they see, or light, another side of the object. With `around`, only what one frame takes part in.
     """
     chosen = []
     devices = (rig.T_world_camera, rig.T_world_projector)
@@ -72,7 +72,7 @@ def observe(
         uv_camera, in_front = project(rig.camera[j], p_j)
         expected, lit = project(rig.projector, transform(inverse(rig.T_camera_projector[j]), p_j))
         miss = (maps.decoded_at(frame, uv_camera) - expected).norm(dim=-1)
-        faces = [_cosine(normal[anchor], T[j, :3, 3] - p_world[anchor]) > _GRAZING for T in devices]
+        faces = [_cosine(normal[anchor], T[j, :3, 3] - p_world[anchor]) > least_cosine for T in devices]
         keep = in_front & lit & faces[0] & faces[1] & (miss < gate_px)  # False where nothing is decoded
         chosen.append(torch.stack([anchor[keep], frame[keep]]))
     rows = torch.cat(chosen, 1)

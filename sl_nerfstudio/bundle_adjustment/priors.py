@@ -1,4 +1,4 @@
-"""What is known of the poses before any residual is looked at."""
+"""What is known of poses and intrinsics before any residual is computed."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 
-INTRINSICS_SIGMA = 0.005  # where nobody says how well the intrinsics are known
-_INDEPENDENT_ROWS = 50  # of a frame, while residuals come from wrong poses rather than from noise
+INTRINSICS_SIGMA = 0.005  # share of the focal length, where nobody says how well the intrinsics are known
 
 
 @dataclass(frozen=True)
@@ -25,35 +24,69 @@ class PosePrior:
     intrinsics: float = INTRINSICS_SIGMA  # focal lengths and principal points, as a share of the focal length
     intrinsics_change: IntrinsicsChange = UNCHANGED  # how far the devices are from what was stated of them
 
+    @property
+    def sigma(self) -> Float[Tensor, "frames 12"]:
+        """1 sigma of every frame's delta and rho: translation xyz, rotation xyz each."""
+        parts = (self.frame_translation, self.frame_rotation, self.relative_translation, self.relative_rotation)
+        return torch.stack(parts, 1).repeat_interleave(3, 1)
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """The prior's part of the objective: squared departures from the starting poses in units of their sigma.
+
+    `weight` brings it to the unit of the data's part (px^2).
+    """
+
+    prior: PosePrior
+    start: Rig
+    weight: float
+
+    def energy(self, rig: Rig) -> float:
+        """The term itself; half its gradient is that of `equations`."""
+        squares = torch.cat([_frame_departure(self.start, rig), _relative_departure(self.start, rig)], 1) ** 2
+        return self.weight * float((squares / self.prior.sigma**2).sum())
+
+    def equations(self, rig: Rig) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
+        """Information matrix and gradient by the increments (delta, rho) of all frames."""
+        H, g = prior_equations(self.prior, self.start, rig)
+        return self.weight * H, self.weight * g
+
 
 def prior_equations(
     prior: PosePrior, start: Rig, rig: Rig
 ) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
-    """Information matrix and gradient of the departure from the starting poses."""
+    """Information matrix and gradient of the departure from the starting poses, by (delta, rho) of all frames."""
     n = rig.frames
-    delta = log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
-    weight = torch.cat([(1 / s**2)[:, None].expand(n, 3) for s in (prior.frame_translation, prior.frame_rotation)], 1)
-    # relative: position and rotation of the projector in camera axes
+    weight = 1 / prior.sigma**2
+    w_frame, w_relative = weight[:, :6], weight[:, 6:]
     t = rig.T_camera_projector[:, :3, 3]
-    e = torch.cat(
-        [
-            t - start.T_camera_projector[:, :3, 3],
-            log_so3(rig.T_camera_projector[:, :3, :3] @ start.T_camera_projector[:, :3, :3].transpose(1, 2)),
-        ],
-        1,
-    )
     eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
     J = torch.cat([torch.cat([eye, -hat(t)], -1), torch.cat([torch.zeros_like(eye), eye], -1)], -2)
-    w_relative = torch.cat(
-        [(1 / s**2)[:, None].expand(n, 3) for s in (prior.relative_translation, prior.relative_rotation)], 1
-    )
     JtW = J.transpose(1, 2) * w_relative[:, None, :]
     H = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-    H[: 6 * n, : 6 * n] = torch.diag(weight.reshape(-1))
+    H[: 6 * n, : 6 * n] = torch.diag(w_frame.reshape(-1))
     H[6 * n :, 6 * n :] = torch.block_diag(*(JtW @ J))
-    return H, torch.cat([(weight * delta).reshape(-1), (JtW @ e[..., None]).reshape(-1)])
+    g_frame = w_frame * _frame_departure(start, rig)
+    g_relative = (JtW @ _relative_departure(start, rig)[..., None]).squeeze(-1)
+    return H, torch.cat([g_frame.reshape(-1), g_relative.reshape(-1)])
 
 
-def rough_trust(noise: float, rows: float) -> float:
-    """Weight of the prior beside `rows` residuals of a frame while those are made by wrong poses, and err together."""
-    return noise**2 * max(rows / _INDEPENDENT_ROWS, 1.0)
+def _frame_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
+    """Increment that leads each frame as a whole from its start to where it is."""
+    return log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
+
+
+def _relative_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
+    """Change of each projector's position in camera axes, and its rotation vector."""
+    now, then = rig.T_camera_projector, start.T_camera_projector
+    turn = log_so3(now[:, :3, :3] @ then[:, :3, :3].transpose(1, 2))
+    return torch.cat([now[:, :3, 3] - then[:, :3, 3], turn], 1)
+
+
+def rough_weight(noise: float, residuals_per_frame: float, independent: float) -> float:
+    """Weight of the prior while residuals come from wrong poses rather than from noise.
+
+    The residuals of a frame then err together: they count as `independent` measurements, however many they are.
+    """
+    return noise**2 * max(residuals_per_frame / independent, 1.0)

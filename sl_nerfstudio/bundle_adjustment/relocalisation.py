@@ -1,6 +1,6 @@
-"""Frames that ended in a wrong minimum while the others agreed: each is led home by itself.
+"""Frames that ended in a wrong minimum while the others agreed: each is placed again by itself.
 
-With all other frames held, a frame is six unknowns and thousands of residuals: from a wide kernel, and from a few
+With all other frames held, a frame is six unknowns and thousands of residuals. From a wide kernel, and from a few
 places around where it stands, it finds the surface that the others agree on.
 """
 
@@ -12,65 +12,60 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, PriorTerm, lm_step
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations, rough_trust
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, rough_weight
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed
-
-_BLIND, _HAIR = 0.75, 0.95  # of the share of residuals within the noise that frames have in the middle
-_BETTER = 0.02  # more residuals within the noise, as a share: a better place
-_INLIER = 5.0  # times the noise
-_STEPS_AS_A_WHOLE, _STEPS = 10, 10
-_ANCHORS = 200  # of each frame
-_ROWS = 6000  # at most, of one frame with all others
-_TRIES = 12  # places from which a frame is led home
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """What residuals are measured with."""
+class _Problem:
+    """What does not change during a search."""
 
     anchors: Anchors
     maps: CoordinateMaps
+    start: Rig
+    prior: PosePrior
     noise: float
     generator: torch.Generator
-    steps_with_projector: int  # after those of the frame as a whole
+    settings: AdjustmentSettings
+    projector_steps: int  # after those of the frame as a whole
 
-    def shares(self, rig: Rig, rows: Observations) -> Float[Tensor, "frames"]:
-        """Share of residuals within the noise, of what each frame takes part in; NaN where that is nothing."""
+    def support(self, rig: Rig, rows: Observations) -> Float[Tensor, "frames"]:
+        """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
         r = residuals_of(rig, self.anchors, rows, self.maps)
-        inlier = r.cross.norm(dim=-1) < _INLIER * self.noise
+        inlier = r.cross.norm(dim=-1) < self.settings.relocalisation.inlier_noises * self.noise
         out = torch.full((rig.frames,), float("nan"), dtype=torch.float64)
         for k in range(rig.frames):
-            mine = r.cross_valid & self.part_of(rows, k)
+            mine = r.cross_valid & ((self.anchors.frame[rows.anchor] == k) | (rows.frame == k))
             if mine.any():
                 out[k] = inlier[mine].double().mean()
         return out
 
-    def part_of(self, rows: Observations, k: int) -> Bool[Tensor, "rows"]:
-        """Rows that a frame takes part in."""
-        return (self.anchors.frame[rows.anchor] == k) | (rows.frame == k)
-
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
         """Every anchor in every other frame that may see it."""
-        return observe(rig, self.anchors, self.maps, rig.frames, float("inf"), self.generator, around)
+        return observe(
+            rig, self.anchors, self.maps, rig.frames, float("inf"), self.settings.least_cosine, self.generator, around
+        )
 
 
-def least_share(shares: Float[Tensor, "frames"]) -> float:
-    """The share of residuals within the noise from which on a frame is where it belongs.
+def least_support(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> float:
+    """The support from which on a frame counts as placed.
 
-    Four robust sigmas below the frames in the middle, but neither hair-splitting nor blind.
+    Some robust standard deviations below the median frame, but always between two shares of its support.
     """
-    middle = shares.nanmedian()
-    sigma = 1.4826 * (shares - middle).abs().nanmedian()
-    return float((middle - 4 * sigma).clamp(_BLIND * middle, _HAIR * middle))
+    middle = support.nanmedian()
+    sigma = 1.4826 * (support - middle).abs().nanmedian()
+    return float((middle - settings.sigmas * sigma).clamp(settings.least_share * middle, settings.most_share * middle))
 
 
-def find_lost_frames(shares: Float[Tensor, "frames"]) -> Int[Tensor, "strays"]:
-    """Frames with far fewer residuals within the noise than most, the best of them first."""
-    astray = (shares < least_share(shares)).nonzero().squeeze(-1)
-    return astray[shares[astray].argsort(descending=True)]
+def find_lost_frames(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> Int[Tensor, "lost"]:
+    """Frames with far less support than most, the best of them first."""
+    lost = (support < least_support(support, settings)).nonzero().squeeze(-1)
+    return lost[support[lost].argsort(descending=True)]
 
 
 def relocalise(
@@ -81,70 +76,79 @@ def relocalise(
     refine: RefinePoses,
     noise: float,
     generator: torch.Generator,
+    settings: AdjustmentSettings,
 ) -> Rig:
-    """The rig with strays moved to where the other frames want them; who finds no better place stays.
+    """The rig with lost frames moved to where the other frames support them; a frame without a better place stays.
 
-    A stray is looked for around where it stands, as far as the prior is uncertain of frames, with the relative pose it
-    started with: what was made of that in a wrong place is worth nothing. (Where the mode leaves projectors free.)
+    A lost frame is searched around where it stands, as far as the prior is uncertain. Where projectors are free, it
+    starts with the relative pose it had at first: what was made of that in a wrong place is worth nothing.
     """
-    alone = refine == "free"
-    scene = _Scene(place_anchors(rig, maps, _ANCHORS, generator), maps, noise, generator, _STEPS if alone else 0)
-    shares = scene.shares(rig, scene.rows(rig))
-    strays = find_lost_frames(shares)
-    settled = ~torch.isin(torch.arange(rig.frames), strays) & shares.isfinite()
-    enough = least_share(shares)
-    for k in strays.tolist():
-        best, best_share = rig, float(shares[k]) + _BETTER
-        sigma = torch.cat([prior.frame_translation[k].expand(3), prior.frame_rotation[k].expand(3)])
-        for attempt in range(_TRIES):
+    s = settings.relocalisation
+    relative_free = refine == "free"
+    anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
+    problem = _Problem(
+        anchors, maps, start, prior, noise, generator, settings, s.projector_steps if relative_free else 0
+    )
+    support = problem.support(rig, problem.rows(rig))
+    lost = find_lost_frames(support, s)
+    placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
+    enough = least_support(support, s)
+    for k in lost.tolist():
+        best, best_support = rig, float(support[k]) + s.least_gain
+        for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)
             if attempt:
-                delta[k] = sigma * torch.randn(6, generator=generator, dtype=torch.float64)
+                delta[k] = prior.sigma[k, :6] * torch.randn(6, generator=generator, dtype=torch.float64)
             relative = rig.T_camera_projector.clone()
-            if alone:
+            if relative_free:
                 relative[k] = start.T_camera_projector[k]
             there = replace(rig, T_camera_projector=relative).moved(delta, torch.zeros_like(delta))
-            found, share = _settle(there, k, settled, start, prior, scene)
-            if share > best_share:
-                best, best_share = found, share
-            if best_share > enough:
+            found, found_support = _place_one(there, k, placed, problem)
+            if found_support > best_support:
+                best, best_support = found, found_support
+            if best_support > enough:
                 break
         rig = best
-        settled[k] = best_share > enough
+        placed[k] = best_support > enough
     return rig
 
 
-def _settle(
-    rig: Rig, k: int, settled: Bool[Tensor, "frames"], start: Rig, prior: PosePrior, scene: _Scene
-) -> tuple[Rig, float]:
-    """Move frame k alone, as a whole, then its projector too; and the share of its residuals within the noise."""
-    n = rig.frames
+def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Problem) -> tuple[Rig, float]:
+    """Move frame k alone, as a whole, then its projector too; and the support it has then."""
+    settings, n = problem.settings, rig.frames
+    s = settings.relocalisation
     B = torch.zeros(12 * n, 12, dtype=torch.float64)
     B[6 * k : 6 * k + 6, :6] = B[6 * (n + k) : 6 * (n + k) + 6, 6:] = torch.eye(6, dtype=torch.float64)
-    allowed = settled.clone()
+    allowed = placed.clone()
     allowed[k] = True
     width = torch.full((n,), float("inf"), dtype=torch.float64)
-    state = LMState(rig, scene.anchors)
-    for step in range(_STEPS_AS_A_WHOLE + scene.steps_with_projector):
-        if step % 3 == 0:
-            rows = _rows_of(state.rig, k, allowed, scene)
-        linear = linearise(state.rig, state.anchors, rows, scene.maps)
+    state = LMState(rig, problem.anchors, settings.steps.damping)
+    rows = _rows_of(rig, k, allowed, problem)
+    for step in range(s.frame_steps + problem.projector_steps):
+        if step and step % s.observe_every == 0:
+            rows = _rows_of(state.rig, k, allowed, problem)
+        linear = linearise(state.rig, state.anchors, rows, problem.maps)
         if not linear.residuals.cross_valid.any():
             return rig, 0.0
-        pair = rows.pairs(scene.anchors)
-        median = frame_medians(linear.residuals, pair, n)[k]
-        width = narrowed(width, torch.full_like(width, 2 * float(median))).clamp_min(3 * scene.noise)
-        H, g = prior_equations(prior, start, state.rig)
-        trust = rough_trust(scene.noise, float(linear.residuals.cross_valid.sum()))
-        kernel = Kernel(width, scene.anchors.frame, pair)
-        free = B[:, :6] if step < _STEPS_AS_A_WHOLE else B
-        state = lm_step(state, linear, rows, scene.maps, kernel, free, PriorTerm(trust * H, trust * g))
-    return state.rig, float(scene.shares(state.rig, _rows_of(state.rig, k, allowed, scene))[k].nan_to_num())
+        pair = rows.pairs(problem.anchors)
+        target = settings.kernel.medians * float(frame_medians(linear.residuals, pair, n)[k])
+        width = narrowed(width, torch.full_like(width, target), settings.kernel)
+        width = width.clamp_min(settings.kernel.noises * problem.noise)
+        residuals = float(linear.residuals.cross_valid.sum())
+        weight = rough_weight(problem.noise, residuals, settings.independent_residuals)
+        term = PriorTerm(problem.prior, problem.start, weight)
+        kernel = Kernel(width, problem.anchors.frame, pair)
+        free = B[:, :6] if step < s.frame_steps else B
+        state = lm_step(state, linear, rows, problem.maps, kernel, term, free, settings.steps)
+    support = problem.support(state.rig, _rows_of(state.rig, k, allowed, problem))[k]
+    return state.rig, float(support.nan_to_num())
 
 
-def _rows_of(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], scene: _Scene) -> Observations:
-    rows = scene.rows(rig, k)
-    mine = allowed[scene.anchors.frame[rows.anchor]] & allowed[rows.frame]
+def _rows_of(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], problem: _Problem) -> Observations:
+    """Residuals of frame k with the frames that are allowed, some of them where there are too many."""
+    rows = problem.rows(rig, k)
+    mine = allowed[problem.anchors.frame[rows.anchor]] & allowed[rows.frame]
     chosen = mine.nonzero().squeeze(-1)
-    chosen = chosen[torch.randperm(len(chosen), generator=scene.generator)[:_ROWS]]
+    most = problem.settings.relocalisation.most_residuals
+    chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:most]]
     return Observations(rows.anchor[chosen], rows.frame[chosen])

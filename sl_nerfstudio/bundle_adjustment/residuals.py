@@ -1,14 +1,14 @@
-"""Residuals of the joint adjustment and their normal equations.
+"""Residuals of the bundle adjustment and their derivatives.
 
 Unknowns are the poses and, for every *anchor* (a decoded pixel of one frame), its depth along its
-camera ray. An anchor is observed twice over:
+camera ray. An anchor makes two kinds of residuals:
 
     own    its decoded coordinate against its own projector's view of it,
     cross  wherever another camera sees it: the coordinate decoded *there* against that frame's
            projector's view of it.
 
 All residuals are projector pixels, so nothing is gained by shrinking the scene: the collapse that
-free-scale ICP suffers from cannot happen. Depths are eliminated by the Schur complement.
+free-scale ICP suffers from cannot happen.
 
 Increments: `T_world_camera <- exp(delta) T_world_camera` moves a frame as a whole (rotating about
 the origin, which is the centre of the scene), `T_camera_projector <- exp(rho) T_camera_projector`
@@ -17,45 +17,14 @@ moves its projector against its camera.
 
 from dataclasses import dataclass, fields, replace
 
-import numba
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.compiled import compiled_parallel
-from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
-from sl_nerfstudio.geometry.se3 import exp_se3, hat, inverse, rotate, transform
-
-
-@dataclass(frozen=True)
-class Rig:
-    """All devices of a scan; poses in the scene frame, whose origin is the centre of the object."""
-
-    camera: Intrinsics  # batch (frames,)
-    projector: Intrinsics  # batch ()
-    T_world_camera: Float[Tensor, "frames 4 4"]
-    T_camera_projector: Float[Tensor, "frames 4 4"]
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self.T_world_camera)
-
-    @property
-    def T_world_projector(self) -> Float[Tensor, "frames 4 4"]:
-        """Projector poses in the scene frame."""
-        return self.T_world_camera @ self.T_camera_projector
-
-    def moved(self, delta: Float[Tensor, "frames 6"], rho: Float[Tensor, "frames 6"]) -> "Rig":
-        """The rig after an increment."""
-        return Rig(
-            self.camera,
-            self.projector,
-            exp_se3(delta) @ self.T_world_camera,
-            exp_se3(rho) @ self.T_camera_projector,
-        )
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.geometry.devices import project, project_jacobian
+from sl_nerfstudio.geometry.se3 import hat, inverse, rotate, transform
 
 
 @dataclass(frozen=True)
@@ -79,13 +48,13 @@ class Anchors:
 
 @dataclass(frozen=True)
 class Observations:
-    """Which anchor is looked for in which other frame."""
+    """Which anchor is looked up in which other frame."""
 
     anchor: Int[Tensor, "rows"]
     frame: Int[Tensor, "rows"]
 
     def pairs(self, anchors: Anchors) -> Int[Tensor, "2 rows"]:
-        """Frame of the anchor, frame that looks for it."""
+        """Frame of the anchor, frame that looks it up."""
         return torch.stack([anchors.frame[self.anchor], self.frame])
 
 
@@ -166,21 +135,6 @@ def _projector_view(
     return uv, torch.cat([-by_point, by_point @ hat(p_camera)], -1), by_point
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """Gauss-Newton equations of all unknowns but the depths, which are eliminated."""
-
-    H: Float[Tensor, "unknowns unknowns"]
-    g: Float[Tensor, "unknowns"]
-    depth_by_rest: Float[Tensor, "anchors unknowns"]
-    H_depth: Float[Tensor, "anchors"]
-    g_depth: Float[Tensor, "anchors"]
-
-    def depth_step(self, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "anchors"]:
-        """Change of the depths that goes with a step of the other unknowns."""
-        return -(self.g_depth + self.depth_by_rest @ step) / self.H_depth
-
-
 def _pose_columns(
     anchors: Anchors, observations: Observations, frames: int
 ) -> tuple[Int[Tensor, "anchors 6"], Int[Tensor, "rows 18"]]:
@@ -189,52 +143,3 @@ def _pose_columns(
     i, j = observations.pairs(anchors)[..., None]
     own = 6 * n + 6 * anchors.frame[:, None] + columns
     return own, torch.cat([6 * i + columns, 6 * j + columns, 6 * (n + j) + columns], -1)
-
-
-def normal_equations(
-    linear: Linearisation,
-    observations: Observations,
-    own_weight: Float[Tensor, "anchors"],
-    cross_weight: Float[Tensor, "rows"],
-) -> NormalEquations:
-    """Weighted normal equations with the Schur complement of the depths."""
-    size, rows, r_of = linear.unknowns, observations.anchor, linear.residuals
-    H = torch.zeros(size, size, dtype=torch.float64)
-    g = torch.zeros(size, dtype=torch.float64)
-    depth_by_rest = torch.zeros(len(own_weight) * size, dtype=torch.float64)
-    H_depth = own_weight * (linear.own_depth**2).sum(-1)
-    g_depth = own_weight * (linear.own_depth * r_of.own).sum(-1)
-    groups = (
-        (linear.own, linear.own_depth, r_of.own, own_weight, linear.own_columns, torch.arange(len(own_weight))),
-        (linear.cross, linear.cross_depth, r_of.cross, cross_weight, linear.cross_columns, rows),
-    )
-    for J, J_depth, r, w, cols, anchor in groups:
-        wJ = w[:, None, None] * J
-        g.index_add_(0, cols.reshape(-1), (wJ[:, 0] * r[:, :1] + wJ[:, 1] * r[:, 1:]).reshape(-1))
-        coupling = wJ[:, 0] * J_depth[:, :1] + wJ[:, 1] * J_depth[:, 1:]
-        depth_by_rest.index_add_(0, (anchor[:, None] * size + cols).reshape(-1), coupling.reshape(-1))
-        partial = np.zeros((torch.get_num_threads(), size, size))
-        _accumulate(J.numpy(), w.numpy(), cols.numpy(), partial)
-        H += torch.from_numpy(partial.sum(0))
-    H = torch.tril(H) + torch.tril(H, -1).T
-    H_depth = H_depth.index_add(0, rows, cross_weight * (linear.cross_depth**2).sum(-1))
-    g_depth = g_depth.index_add(0, rows, cross_weight * (linear.cross_depth * linear.residuals.cross).sum(-1))
-    H_depth = H_depth.clamp_min(1e-12)
-    V = depth_by_rest.reshape(-1, size)
-    scaled = V / H_depth[:, None]
-    return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
-
-
-@compiled_parallel
-def _accumulate(J, weight, columns, partial):
-    """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
-    threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]
-    for t in numba.prange(threads):
-        for n in range(t * rows // threads, (t + 1) * rows // threads):
-            w = weight[n]
-            if w > 0:
-                for a in range(width):
-                    x, y, ca = w * J[n, 0, a], w * J[n, 1, a], columns[n, a]
-                    for b in range(width):
-                        if columns[n, b] <= ca:
-                            partial[t, ca, columns[n, b]] += x * J[n, 0, b] + y * J[n, 1, b]

@@ -1,7 +1,7 @@
-"""The robust kernel of the joint adjustment: wrong decodings end without influence, frames that lag are not given up.
+"""The robust kernel of the bundle adjustment: wrong decodings end without influence, slow frames are not given up.
 
-Its width follows the residuals down (graduated non-convexity: Yang et al., RA-L 2020), for every frame
-apart: while most frames fit, one that does not yet keeps a kernel wide enough to be pulled in.
+Its width follows the residuals down (graduated non-convexity: Yang et al., RA-L 2020), separately for every frame:
+while most frames fit, one that does not yet keeps a kernel wide enough to be pulled in.
 """
 
 from dataclasses import dataclass
@@ -11,18 +11,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
-
-NOISE_FLOOR_PX = 0.01  # projector pixels: residuals are not believed to be better than this
-_SHRINK = 1.4  # of the kernel in one step, at most
+from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """Geman-McClure's, with a width for each frame; wrong by far costs the same whatever the width."""
+    """Geman-McClure's, with a width for each frame; a gross error costs the same whatever the width."""
 
     width: Float[Tensor, "frames"]  # projector pixels
     frame: Int[Tensor, "anchors"]
-    pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks for it
+    pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks it up
 
     @property
     def narrowest(self) -> float:
@@ -39,7 +37,7 @@ class Kernel:
         return own, torch.where(r.cross_valid, cross, torch.zeros_like(cross))
 
     def cost(self, r: Residuals, valid: Bool[Tensor, "rows"]) -> float:
-        """What a step must lower."""
+        """The data's part of the objective, px^2; half its gradient is that of the weighted normal equations."""
         own2, cross2 = self._squares()
         own = ((r.own**2).sum(-1), own2)
         cross = ((r.cross**2).sum(-1)[valid], cross2[valid])
@@ -59,14 +57,16 @@ def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Flo
     return out
 
 
-def narrowed(width: Float[Tensor, "frames"], target: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
+def narrowed(
+    width: Float[Tensor, "frames"], target: Float[Tensor, "frames"], settings: KernelSettings
+) -> Float[Tensor, "frames"]:
     """Kernel widths on their way to a narrower target, not in one leap: a part may fit before the whole does."""
-    gently = torch.where(width.isfinite(), width / _SHRINK, torch.zeros_like(width))
+    gently = torch.where(width.isfinite(), width / settings.fastest, torch.zeros_like(width))
     return torch.minimum(width, torch.maximum(target, gently))
 
 
-def noise_of(r: Residuals, width: float) -> float:
-    """Robust 1 sigma of one residual component among those that the kernel keeps."""
+def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
+    """Robust 1 sigma of one residual component among those that the kernel keeps, pattern pixels."""
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
-    return max(float(values.median()) * 1.4826, NOISE_FLOOR_PX)
+    return max(float(values.median()) * 1.4826, settings.noise_floor_px)

@@ -21,6 +21,7 @@ from sl_nerfstudio.dataparser.pixel_sampler import SLPixelSampler
 from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
 from sl_nerfstudio.dataparser.scene_rays import SceneRays
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.spacing import evenly_spaced
 
 Batch = dict[str, Tensor]
 
@@ -114,7 +115,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         """At most `count` of one frame's held-out pixels, evenly spread; possibly none."""
         index = self._samples.held_out_of(frame)
         if len(index) > count:
-            index = index[torch.linspace(0, len(index) - 1, count, device=index.device).round().long()]
+            index = index[torch.from_numpy(evenly_spaced(len(index), count)).to(index.device)]
         return self._rays_and_batch(self._samples.at(index))
 
     def stand_at(self, T_scene_camera: Float[Tensor, "n 4 4"]) -> None:

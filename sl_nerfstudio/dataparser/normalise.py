@@ -6,7 +6,7 @@ world of a scan, and the normalised scene stays the same but for rounding.
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
@@ -14,6 +14,7 @@ from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan import Scan
 
@@ -65,7 +66,9 @@ def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarra
     """World points of up to 1000 decoded pixels of each frame, and how many pixels were tried."""
     points, tried = [], 0
     for number, frame in enumerate(scan.frames):
-        pixels = samples.at(_evenly(samples, number))
+        first, last = int(samples.first[number]), int(samples.first[number + 1])
+        count = min(_POINTS_PER_FRAME, last - first)
+        pixels = samples.at(first + torch.from_numpy(evenly_spaced(last - first, count)))
         decoded = pixels.decoded
         count = int(decoded.sum())
         tried += count
@@ -80,11 +83,6 @@ def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarra
         good = found.p_world.isfinite().all(-1) & (found.depth_camera > 0) & (found.depth_projector > 0)
         points.append(found.p_world[good].numpy())
     return np.concatenate(points), tried
-
-
-def _evenly(samples: PixelSamples, frame: int) -> Int[torch.Tensor, "n"]:
-    first, last = int(samples.first[frame]), int(samples.first[frame + 1])
-    return torch.linspace(first, last - 1, min(_POINTS_PER_FRAME, last - first), dtype=torch.float64).round().long()
 
 
 def without_lonely(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:

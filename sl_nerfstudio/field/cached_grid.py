@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sl_nerfstudio.field.sdf_field import SDFField
+from sl_nerfstudio.field.signed_distance import SignedDistance
 
 _BAND_CELLS = 3.0  # vertices this near to the surface are kept up to date
 _AT_ONCE = 131072
@@ -29,13 +29,13 @@ class CachedGrid(nn.Module):
         return 2 / (self.resolution - 1)
 
     @torch.no_grad()
-    def refresh(self, field: SDFField, everywhere: bool = False) -> None:
-        """Evaluate the field again: near its cached surface, or everywhere (always so at first)."""
+    def refresh(self, field: SignedDistance) -> None:
+        """Evaluate the field again: near its cached surface; the first time everywhere."""
         flat = self.values.reshape(-1)
-        if everywhere or not self.filled:
-            index = torch.arange(len(flat), device=flat.device)
-        else:
+        if self.filled:
             index = (flat.abs() < _BAND_CELLS * self.cell).nonzero()[:, 0]
+        else:
+            index = torch.arange(len(flat), device=flat.device)
         n = self.resolution
         for part in index.split(_AT_ONCE):
             xyz = torch.stack([part % n, part // n % n, part // (n * n)], -1)

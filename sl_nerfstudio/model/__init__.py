@@ -1,1 +1,5 @@
-"""The neural surface: hash-grid SDF field, sampling, rendering, losses, poses, and the nerfstudio model."""
+"""Everything that plugs the method into nerfstudio: model, settings, pipeline, trainer, optimisers, viewer.
+
+In: a loaded scan with its table of pixels. Out: trained weights, adjusted poses with their uncertainty, and the outputs
+that nerfstudio's viewer and exporters read. The mathematics lies in bundle_adjustment/, field/ and rendering/.
+"""

@@ -1,39 +1,41 @@
 """What the model shows outside training: outputs of rays for viewer, exporters and evaluation."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.rendering.renderer import Renderer
 
-if TYPE_CHECKING:
-    from sl_nerfstudio.model.model import SLModel
-
+_EVAL_SAMPLES = 24
 _OPAQUE = 0.5
 _MODULO = 128.0  # pattern pixels of one turn of the coordinate colours
 _RESIDUAL_WHITE_PX = 5.0
 
 
 @torch.no_grad()
-def outputs(model: "SLModel", bundle: RayBundle) -> dict[str, Tensor]:
+def ray_outputs(
+    renderer: Renderer,
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    T_scene_projector: Float[Tensor, "rays 4 4"],
+) -> dict[str, Tensor]:
     """Float images of 1 or 3 channels: what nerfstudio's viewer, renderer and exporters rely on, and ours.
 
     `depth` is the distance along the unit ray, in scene units, and far (1000) where there is no object.
     """
-    o, d, views = model.corrected_rays(bundle)
-    T_projector = model.poses_scene()[1]
-    T_projector_scene = inverse(T_projector).float()[views]
-    seen = model.render_rays(o, d, T_projector_scene, jitter=False)
+    o, d = origins, directions
+    samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
+    seen = renderer.render(o, d, inverse(T_scene_projector), samples, jitter=False)
     p = o + seen.depth[:, None] * d
-    normal = torch.nn.functional.normalize(model.field.sdf_and_gradient(p)[1].detach(), dim=-1)
+    normal = torch.nn.functional.normalize(renderer.field.sdf_and_gradient(p)[1].detach(), dim=-1)
     opaque = seen.accumulation > _OPAQUE
-    lit = model.is_lit(p, normal, T_projector.float()[views, :3, 3]) & opaque
+    lit = renderer.is_lit(p, normal, T_scene_projector[:, :3, 3]) & opaque
     facing = (-(normal * d).sum(-1)).clamp(0, 1)
     shade = (0.15 + 0.35 * facing + 0.5 * facing * torch.where(lit, seen.pattern, 0.0)) * opaque
-    result = {
+    return {
         "rgb": shade[:, None].expand(-1, 3).contiguous(),
         "accumulation": seen.accumulation[:, None],
         "depth": torch.where(opaque, seen.depth, 1e3)[:, None],
@@ -43,11 +45,14 @@ def outputs(model: "SLModel", bundle: RayBundle) -> dict[str, Tensor]:
         "coordinate_x": torch.where(opaque, seen.coordinates[:, 0], 0.0)[:, None],
         "coordinate_y": torch.where(opaque, seen.coordinates[:, 1], 0.0)[:, None],
     }
-    if "sl_uv" not in (bundle.metadata or {}):  # single pixels of a batch bring their measured coordinates along
-        error = (seen.coordinates - model.measured_coordinates(p, views)).norm(dim=-1)
-        share = torch.where(opaque, torch.nan_to_num(error / _RESIDUAL_WHITE_PX, nan=0.0), 0.0)
-        result["residual"] = share.clamp(0, 1)[:, None]
-    return result
+
+
+def residual_output(outputs: dict[str, Tensor], measured: Float[Tensor, "rays 2"]) -> Float[Tensor, "rays 1"]:
+    """Distance of rendered from measured coordinates as brightness; 0 off the object and where nothing was decoded."""
+    rendered = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
+    share = torch.nan_to_num((rendered - measured).norm(dim=-1) / _RESIDUAL_WHITE_PX, nan=0.0)
+    opaque = outputs["accumulation"][:, 0] > _OPAQUE
+    return torch.where(opaque, share, 0.0).clamp(0, 1)[:, None]
 
 
 def coordinate_colours(uv: Float[Tensor, "n 2"], valid: Tensor) -> Float[Tensor, "n 3"]:

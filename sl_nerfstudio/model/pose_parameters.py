@@ -1,18 +1,21 @@
 """Poses of all devices as parameters, in the scene frame.
 
-`RigPoseParameters` (ours): a frame moves as a whole, and its projector moves against its camera.
+`RigPoseParameters`: a frame moves as a whole, and its projector moves against its camera.
 `StaticProjectorParameters`: cameras move about a projector that does not.
 `IndependentPoseParameters` (the paper's): camera and projector of a frame know nothing of each other.
+`CoupledPoseParameters`: each camera by itself, and a projector whose pose against it is known or shared by all frames.
 
-Both start from a *base* that may be replaced (by the joint adjustment) before training goes on; the
-parameters are increments to it, in units of `step`, so that one learning rate suits all of them.
+All start from a *base* that may be replaced (by the bundle adjustment) before training goes on; the parameters are
+increments to it.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
+from sl_nerfstudio.model.settings import SLModelSettings
 
 
 class PoseParameters(nn.Module):
@@ -39,11 +42,12 @@ class PoseParameters(nn.Module):
             self.register_buffer(f"start_{name}", T.double().clone())
             self.register_buffer(f"base_{name}", T.double().clone())
         n = len(T_scene_camera)
-        # posterior 1 sigma of (delta, rho): translation xyz, rotation xyz each; NaN where not estimated
+        # 1 sigma of (delta, rho): translation xyz, rotation xyz each; NaN where not estimated
         self.register_buffer("sigma", torch.full((n, 12), float("nan"), dtype=torch.float64))
-        # what the adjustment says of the intrinsics (see IntrinsicsDoubt); NaN where nothing
-        self.register_buffer("intrinsics_change", torch.full((6,), float("nan"), dtype=torch.float64))
-        self.register_buffer("intrinsics_covariance", torch.full((6, 6), float("nan"), dtype=torch.float64))
+        # what the adjustment found about the intrinsics (see SelfCalibration); NaN where it found nothing
+        self.register_buffer("intrinsics_change", torch.full((UNKNOWNS,), float("nan"), dtype=torch.float64))
+        covariance = torch.full((UNKNOWNS, UNKNOWNS), float("nan"), dtype=torch.float64)
+        self.register_buffer("intrinsics_covariance", covariance)
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
 
@@ -57,9 +61,31 @@ class PoseParameters(nn.Module):
         self.camera_step.zero_()
         self.projector_step.zero_()
 
+    @torch.no_grad()
+    def note(self, sigma: Float[Tensor, "frames 12"], intrinsics: SelfCalibration | None) -> None:
+        """Keep what the adjustment found beside the poses."""
+        self.sigma.copy_(sigma)
+        if intrinsics is not None:
+            self.intrinsics_change.copy_(intrinsics.change)
+            self.intrinsics_covariance.copy_(intrinsics.covariance)
+
+    def self_calibration(self) -> SelfCalibration | None:
+        """What the adjustment found about the intrinsics; None where nothing was adjusted."""
+        found = SelfCalibration(self.intrinsics_change.cpu(), self.intrinsics_covariance.cpu())
+        return found if found.known else None
+
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""
         raise NotImplementedError
+
+    def _camera_about_scene(self) -> Float[Tensor, "frames 4 4"]:
+        return exp_se3(self.camera_step.double()) @ self.base_camera
+
+    def _camera_about_itself(self) -> Float[Tensor, "frames 4 4"]:
+        return self.base_camera @ exp_se3(self.camera_step.double())
+
+    def _relative(self) -> Float[Tensor, "frames 4 4"]:
+        return exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
 
 
 class RigPoseParameters(PoseParameters):
@@ -69,26 +95,54 @@ class RigPoseParameters(PoseParameters):
     """
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See Poses."""
-        camera = exp_se3(self.camera_step.double()) @ self.base_camera
-        relative = exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
-        return camera, camera @ relative
+        """See PoseParameters."""
+        camera = self._camera_about_scene()
+        return camera, camera @ self._relative()
 
 
 class StaticProjectorParameters(PoseParameters):
     """`T_scene_camera = exp(delta) base`, and a projector that stays where it is: only cameras move about it."""
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See Poses."""
-        return exp_se3(self.camera_step.double()) @ self.base_camera, self.base_projector
+        """See PoseParameters."""
+        return self._camera_about_scene(), self.base_projector
 
 
 class IndependentPoseParameters(PoseParameters):
-    """`T = base exp(xi)` for camera and projector apart: each turns about its own centre."""
+    """`T = base exp(xi)` for camera and projector separately: each rotates about its own centre."""
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See Poses."""
-        return (
-            self.base_camera @ exp_se3(self.camera_step.double()),
-            self.base_projector @ exp_se3(self.projector_step.double()),
-        )
+        """See PoseParameters."""
+        return self._camera_about_itself(), self.base_projector @ exp_se3(self.projector_step.double())
+
+
+class CoupledPoseParameters(PoseParameters):
+    """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres and take their projectors along."""
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See PoseParameters."""
+        camera = self._camera_about_itself()
+        return camera, camera @ self._relative()
+
+
+def make_pose_parameters(
+    settings: SLModelSettings,
+    T_scene_camera: Float[Tensor, "frames 4 4"],
+    T_scene_projector: Float[Tensor, "frames 4 4"],
+) -> PoseParameters:
+    """The parameters that fit what is free (`refine_poses`) and how it is refined (`pose_method`)."""
+    free, independent = settings.refine_poses, settings.pose_method == "render-independently"
+    if free == "static-projector":
+        kind = StaticProjectorParameters
+    elif not independent:
+        kind = RigPoseParameters
+    else:
+        kind = CoupledPoseParameters if free in ("known-rig", "rigid-rig") else IndependentPoseParameters
+    moves = settings.renders_poses
+    return kind(
+        T_scene_camera,
+        T_scene_projector,
+        refine_camera=moves,
+        refine_projector=moves and free not in ("known-rig", "static-projector"),
+        shared_projector=free == "rigid-rig",
+    )

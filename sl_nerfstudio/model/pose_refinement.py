@@ -1,4 +1,4 @@
-"""From the table of pixels to refined poses: what stands between a training run and the joint adjustment."""
+"""From the table of pixels to adjusted poses: what stands between a training run and the bundle adjustment."""
 
 from dataclasses import dataclass
 
@@ -8,33 +8,29 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import (
-    AdjustmentSettings,
-    adjust,
-)
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
 from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.dataparser.held_out import BLOCK
 from sl_nerfstudio.dataparser.samples import PixelSamples
-from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan
 
-_HELD_OUT_PER_FRAME = 300
-# times the decoding noise: beyond it a residual is a wrong decoding, or something else hides the place
-_GUARD_WIDTH = 4.0
-_GUARD_FLOOR_PX = 0.25  # where decoding is perfect, looking up between pixels is not
+_LEAST_SIGMA = 1e-9  # scene units and radian: stands for a pose that is known exactly, and keeps equations solvable
 
 
 @dataclass
 class PriorConfig:
-    """How well the starting poses are known where the scan does not say (`sl_pose_sigma`), and intrinsics; 1 sigma."""
+    """1 sigma of intrinsics, and of starting poses where the scan does not state it by `sl_pose_sigma`."""
 
     frame_rotation_deg: float = 2.0
     """Orientation of a frame in the world, in degrees."""
@@ -45,48 +41,30 @@ class PriorConfig:
     relative_translation: float = 0.05
     """Position of the projector against the camera, as a share of the baseline."""
     intrinsics: float = INTRINSICS_SIGMA
-    """Focal lengths and principal points of both devices, as a share of the focal length; unless `refine_intrinsics`
-    is on they stay as they are, but poses are stated to be as uncertain as this makes them."""
+    """Focal lengths and principal points of both devices, as a share of the focal length; they widen the stated
+    uncertainty of the poses."""
 
 
 @dataclass(frozen=True)
 class ScanAdjustment:
-    """Refined poses in the scene frame, or the starting ones where refinement did not help."""
+    """Adjusted poses in the scene frame, or the starting ones where adjusting did not help."""
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
-    verdict: CrossValidation
+    cross_validation: CrossValidation
     noise_px: float
-    intrinsics: SelfCalibration | None = None  # None where nothing was refined
+    intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
 
     @property
-    def T_scene_camera(self) -> Float[Tensor, "frames 4 4"]:
-        """Poses of the cameras."""
-        return self.rig.T_world_camera
-
-    @property
-    def T_scene_projector(self) -> Float[Tensor, "frames 4 4"]:
-        """Poses of the projectors."""
-        return self.rig.T_world_projector
-
-    def message(self) -> str:
-        """One line for the person who waits."""
-        change = f"held-out pixels agree to {self.verdict.after_px:.3g} px, before {self.verdict.before_px:.3g} px"
-        if self.verdict.better:
-            return f"Poses adjusted: {change}."
-        return f"Poses NOT changed, because adjusting them did not help: {change}. The starting poses are kept."
+    def adjusted(self) -> bool:
+        """Whether `rig` is the adjusted one."""
+        return self.cross_validation.better
 
 
 def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
     """The scan's devices at their starting poses, in the scene frame."""
-    camera = torch.from_numpy(S_scene_world.poses(scan.T_world_camera))
-    projector = torch.from_numpy(S_scene_world.poses(scan.T_world_projector))
-    return Rig(
-        camera=Intrinsics.of([frame.camera for frame in scan.frames], torch.float64),
-        projector=Intrinsics.of(scan.projector, torch.float64),
-        T_world_camera=camera,
-        T_camera_projector=inverse(camera) @ projector,
-    )
+    poses = DevicePoses(scan.T_world_camera, scan.T_world_projector)
+    return Rig.of([frame.camera for frame in scan.frames], scan.projector, poses, S_scene_world)
 
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
@@ -113,8 +91,7 @@ def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> Po
                     np.radians(stated.relative_rotation_deg),
                 )
             )
-    # a sigma of zero is a pose known exactly: a very small one keeps the equations solvable
-    sigma = torch.tensor(np.maximum(np.array(rows), 1e-9), dtype=torch.float64)
+    sigma = torch.tensor(np.maximum(np.array(rows), _LEAST_SIGMA), dtype=torch.float64)
     a, b, c, d = sigma.unbind(1)
     return PosePrior(a, b, c, d, config.intrinsics, scan.intrinsics_change)
 
@@ -123,61 +100,74 @@ def adjust_scan(
     scan: Scan,
     S_scene_world: Similarity,
     samples: PixelSamples,
-    mode: RefinePoses,
+    refine: RefinePoses,
     prior: PriorConfig,
     settings: AdjustmentSettings,
 ) -> ScanAdjustment:
-    """Adjust all poses jointly, fix the gauge, and keep the result only if held-out pixels agree better with it."""
+    """Adjust all poses together, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
-    maps, held_out = maps_and_held_out(scan, samples)
+    maps, held_out = maps_and_held_out(scan, samples, settings)
     stated = pose_prior(scan, S_scene_world, prior)
-    found = adjust(constrained(mode, start), maps, stated, mode, settings)
-    rig = restore(start, found.rig, _scale(scan, mode, start, found.rig, stated))
-    verdict = cross_validate(start, rig, held_out, maps, guard_width(found.noise_px))
-    sigma = found.sigma if verdict.better else _prior_sigma(stated)
-    return ScanAdjustment(rig if verdict.better else start, sigma, verdict, found.noise_px, found.intrinsics)
+    found = adjusted(scan, start, maps, refine, stated, settings)
+    decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
+    if decision.better:
+        return ScanAdjustment(found.rig, found.sigma, decision, found.noise_px, found.intrinsics)
+    return ScanAdjustment(start, stated.sigma, decision, found.noise_px, found.intrinsics)
 
 
-def _scale(scan: Scan, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
+@dataclass(frozen=True)
+class Found:
+    """An adjustment in the scan's gauge, not judged yet."""
+
+    rig: Rig
+    sigma: Float[Tensor, "frames 12"]
+    noise_px: float
+    intrinsics: SelfCalibration | None
+
+
+def adjusted(
+    scan: Scan, start: Rig, maps: CoordinateMaps, refine: RefinePoses, prior: PosePrior, settings: AdjustmentSettings
+) -> Found:
+    """Adjust the scan's poses from `start`, and give them the scan's lengths."""
+    found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
+    rig = restore(start, found.rig, _scale(scan, refine, start, found.rig, prior))
+    return Found(rig, found.sigma, found.noise_px, found.intrinsics)
+
+
+def _scale(scan: Scan, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
     """The factor by which the adjusted rig gets the scan's lengths."""
     frame = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
-    if frame is None and scan.scale.known and mode != "known-rig":
+    if frame is None and scan.scale.known and refine != "known-rig":
         return agreeing_scale(start, rig, prior)
     return baseline_scale(start, rig, frame)
 
 
-def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:
-    """What is known of poses that were not refined: the uncertainty they came with, per axis."""
-    parts = (prior.frame_translation, prior.frame_rotation, prior.relative_translation, prior.relative_rotation)
-    return torch.stack(parts, 1).repeat_interleave(3, 1)
-
-
-def guard_width(noise_px: float) -> float:
-    """From where on a held-out residual says nothing more, in projector pixels."""
-    return max(_GUARD_WIDTH * noise_px, _GUARD_FLOOR_PX)
-
-
-def maps_and_held_out(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOutPixels]:
+def maps_and_held_out(
+    scan: Scan, samples: PixelSamples, settings: AdjustmentSettings
+) -> tuple[CoordinateMaps, HeldOutPixels]:
     """Coordinate images without the held-out pixels, and some of those."""
-    images, frames, uv_camera, uv_projector = [], [], [], []
+    images, frames, uv_camera, uv_projector, blocks = [], [], [], [], []
     for number, frame in enumerate(scan.frames):
         rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
         image = torch.full((frame.camera.h, frame.camera.w, 2), float("nan"))
         row, column, held = samples.row[rows].long(), samples.column[rows].long(), samples.held_out[rows]
         image[row[~held], column[~held]] = samples.coords[rows][~held]
         images.append(image)
-        test = samples.at(_evenly(samples.held_out_of(number), _HELD_OUT_PER_FRAME))
+        index = samples.held_out_of(number)
+        count = min(len(index), settings.cross_validation.pixels_per_frame)
+        test = samples.at(index[torch.from_numpy(evenly_spaced(len(index), count))])
         decoded = test.decoded
         frames.append(test.frame[decoded])
         uv_camera.append(test.uv[decoded].double())
         uv_projector.append(test.coords[decoded].double())
-    return CoordinateMaps.of(images), HeldOutPixels(torch.cat(frames), torch.cat(uv_camera), torch.cat(uv_projector))
-
-
-def _evenly(index: Tensor, count: int) -> Tensor:
-    if len(index) <= count:
-        return index
-    return index[torch.linspace(0, len(index) - 1, count).round().long()]
+        per_row = frame.camera.w // BLOCK + 1
+        blocks.append((test.row // BLOCK * per_row + test.column // BLOCK)[decoded])
+    most = max(frame.camera.w * frame.camera.h for frame in scan.frames)
+    frame_of = torch.cat(frames)
+    held_out = HeldOutPixels(
+        frame_of, torch.cat(uv_camera), torch.cat(uv_projector), frame_of * most + torch.cat(blocks)
+    )
+    return CoordinateMaps.of(images, settings.look_up), held_out
 
 
 def sigmas_in_scan_units(sigma: Float[Tensor, "frames 12"], S_scene_world: Similarity) -> Float[ndarray, "frames 4"]:

@@ -10,11 +10,12 @@ import torch
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sl_nerfstudio.dataparser.dataparser import LoadedScan, SLDataParserConfig, load_scan, scan_root
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.intrinsics_refinement import refine_intrinsics
+from sl_nerfstudio.model.messages import refined_intrinsics_message
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
 from sl_nerfstudio.scan import require_valid
 
@@ -40,7 +41,7 @@ class SLTrainerConfig(TrainerConfig):
         super().set_timestamp()
 
     def prepare(self) -> None:
-        """Check scan, device and checkpoint; make paths absolute; fill in the length of the schedules.
+        """Check scan, device and checkpoint; make paths absolute; fill in intrinsics and the length of the schedules.
 
         Raises UserError.
         """
@@ -49,18 +50,18 @@ class SLTrainerConfig(TrainerConfig):
             raise UserError(f"--max-num-iterations {self.max_num_iterations}: at least 1 is needed")
         _require_device(self.machine.device_type)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
+        begun = None if checkpoint is None else read_begun(checkpoint)
         require_valid(root)
         dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
-        loaded = load_scan(root, dataparser.intrinsics_change)  # remembered; tells whether rays meet at all
         model: SLModelConfig = self.pipeline.model  # type: ignore[assignment]
-        if model.refine_intrinsics:
-            dataparser.intrinsics_change = _refined(loaded, model)
-            model.refine_intrinsics = False  # the settings that are saved hold what was found: --load-config goes on
+        dataparser.intrinsics_change = _intrinsics_change(root, dataparser.intrinsics_change, begun, model)
+        load_scan(root, dataparser.intrinsics_change)  # remembered; fails where no rays meet
         self.data = root
         self.pipeline.datamanager.data = root
         self.output_dir = self.output_dir.expanduser().absolute()
         if self.schedule_iterations is None:
-            self.schedule_iterations = schedule_of(checkpoint) or self.max_num_iterations
+            stated = None if begun is None else begun.schedule_iterations
+            self.schedule_iterations = stated or self.max_num_iterations
         model.schedule_iterations = self.schedule_iterations
         self.optimizers = {
             name: {**group, "scheduler": _with_length(group["scheduler"], self.schedule_iterations)}
@@ -80,21 +81,31 @@ class SLTrainerConfig(TrainerConfig):
         return scan_root(data)
 
 
-def _refined(loaded: LoadedScan, model: SLModelConfig) -> IntrinsicsChange:
-    """The change of intrinsics that the captures ask for, told. Raises UserError for settings that exclude it."""
-    if loaded.scan.intrinsics_change:
+def _intrinsics_change(
+    root: Path, stated: IntrinsicsChange, begun: "BegunRun | None", model: SLModelConfig
+) -> IntrinsicsChange:
+    """The intrinsics of the run: those of the run it resumes, else as stated, refined from there on request."""
+    if begun is not None and begun.intrinsics_change is not None:
+        if stated and stated != begun.intrinsics_change:
+            raise UserError(
+                f"sl-data --intrinsics-change {stated.values}: the checkpoint was trained with "
+                f"{begun.intrinsics_change.values}\n    cause:  a run is resumed with other intrinsics\n"
+                "    remedy: leave the option out; the run goes on with its own"
+            )
+        return begun.intrinsics_change
+    if not model.refine_intrinsics:
+        return stated
+    if not model.adjusts_poses:
         raise UserError(
-            "--pipeline.model.refine-intrinsics: a change of intrinsics is given, too\n"
-            "    cause:  sl-data --intrinsics-change states it\n    remedy: leave out one"
-        )
-    if model.refine_poses == "off" or not model.adjust_poses:
-        raise UserError(
-            "--pipeline.model.refine-intrinsics: intrinsics are found together with the poses, and those are not to be "
-            "adjusted\n    cause:  refine-poses off, or adjust-poses False\n"
+            "--pipeline.model.refine-intrinsics: intrinsics are found together with the poses, and those are not "
+            f"adjusted\n    cause:  --pipeline.model.refine-poses {model.refine_poses}, "
+            f"--pipeline.model.pose-method {model.pose_method}\n"
             "    remedy: leave that out, or refine-intrinsics"
         )
-    found = refine_intrinsics(loaded, model.refine_poses, model.prior, model.adjustment)
-    print(found.message(loaded.scan), flush=True)
+    loaded = load_scan(root)
+    found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
+    cameras = [frame.camera for frame in loaded.scan.frames]
+    print(refined_intrinsics_message(found, cameras, loaded.scan.projector), flush=True)
     return found.change
 
 
@@ -118,6 +129,14 @@ def _require_device(device_type: str) -> None:
         )
 
 
+@dataclass(frozen=True)
+class BegunRun:
+    """What a checkpoint says about the run that wrote it; None where it does not say."""
+
+    schedule_iterations: int | None
+    intrinsics_change: IntrinsicsChange | None
+
+
 def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
     """The checkpoint that nerfstudio will load, None for a fresh run. Raises UserError where it is missing."""
     if load_dir is not None:
@@ -134,16 +153,17 @@ def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoin
     return load_checkpoint
 
 
-def schedule_of(checkpoint: Path | None) -> int | None:
-    """Length of the schedule that a checkpoint was written under, if it tells. Raises UserError if it is unreadable."""
-    if checkpoint is None:
-        return None
+def read_begun(checkpoint: Path) -> BegunRun:
+    """What a checkpoint says about the run that wrote it. Raises UserError if it is unreadable."""
     try:
-        schedulers = torch.load(checkpoint, map_location="cpu", mmap=True).get("schedulers", {})
+        state = torch.load(checkpoint, map_location="cpu", mmap=True)
+        schedulers, weights = state.get("schedulers", {}), state.get("pipeline", {})
     except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError) as error:
         raise UserError(
             f"{checkpoint}: cannot be read as a checkpoint ({type(error).__name__}). "
-            "It is probably cut off; name an older one with --load-step, or train anew."
+            "It is probably cut off; name an older one with --load-step, or train again."
         ) from error
     lengths = [rate["max_steps"] for s in schedulers.values() for rate in s.get("lr_lambdas", []) if rate]
-    return max(lengths, default=None)
+    changes = [value for key, value in weights.items() if key.endswith("model.intrinsics_change")]
+    change = IntrinsicsChange.of(changes[0].tolist()) if changes else None
+    return BegunRun(max(lengths, default=None), change)

@@ -167,16 +167,13 @@ def _place(
     joint = adjust_registered(clouds, registration)
     units, scale = "arbitrary", Scale(False)
     if given is not None:
-        S = align_to(given, joint.T_world_camera, registration.registered)
-        joint = joint.scaled(S.scale)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = S.R, S.t
-        joint = replace(joint, T_world_camera=T @ joint.T_world_camera, T_world_projector=T @ joint.T_world_projector)
+        S = align_to(given, joint.poses.T_world_camera, registration.registered)
+        joint = joint.mapped(S)
         units = given.units
         scale = Scale(True, "given camera poses") if units != "arbitrary" else scale
     if known is not None:
         _require_used(known, clouds)
-        factor = scale_to(known, known.unit, clouds, joint.T_world_camera, joint.T_world_projector)
+        factor = scale_to(known, known.unit, clouds, joint.poses.T_world_camera, joint.poses.T_world_projector)
         joint, units = joint.scaled(factor), known.unit
         scale = Scale(True, _source_in_scan(known, clouds, registration))
     return Placed(registration, joint, units, scale)

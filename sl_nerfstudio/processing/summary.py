@@ -10,6 +10,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_stage import FrameOutcome
+from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.registration.register import Registration
 from sl_nerfstudio.scan.types import Scale
@@ -36,17 +37,23 @@ def summarise(
         scale_source=scale.source if scale.known else "",
         frames=frames,
         edges=records,
-        remarks=_remarks(registration, joint),
+        remarks=_remarks(outcomes, registration, joint),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if joint is None else _both_known(joint.median_before_px, joint.median_after_px),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 
 
-def _remarks(registration: Registration | None, joint: AdjustedFrames | None) -> tuple[str, ...]:
+def _remarks(
+    outcomes: Sequence[FrameOutcome], registration: Registration | None, joint: AdjustedFrames | None
+) -> tuple[str, ...]:
     """What remains uncertain."""
     placed = () if registration is None else tuple(registration.remarks)
-    return (joint.intrinsics, *placed) if joint is not None and joint.intrinsics else placed
+    clouds = [o.cloud for o in outcomes if o.cloud is not None]
+    if joint is None or not clouds:
+        return placed
+    wrong = contradiction(joint.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+    return (wrong, *placed) if wrong else placed
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:
@@ -69,7 +76,7 @@ def _record(
         reason = "too few other frames could be used" if registration is None else registration.reasons[outcome.name]
     baseline = fitness = None
     if placed and joint is not None and registration is not None and k is not None:
-        baseline = float(np.linalg.norm(joint.T_world_camera[k, :3, 3] - joint.T_world_projector[k, :3, 3]))
+        baseline = float(joint.poses.baseline[k])
         fitness = float(np.nan_to_num(registration.fitness[k]))
     return FrameRecord(
         name=outcome.name,

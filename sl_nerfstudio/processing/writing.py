@@ -61,8 +61,8 @@ def write_scan(
                 coords=cloud.coords,
                 mask=decoded.mask,
                 pattern=np.rint(255 * decoded.pattern).astype(np.uint8),
-                T_world_camera=joint.T_world_camera[k],
-                T_world_projector=joint.T_world_projector[k],
+                T_world_camera=joint.poses.T_world_camera[k],
+                T_world_projector=joint.poses.T_world_projector[k],
                 pose_sigma=joint.sigma[k],
             )
         writer.add_file("pattern.json", _description(layout))

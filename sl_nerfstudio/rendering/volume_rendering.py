@@ -7,14 +7,14 @@
 
 What is lit: a point behind the projector has no pattern coordinate, so it carries no weight, and what
 remains is divided by the weight that counts. Outside the pattern the coordinate goes on, the intensity
-is 0. Whether something stands between projector and point is not asked here: training pixels lie inside
-the mask, where the pattern was seen; for pictures see `shadow.lit`.
+is 0. Whether something stands between projector and point does not matter here: training pixels lie inside
+the mask, where the pattern was seen; for pictures see `Renderer.is_lit`.
 """
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -83,9 +83,3 @@ def look_up(pattern: Float[Tensor, "h w"], uv: Float[Tensor, "*batch 2"]) -> Flo
         pattern[None, None], grid.reshape(1, 1, -1, 2), mode="bilinear", padding_mode="zeros", align_corners=False
     )
     return found.reshape(uv.shape[:-1])
-
-
-def inside_pattern(uv: Float[Tensor, "*batch 2"], projector_size: tuple[int, int]) -> Bool[Tensor, "*batch"]:
-    """Whether coordinates lie on the pattern (w, h)."""
-    w, h = projector_size
-    return (uv[..., 0] >= 0) & (uv[..., 1] >= 0) & (uv[..., 0] <= w) & (uv[..., 1] <= h)

@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.runs.trained_run import TrainedRun
-from sl_nerfstudio.scan import Scan
 
 _PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", "open3d")
 _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
@@ -18,7 +19,7 @@ _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_
 def training_record(run: TrainedRun) -> dict[str, Any]:
     """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
 
-    The last says how intrinsics were changed, and what the captures say against them ("": nothing).
+    The last says how intrinsics were changed, and how well they agree with the captures.
     """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
@@ -29,19 +30,23 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
             "device": _device(run.model.device),
         },
         "curves": {name: plain(values) for name, values in run.model.history().items()},
-        "intrinsics": "\n".join(filter(None, (_changed(run.model.scan), run.model.intrinsics_doubt()))),
+        "intrinsics": {
+            "change": plain(run.model.scan.intrinsics_change),
+            "self_calibration": _self_calibration(run.model.self_calibration()),
+        },
     }
 
 
-def _changed(scan: Scan) -> str:
-    """That the run's intrinsics are not those of the scan folder; "" if they are."""
-    if not scan.intrinsics_change:
-        return ""
-    camera, projector = 100 * scan.intrinsics_change.camera.focal, 100 * scan.intrinsics_change.projector.focal
-    return (
-        f"The intrinsics are not those of the scan folder: focal length of the camera {camera:+.2f} %, of the "
-        f"projector {projector:+.2f} %. The transforms.json of the refined poses holds them"
-    )
+def _self_calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
+    """Which change of the intrinsics would agree better with the captures, with its uncertainty."""
+    if found is None:
+        return None
+    return {
+        "change": plain(IntrinsicsChange.of(found.change.tolist())),
+        "sigma": plain(IntrinsicsChange.of(found.sigma.tolist())),
+        "chi_square": found.chi_square,
+        "contradicts": found.contradicts(),
+    }
 
 
 def run_settings(config: Any) -> dict[str, Any]:

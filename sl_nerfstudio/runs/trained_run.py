@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
@@ -47,8 +48,8 @@ class TrainedModel(Protocol):
         """One sigma of each frame's poses, in the order of PoseSigma's fields; None where it was not estimated."""
         ...
 
-    def intrinsics_doubt(self) -> str:
-        """What the captures say against the intrinsics; "" if nothing."""
+    def self_calibration(self) -> SelfCalibration | None:
+        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
         ...
 
     def history(self) -> dict[str, list[float]]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, pose, transform
@@ -108,7 +108,7 @@ class ExactMaps(CoordinateMaps):
     def around(rig: Rig, size: int) -> "ExactMaps":
         """Maps that know the true poses."""
         m = CoordinateMaps.of(images_of(rig, size))
-        return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.max_roughness, rig)
+        return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.settings, m.max_roughness, rig)
 
     def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
         uv, part = seen(self.rig, frame, uv_camera)

@@ -1,4 +1,4 @@
-"""The joint adjustment finds true poses again, keeps what its mode says, and is not led astray."""
+"""The adjustment recovers true poses, holds what is not free, and is not misled by wrong decodings."""
 
 from dataclasses import dataclass, replace
 from math import degrees, radians
@@ -8,15 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import (
-    Adjustment,
-    AdjustmentSettings,
-    adjust,
-)
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.free_parameters import constrained, free_parameters
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
@@ -134,7 +131,7 @@ def test_wrong_cells_do_not_spoil_it(true):
     cells = torch.rand(FRAMES, SIZE // 5, SIZE // 5, generator=torch.Generator().manual_seed(0)) < 0.03
     m = ExactMaps.around(true, SIZE)
     wrong = cells.repeat_interleave(5, 1).repeat_interleave(5, 2)
-    maps = SpoiltMaps(m.values, m.offsets, m.widths, m.heights, m.max_roughness, true, wrong)
+    maps = SpoiltMaps(m.values, m.offsets, m.widths, m.heights, m.settings, m.max_roughness, true, wrong)
     turn, shift = errors(
         adjust(disturbed(true), maps, prior_of(FRAMES), "known-rig", replace(QUICK, max_iterations=30)).rig, true
     )
@@ -200,7 +197,7 @@ def test_prior_equations_are_derivatives_of_the_weighted_departure():
     prior = PosePrior(*sigmas)
     rig = disturbed(true, 7, degrees=0.05, shift=0.001, relative=1.0)
 
-    def cost(r: Rig) -> float:
+    def half_cost(r: Rig) -> float:
         delta = log_se3(r.T_world_camera @ inverse(true.T_world_camera))
         t = r.T_camera_projector[:, :3, 3] - true.T_camera_projector[:, :3, 3]
         w = log_so3(r.T_camera_projector[:, :3, :3] @ true.T_camera_projector[:, :3, :3].transpose(1, 2))
@@ -213,8 +210,11 @@ def test_prior_equations_are_derivatives_of_the_weighted_departure():
         x = torch.zeros(12 * n, dtype=torch.float64)
         x[k] = step
         plus, minus = (rig.moved(*(s * x).reshape(2, n, 6)) for s in (1, -1))
-        expected[k] = (cost(plus) - cost(minus)) / (2 * step)
+        expected[k] = (half_cost(plus) - half_cost(minus)) / (2 * step)
     assert (g - expected).abs().max() < 5e-3 * expected.abs().max()
     assert torch.allclose(H, H.T) and torch.linalg.eigvalsh(H).min() > 0
+    term = PriorTerm(prior, true, 3.0)
+    assert term.energy(rig) == pytest.approx(6 * half_cost(rig), rel=1e-12)
+    assert torch.equal(term.equations(rig)[0], 3 * H) and torch.equal(term.equations(rig)[1], 3 * g)
     at_start = prior_equations(prior, true, true)[1]
     assert at_start.abs().max() < 1e-12 * float(H.abs().max())

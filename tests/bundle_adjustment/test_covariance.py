@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings, adjust
+from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.se3 import inverse, log_se3
 
 from .analytic import images_of, rig_of

@@ -1,15 +1,18 @@
-"""Refined poses are judged by pixels that took no part: a disturbed rig loses, wrong decodings decide nothing."""
+"""Held-out pixels judge poses: a disturbed rig loses, chance and wrong decodings decide nothing."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.cross_validation import HeldOutPixels, cross_validate
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.cross_validation import HeldOutPixels, cross_validate, mean_and_error
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 
 from .analytic import ExactMaps, disturbed, rig_of
 
-FRAMES, SIZE, WIDTH = 4, 60, 4.0
+FRAMES, SIZE, NOISE = 4, 60, 1.0
+WIDTH = 4 * NOISE
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +30,9 @@ def held_out(maps) -> HeldOutPixels:
     generator = torch.Generator().manual_seed(0)
     uv = [maps.draw(k, 80, generator) for k in range(FRAMES)]
     frame = torch.arange(FRAMES).repeat_interleave(torch.tensor([len(u) for u in uv]))
-    return HeldOutPixels(frame, torch.cat(uv), maps.decoded_at(frame, torch.cat(uv)))
+    pixel = torch.cat(uv).long() // 8
+    block = 64 * frame + 8 * pixel[:, 1] + pixel[:, 0]
+    return HeldOutPixels(frame, torch.cat(uv), maps.decoded_at(frame, torch.cat(uv)), block)
 
 
 @pytest.mark.parametrize("kind", ["frames", "projectors"])
@@ -35,7 +40,7 @@ def held_out(maps) -> HeldOutPixels:
 def test_a_disturbed_rig_is_worse_than_the_true_one(true, maps, held_out, kind, seed):
     small = {"degrees": 0.3, "shift": 0.01}
     rig = disturbed(true, seed, **small) if kind == "frames" else disturbed(true, seed, **small, relative=1.0)
-    better, worse = cross_validate(rig, true, held_out, maps, WIDTH), cross_validate(true, rig, held_out, maps, WIDTH)
+    better, worse = cross_validate(rig, true, held_out, maps, NOISE), cross_validate(true, rig, held_out, maps, NOISE)
     assert better.better and not worse.better
     assert better.after_px < 0.9 * better.before_px  # what is hidden in another frame costs the same in both
     assert (better.before_px, better.after_px) == pytest.approx((worse.after_px, worse.before_px))
@@ -43,8 +48,8 @@ def test_a_disturbed_rig_is_worse_than_the_true_one(true, maps, held_out, kind, 
 
 
 def test_the_same_rig_is_no_better(true, maps, held_out):
-    verdict = cross_validate(true, true, held_out, maps, WIDTH)
-    assert verdict.before_px == verdict.after_px and not verdict.better
+    found = cross_validate(true, true, held_out, maps, NOISE)
+    assert found.before_px == found.after_px and not found.better
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])
@@ -53,14 +58,40 @@ def test_wrong_decodings_do_not_decide(true, maps, held_out, share):
     wrong = torch.rand(len(held_out.frame), generator=generator) < share
     elsewhere = 400 * torch.rand(len(wrong), 2, generator=generator, dtype=torch.float64)
     uv = torch.where(wrong[:, None], elsewhere, held_out.uv_projector)
-    spoilt = HeldOutPixels(held_out.frame, held_out.uv_camera, uv)
-    verdict = cross_validate(disturbed(true, 0, degrees=0.3, shift=0.01), true, spoilt, maps, WIDTH)
-    assert verdict.better and verdict.before_px <= WIDTH
+    spoilt = replace(held_out, uv_projector=uv)
+    found = cross_validate(disturbed(true, 0, degrees=0.3, shift=0.01), true, spoilt, maps, NOISE)
+    assert found.better and found.before_px <= WIDTH
 
 
 def test_a_rig_that_sees_nothing_is_the_worst(true, maps, held_out):
     """Cameras turned away: no residual can be formed, which is no excuse."""
     away = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     blind = Rig(true.camera, true.projector, true.T_world_camera @ away, true.T_camera_projector)
-    verdict = cross_validate(true, blind, held_out, maps, WIDTH)
-    assert not verdict.better and verdict.after_px <= WIDTH
+    found = cross_validate(true, blind, held_out, maps, NOISE)
+    assert not found.better and found.after_px <= WIDTH
+
+
+def test_a_difference_within_its_standard_error_decides_nothing(true, maps, held_out):
+    """Poses that differ by much less than the decoding noise: kept as they were, whichever way chance leans."""
+    generator = torch.Generator().manual_seed(3)
+    noisy = replace(
+        held_out, uv_projector=held_out.uv_projector + torch.randn(len(held_out.frame), 2, generator=generator).double()
+    )
+    nudges = [disturbed(true, seed, degrees=0.002, shift=0.00005) for seed in range(12)]
+    found = [cross_validate(true, nudge, noisy, maps, NOISE) for nudge in nudges]
+    assert {f.difference < 0 for f in found} == {True, False}  # a comparison without a margin would keep some
+    assert not any(f.better for f in found)
+
+
+def test_the_standard_error_is_that_of_independent_blocks():
+    """Values that are the same all over a block count as one: against the spread over many draws."""
+    generator = torch.Generator().manual_seed(0)
+    block = torch.arange(40).repeat_interleave(25)
+    means, errors = [], []
+    for _ in range(400):
+        values = torch.randn(40, generator=generator, dtype=torch.float64)[block]
+        mean, error = mean_and_error(values, block)
+        means.append(mean)
+        errors.append(error)
+    assert torch.tensor(means).std().item() == pytest.approx(sum(errors) / len(errors), rel=0.1)
+    assert mean_and_error(torch.ones(5, dtype=torch.float64), torch.zeros(5, dtype=torch.int64))[1] == float("inf")

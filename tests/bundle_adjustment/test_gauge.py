@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, baselines, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.residuals import Rig, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.se3 import exp_se3
 
 from .analytic import disturbed, images_of, rig_of
@@ -40,13 +41,13 @@ def test_a_changed_gauge_is_undone(known):
 def test_the_known_baseline_or_the_mean_is_kept_exactly(known):
     start = rig_of(FRAMES, SIZE)
     rig = scaled(disturbed(start, 1, relative=1.0), 0.8, TWIST)
-    before, after = baselines(start), baselines(restore(start, rig, baseline_scale(start, rig, known)))
+    before, after = start.baseline, restore(start, rig, baseline_scale(start, rig, known)).baseline
     assert not torch.allclose(before, after, rtol=1e-4)
     if known is None:
         assert float(after.log().mean() - before.log().mean()) == pytest.approx(0, abs=1e-13)
     else:
         assert float(after[known]) == pytest.approx(float(before[known]), rel=1e-13)
-    assert torch.allclose(after / baselines(rig), (after / baselines(rig))[:1], rtol=1e-12)
+    assert torch.allclose(after / rig.baseline, (after / rig.baseline)[:1], rtol=1e-12)
 
 
 def prior_of(frame_translation: float, relative_translation: float) -> PosePrior:
@@ -62,7 +63,7 @@ def test_the_scale_that_agrees_best_is_the_weighted_least_squares_one(frames, re
     rig.T_camera_projector[:, :3, 3] *= long
     centre = start.T_world_camera[:, :3, 3]
     of_frames = float((centre - centre.mean(0)).pow(2).sum()) / frames**2
-    of_baselines = float(baselines(start).pow(2).sum()) / relative**2
+    of_baselines = float(start.baseline.pow(2).sum()) / relative**2
     expected = (of_frames + long * of_baselines) / (of_frames + long**2 * of_baselines)
     found = agreeing_scale(start, scaled(rig, 0.7, TWIST), prior_of(frames, relative))
     assert found * 0.7 == pytest.approx(expected, rel=1e-9)
@@ -73,7 +74,7 @@ def test_no_residual_changes():
     maps, generator = CoordinateMaps.of(images_of(true, SIZE)), torch.Generator().manual_seed(0)
     rig = disturbed(true, 1, degrees=0.3, shift=0.01, relative=0.5)
     anchors = place_anchors(rig, maps, 40, generator)
-    rows = observe(rig, anchors, maps, 3, 50.0, generator)
+    rows = observe(rig, anchors, maps, 3, 50.0, 0.1, generator)
     factor = baseline_scale(true, rig, 0)
     found = restore(true, rig, factor)
     before = residuals_of(rig, anchors, rows, maps)

@@ -5,8 +5,10 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
+from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Rig, linearise, normal_equations, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.se3 import transform
 
 from .analytic import ExactMaps, cast, disturbed, images_of, rig_of
@@ -20,7 +22,7 @@ def scene(request):
     rig = rig_of(FRAMES, SIZE, request.param)
     maps, generator = CoordinateMaps.of(images_of(rig, SIZE)), torch.Generator().manual_seed(0)
     anchors = place_anchors(rig, maps, 60, generator)
-    return rig, maps, anchors, observe(rig, anchors, maps, 3, 8.0, generator)
+    return rig, maps, anchors, observe(rig, anchors, maps, 3, 8.0, 0.1, generator)
 
 
 def test_residuals_of_a_true_rig_are_zero(scene):
@@ -28,7 +30,7 @@ def test_residuals_of_a_true_rig_are_zero(scene):
     exact = ExactMaps.around(rig, SIZE)
     pixels = torch.Generator().manual_seed(1)
     anchors = place_anchors(rig, exact, 60, pixels)
-    rows = observe(rig, anchors, exact, 3, 20.0, pixels)
+    rows = observe(rig, anchors, exact, 3, 20.0, 0.1, pixels)
     r = residuals_of(rig, anchors, rows, exact)
     p = transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)[rows.anchor]
     way = p - rig.T_world_camera[rows.frame, :3, 3]

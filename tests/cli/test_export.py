@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -45,8 +46,8 @@ class BallModel:
     def pose_sigma(self):
         return self.sigma
 
-    def intrinsics_doubt(self):
-        return "the camera is too long"
+    def self_calibration(self):
+        return SelfCalibration(torch.full((6,), 0.01).double(), 1e-6 * torch.eye(6).double())
 
     def history(self):
         return {"step": [0.0, 5.0], "loss": [1.0, float("nan")]}
@@ -117,7 +118,13 @@ def test_training_record_is_json_with_settings_versions_and_curves(scan, tmp_pat
     assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["model"] == {"lr": 1e-3, "where": "a"}
     assert record["versions"]["torch"] == torch.__version__ and "python" in record["versions"]
     assert record["curves"] == {"step": [0.0, 5.0], "loss": [1.0, None]}
-    assert record["intrinsics"] == "the camera is too long"
+    assert record["intrinsics"]["change"] == {
+        device: {"focal": 0, "x": 0, "y": 0} for device in ("camera", "projector")
+    }
+    found = record["intrinsics"]["self_calibration"]
+    assert found["contradicts"] and found["chi_square"] == pytest.approx(600)
+    assert found["change"]["projector"] == pytest.approx({"focal": 0.01, "x": 0.01, "y": 0.01})
+    assert found["sigma"]["camera"] == pytest.approx({"focal": 1e-3, "x": 1e-3, "y": 1e-3})
     assert "sl_pose_sigma" not in (tmp_path / "r/transforms.json").read_text()  # not estimated, so not stated
 
 

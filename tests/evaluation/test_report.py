@@ -24,7 +24,18 @@ TRAINING = {
     "settings": {"method": "sl-neus", "model": {"refine_poses": "free", "note": "<script>alert(1)</script>"}},
     "versions": {"torch": "2.11"},
     "curves": {"step": [0, 100, 200], "loss": [5.0, 0.5, 0.1], "coordinate_px": [20.0, None, 0.4]},
-    "intrinsics": "The intrinsics contradict the captures",
+    "intrinsics": {
+        "change": {"camera": {"focal": 0.01, "x": 0.0, "y": 0.0}, "projector": {"focal": -0.005, "x": 0.0, "y": 0.0}},
+        "self_calibration": {
+            "change": {"camera": {"focal": 0.002, "x": 0.0, "y": 0.0}, "projector": {"focal": 0.0, "x": 0.0, "y": 0.0}},
+            "sigma": {
+                "camera": {"focal": 1e-4, "x": 1e-4, "y": 1e-4},
+                "projector": {"focal": 1e-4, "x": 0.0, "y": 0.0},
+            },
+            "chi_square": 412.3,
+            "contradicts": True,
+        },
+    },
 }
 
 
@@ -114,7 +125,8 @@ def test_report_tells_everything(full_report: str) -> None:
         "Scan report: scan", "<mesh & co>.ply", "refined/transforms.json", "2026-01-02 03:04", "What it means",
         "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
         "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
-        "known (by construction)", "σ frame", "The intrinsics contradict the captures",
+        "known (by construction)", "σ frame", "The intrinsics contradict the captures (chi square 412, by chance 6)",
+        "focal length of the camera +1.00 %, of the projector -0.50 %", "camera: focal length +0.20 ± 0.01 %",
     ):  # fmt: skip
         assert what in text, what
     assert "<script>alert(1)" not in full_report  # only escaped

@@ -1,5 +1,6 @@
 """The same scan in other units, or in a turned and shifted world, gives the same surface."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def surface(folder: Path) -> np.ndarray:
     """Vertices of the observed surface after a short run, in world units."""
     loaded = load_scan(folder)
     config = SLModelConfig(schedule_iterations=STEPS)
-    config.adjustment.anchors_per_frame = 100
+    config.adjustment = replace(config.adjustment, anchors_per_frame=100)
     config.sdf.levels, config.sdf.max_resolution, config.sdf.hidden = 3, 64, 32
     torch.manual_seed(0)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

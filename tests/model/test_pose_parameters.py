@@ -1,18 +1,22 @@
-"""Poses as parameters: what an increment means, derivatives, and starting anew from other poses."""
+"""Poses as parameters: what an increment means, derivatives, other base poses, and what each choice holds fixed."""
 
 import pytest
 import torch
 
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
+from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.pose_parameters import (
+    CoupledPoseParameters,
     IndependentPoseParameters,
     PoseParameters,
     RigPoseParameters,
     StaticProjectorParameters,
+    make_pose_parameters,
 )
 
 FRAMES = 3
-KINDS = pytest.mark.parametrize("kind", [RigPoseParameters, IndependentPoseParameters])
+KINDS = pytest.mark.parametrize("kind", [RigPoseParameters, IndependentPoseParameters, CoupledPoseParameters])
 
 
 def random_poses(seed: int) -> torch.Tensor:
@@ -96,7 +100,7 @@ def test_gradients_are_central_differences(kind, zero):
 
 
 @KINDS
-def test_starting_anew_from_other_poses(kind):
+def test_going_on_from_other_poses(kind):
     poses = make(kind)
     set_steps(poses)
     poses.rebase(random_poses(5), random_poses(6))
@@ -140,3 +144,50 @@ def test_training_in_float32_keeps_the_base_in_float64():
     poses = RigPoseParameters(random_poses(0), random_poses(1), True, True)
     assert poses.camera_step.dtype == torch.float32
     assert torch.allclose(poses()[0], random_poses(0), rtol=0, atol=1e-14)
+
+
+METHODS = ("adjust", "adjust-and-render", "render", "render-independently")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("free", ["free", "rigid-rig", "known-rig", "static-projector", "off"])
+def test_every_choice_moves_what_it_says_and_holds_the_rest(free, method):
+    """One choice of what is free and one of how: no pair of them contradicts itself."""
+    settings = SLModelConfig(refine_poses=free, pose_method=method)
+    start, light = random_poses(0), random_poses(1)
+    poses = make_pose_parameters(settings, start, light).double()
+    moves = free != "off" and method != "adjust"
+    assert settings.renders_poses == moves and settings.adjusts_poses == (free != "off" and method.startswith("adjust"))
+    assert poses.camera_step.requires_grad == moves
+    assert poses.projector_step.requires_grad == (moves and free in ("free", "rigid-rig"))
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():  # one step of any optimiser: along what has a gradient
+        for step in (p for p in poses.parameters() if p.requires_grad):
+            step.copy_(0.1 * torch.randn(step.shape, generator=generator, dtype=torch.float64))
+    camera, projector = poses()
+    before, after = inverse(start) @ light, inverse(camera) @ projector
+    assert torch.allclose(camera, start, atol=1e-12) == (not moves)
+    if free == "static-projector":
+        assert torch.allclose(projector, light, atol=1e-12)
+    elif free in ("known-rig", "off") or not moves:
+        assert torch.allclose(after, before, atol=1e-12)
+    elif free == "rigid-rig":
+        change = after @ inverse(before)
+        assert torch.allclose(change, change[:1].expand_as(change), atol=1e-12)
+        assert not torch.allclose(change[0], torch.eye(4, dtype=torch.float64), atol=1e-3)
+    else:
+        assert (after - before).abs().flatten(1).amax(1).min() > 1e-3  # every frame's own
+
+
+def test_what_the_adjustment_found_travels_with_the_poses():
+    poses = make(RigPoseParameters)
+    assert poses.self_calibration() is None
+    sigma, found = torch.rand(FRAMES, 12), SelfCalibration(torch.rand(6).double(), torch.eye(6).double())
+    poses.note(sigma, found)
+    other = make(RigPoseParameters)
+    other.load_state_dict(poses.state_dict())
+    kept = other.self_calibration()
+    assert (
+        kept is not None and torch.equal(kept.change, found.change) and torch.equal(kept.covariance, found.covariance)
+    )
+    assert torch.equal(other.sigma, sigma.double())

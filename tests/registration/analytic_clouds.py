@@ -5,7 +5,7 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import judge_relative_pose

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pair_registration import ANYWHERE, NEARBY, NEIGHBOURS, register_pair, rotations

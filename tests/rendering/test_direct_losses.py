@@ -1,6 +1,6 @@
 """Losses on triangulated points, with a sphere by formula in place of the trained field."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,10 +8,17 @@ from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, pose, transform
-from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.rendering.direct_losses import direct_losses
+from sl_nerfstudio.rendering.direct_losses import (
+    DecodingNoise,
+    MeasuredRays,
+    direct_losses,
+    field_losses,
+    random_points,
+)
+from sl_nerfstudio.rendering.settings import LossConfig
 
 RADIUS = 0.5
+NOISE = DecodingNoise(px=0.3, px_per_length=150.0)
 PROJECTOR = Intrinsics.of(Device(400, 400, 520.0, 520.0, 200.0, 200.0), torch.float64)
 
 
@@ -28,20 +35,6 @@ class Sphere:
         return self.sdf(p), self.sign * p / p.norm(dim=-1, keepdim=True)
 
 
-def model_with(field: Sphere, step: int = 500) -> SimpleNamespace:
-    """What the losses ask a model for."""
-    config = SLModelConfig()
-    config.schedule_iterations = 1000
-    return SimpleNamespace(
-        config=config,
-        field=field,
-        projector=PROJECTOR,
-        noise_px=torch.tensor(0.3),
-        px_per_length=torch.tensor(150.0),
-        step_now=torch.tensor(step),
-    )
-
-
 def projector_pose() -> Tensor:
     back = torch.tensor([1.0, 0.2, 2.8], dtype=torch.float64)
     t, back = back, back / back.norm()
@@ -51,7 +44,7 @@ def projector_pose() -> Tensor:
 
 
 @pytest.fixture
-def views() -> tuple[dict, dict]:
+def rays() -> MeasuredRays:
     """Rays from (0, 0, 3) that meet the sphere, and what an errorless decoder says there."""
     axis = torch.linspace(-0.25, 0.25, 12, dtype=torch.float64)
     aim = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
@@ -63,13 +56,13 @@ def views() -> tuple[dict, dict]:
     T = projector_pose()
     coords, lit = project(PROJECTOR, transform(inverse(T), p))
     assert lit.all()
-    outputs = {"origins": o, "directions": d, "T_scene_projector": T.expand(len(o), 4, 4)}
-    return outputs, {"coords": coords, "decoded": torch.ones(len(o), 1, dtype=torch.bool)}
+    return MeasuredRays(o, d, T.expand(len(o), 4, 4), coords)
 
 
-def losses(field: Sphere, outputs: dict, batch: dict, step: int = 500) -> dict[str, Tensor]:
+def losses(field: Sphere, rays: MeasuredRays, step: int = 500) -> dict[str, Tensor]:
     torch.manual_seed(0)
-    return direct_losses(model_with(field, step), outputs, batch)
+    points = random_points(1024, torch.device("cpu")).double()
+    return direct_losses(field, rays, PROJECTOR, NOISE, points, LossConfig(), step / 1000)
 
 
 def kernel(distance: float, step: int) -> float:
@@ -77,19 +70,19 @@ def kernel(distance: float, step: int) -> float:
     return width * (1 - torch.tensor(-distance / width).exp().item())
 
 
-def test_the_true_field_costs_nothing(views):
-    for name, value in losses(Sphere(), *views).items():
+def test_the_true_field_costs_nothing(rays):
+    for name, value in losses(Sphere(), rays).items():
         assert float(value) < 1e-9, name
 
 
 @pytest.mark.parametrize("step", [0, 500, 1000])
-def test_a_field_that_is_off_by_a_constant_costs_the_kernel_of_it(views, step):
-    found = losses(Sphere(RADIUS + 0.02), *views, step)["surface"]
+def test_a_field_that_is_off_by_a_constant_costs_the_kernel_of_it(rays, step):
+    found = losses(Sphere(RADIUS + 0.02), rays, step)["surface"]
     assert float(found) == pytest.approx(kernel(0.02, step), rel=1e-6)
 
 
-def test_a_field_inside_out_costs_signs_but_no_surface(views):
-    found = losses(Sphere(sign=-1.0), *views)
+def test_a_field_inside_out_costs_signs_but_no_surface(rays):
+    found = losses(Sphere(sign=-1.0), rays)
     assert float(found["free_space"]) > 0.01 and float(found["surface"]) < 1e-9
 
 
@@ -116,36 +109,33 @@ class Folded(Sphere):
 
 
 @pytest.mark.parametrize("half", [0.002, 0.01, 0.02])
-def test_a_surface_that_is_folded_about_the_measured_points_costs_signs(views, half):
-    found = losses(Folded(half), *views)
+def test_a_surface_that_is_folded_about_the_measured_points_costs_signs(rays, half):
+    found = losses(Folded(half), rays)
     assert float(found["surface"]) < 1e-9 and float(found["eikonal"]) < 1e-9
     assert float(found["free_space"]) > 0.05
 
 
-def test_wrong_and_missing_decodings_do_not_count(views):
-    outputs, batch = views
-    coords, decoded = batch["coords"].clone(), batch["decoded"].clone()
+def test_wrong_and_missing_decodings_do_not_count(rays):
+    coords, decoded = rays.uv_projector.clone(), torch.ones(len(rays.origins), dtype=torch.bool)
     coords[::3, 1] += 25.0  # across the epipolar lines, which run along x here
     coords[1::5], decoded[1::5] = float("nan"), False
-    spoilt = losses(Sphere(RADIUS + 0.02), outputs, {"coords": coords, "decoded": decoded})["surface"]
+    spoilt = losses(Sphere(RADIUS + 0.02), replace(rays, uv_projector=coords).chosen(decoded))["surface"]
     assert float(spoilt) == pytest.approx(kernel(0.02, 500), rel=1e-6)
 
 
-def test_without_weights_only_the_slope_is_asked_for(views):
-    model = model_with(Sphere(RADIUS + 0.1))
-    model.config.losses.surface = model.config.losses.free_space = 0.0
-    found = direct_losses(model, *views)
+def test_without_direct_terms_only_the_slope_counts():
+    points = random_points(1024, torch.device("cpu")).double()
+    assert points.norm(dim=-1).max() <= 1 and 0.7 < float(points.norm(dim=-1).mean()) < 0.8  # uniform in the ball: 3/4
+    found = field_losses(Sphere(RADIUS + 0.1), points, LossConfig(surface=0.0, free_space=0.0))
     assert list(found) == ["eikonal"] and float(found["eikonal"]) < 1e-9
+    assert not LossConfig(surface=0.0, free_space=0.0).direct and LossConfig().direct
 
 
-def test_the_gradient_by_the_projector_s_pose_is_a_central_difference(views):
-    outputs, batch = views
-
+def test_the_gradient_by_the_projector_s_pose_is_a_central_difference(rays):
     def surface(xi: Tensor) -> Tensor:
         T = exp_se3(xi) @ projector_pose()
-        return losses(
-            Sphere(RADIUS + 0.02), {**outputs, "T_scene_projector": T.expand(len(batch["coords"]), 4, 4)}, batch
-        )["surface"]
+        turned = replace(rays, T_scene_projector=T.expand(len(rays.origins), 4, 4))
+        return losses(Sphere(RADIUS + 0.02), turned)["surface"]
 
     xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(surface(xi), xi)

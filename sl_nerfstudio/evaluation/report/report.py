@@ -14,6 +14,7 @@ from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
+from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
 from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, data_uri, render, views_of
 from sl_nerfstudio.evaluation.report.plot3d import compressed_script, mesh_figure
@@ -66,7 +67,7 @@ def render_report(report: ReportInput) -> str:
         "fit": evaluation.fit,
         "units": evaluation.units,
         "truth_units": evaluation.truth_units,
-        "verdict": judge(evaluation, str((report.training or {}).get("intrinsics", ""))),
+        "verdict": judge(evaluation, intrinsics_hint(report.training, report.scan)),
         "surface": _surface_pictures(report, surface),
         "comparisons": comparisons,
         "coordinate_scale": COORDINATE,
