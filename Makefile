@@ -1,5 +1,5 @@
-# One machine, one virtual environment: `make install` makes .venv from pinned versions, and every target
-# below uses it. Nothing is installed twice: the stamp is renewed only when a pinned version changes.
+# `make install` creates the virtual environment .venv from pinned versions, and every target below uses it.
+# It is installed once: the stamp is renewed only when a pinned version changes.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -16,22 +16,22 @@ DEMO_RUN := $(DEMO)/run/cone-and-cylinder/sl-neus/demo
 IMAGES := outputs/demo-images
 IMAGES_RUN := $(IMAGES)/run/head/sl-neus/demo
 
-# The first of these that runs, is of a version in range and can make virtual environments.
-# `make install PYTHON=/path/to/python3.12` chooses another.
+# Takes the first of these that runs, has a supported version and can create virtual environments.
+# `make install PYTHON=/path/to/python3.12` selects another.
 PYTHONS := python3.11 python3.12 python3.10 python3 python
 SUITABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
 
 .PHONY: help install demo demo-images test bench lint format clean
 
 help:
-	@echo "make install   .venv with pinned dependencies and this package"
-	@echo "make demo      synthesise, train, export, evaluate: outputs/demo/report.html (minutes)"
-	@echo "make demo-images   the same from images alone: decoding, calibration and registration come first (minutes)"
-	@echo "make test      the test suite"
-	@echo "make bench     the benchmarks that need minutes; results in benchmarks/results/"
-	@echo "make lint      ruff and pyright"
-	@echo "make format    let ruff format the code and sort the imports"
-	@echo "make clean     remove .venv, the demo's output and caches; your own outputs stay"
+	@echo "make install   create .venv with pinned dependencies and this package"
+	@echo "make demo      synthesise, train, export and evaluate a scan: outputs/demo/report.html (minutes)"
+	@echo "make demo-images   the same from images alone, with decoding, calibration and registration first (minutes)"
+	@echo "make test      run the test suite"
+	@echo "make bench     run the benchmarks that take minutes; results in benchmarks/results/"
+	@echo "make lint      check with ruff and pyright"
+	@echo "make format    format the code and sort the imports with ruff"
+	@echo "make clean     remove .venv, the output of the demos and caches; keeps your own outputs"
 
 install: $(STAMP)
 
@@ -43,14 +43,14 @@ $(BIN)/python:
 	if [ -z "$$python" ]; then \
 	  echo "error: no suitable Python found (tried: $(PYTHONS))." >&2; \
 	  echo "       Needed: Python 3.10, 3.11 or 3.12 with its venv and ensurepip modules, for example" >&2; \
-	  echo "       'apt-get install python3.11 python3.11-venv' on Debian 12; or name one: make install PYTHON=/path/to/python3" >&2; \
+	  echo "       'apt-get install python3.11 python3.11-venv' on Debian 12; or choose one: make install PYTHON=/path/to/python3" >&2; \
 	  exit 1; \
 	fi; \
 	echo "creating $(VENV) with $$python ($$("$$python" --version))"; \
 	"$$python" -m venv --clear $(VENV)
 
 $(STAMP): $(BIN)/python pyproject.toml constraints.txt
-	@# All of it comes as wheels but pyliblzfse (viser's, for iPhone recordings, unused here): without a C compiler it is left out.
+	@# Everything comes as wheels except pyliblzfse (viser needs it for iPhone recordings, unused here); without a C compiler it is left out.
 	@if $(PIP) --quiet pyliblzfse >/dev/null 2>&1; then \
 	  $(PIP) --editable '.[dev]'; \
 	else \
@@ -60,8 +60,8 @@ $(STAMP): $(BIN)/python pyproject.toml constraints.txt
 	  $(PIP) --no-deps --editable .; \
 	fi
 	@$(BIN)/python -c 'import cv2, open3d, torch, torchvision' || { \
-	  echo "error: the packages are installed, but not all of them can be loaded (see above)." >&2; \
-	  echo "       Where a shared library is missing (libGL.so.1, libgomp.so.1): 'apt-get install libgl1 libgomp1'." >&2; \
+	  echo "error: the packages are installed, but some of them cannot be loaded (see above)." >&2; \
+	  echo "       If a shared library is missing (libGL.so.1, libgomp.so.1): 'apt-get install libgl1 libgomp1'." >&2; \
 	  exit 1; \
 	}
 	@touch $@
@@ -80,7 +80,7 @@ demo: install
 	@echo "figures  $(DEMO)/evaluation.json"
 	@echo "report   $(CURDIR)/$(DEMO)/report.html (open it in a browser)"
 
-# The truth joins the scan for sl-eval only; nothing before it has seen it. Without a known length, scale is free.
+# The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.
 demo-images: install
 	rm -rf $(IMAGES)
 	$(BIN)/sl-synth --output $(IMAGES)/captures --scene head --frames 22 --images-only
@@ -93,7 +93,7 @@ demo-images: install
 	$(BIN)/sl-eval --mesh $(IMAGES)/mesh.ply --data $(IMAGES)/scan --poses $(IMAGES)/refined/transforms.json \
 	  --json $(IMAGES)/evaluation.json --report $(IMAGES)/report.html
 
-# On more than one core; a file's tests stay together, because they share what was trained for them.
+# On up to four cores. The tests of one file run together, because they share what was trained for them.
 test: install
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 

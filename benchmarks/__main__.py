@@ -1,4 +1,4 @@
-"""Runs the benchmarks that need minutes, one after the other: `make bench`, or `python -m benchmarks [NAME ...]`."""
+"""Runs the benchmarks that take minutes, one after another: `make bench`, or `python -m benchmarks [NAME ...]`."""
 
 import subprocess
 import sys
@@ -15,14 +15,14 @@ BENCHMARKS: dict[str, list[str]] = {
     "decoding": [],
     "decoding_graphs": [],
 }
-"""Name of the module, and its arguments besides --output."""
+"""Module names, and their arguments besides --output."""
 
 
 def main(names: list[str]) -> int:
-    """Run the named benchmarks, or all; the exit status is that of the first that fails."""
+    """Run the named benchmarks, or all. Return the exit status of the first that fails, or 0."""
     unknown = sorted(set(names) - BENCHMARKS.keys())
     if unknown:
-        print(f"error: no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        print(f"error: no benchmark named {', '.join(unknown)}; choose from {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 1
     for name in names or BENCHMARKS:
         status = make_scan() if str(SCAN) in BENCHMARKS[name] else 0
@@ -33,14 +33,14 @@ def main(names: list[str]) -> int:
 
 
 def make_scan() -> int:
-    """The synthetic scan that several benchmarks use, made once."""
+    """Make the synthetic scan that several benchmarks use, unless it exists. Return the exit status."""
     if (SCAN / "transforms.json").exists():
         return 0
     return run("sl_nerfstudio.cli.synth", "--output", str(SCAN))
 
 
 def run(module: str, *arguments: str) -> int:
-    """Run a module with the same Python; what it prints is shown as it comes."""
+    """Run a module with the same Python, showing its output as it comes. Return its exit status."""
     print(f"\n$ python -m {module} {' '.join(arguments)}", flush=True)
     start = time.monotonic()
     status = subprocess.run([sys.executable, "-m", module, *arguments], check=False).returncode

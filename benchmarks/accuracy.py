@@ -1,12 +1,12 @@
-"""Surface and pose error of whole runs, by the commands a user types, against the truth of synthetic scans.
+"""Surface and pose errors of whole runs, with the commands a user types, against the truth of synthetic scans.
 
     python -m benchmarks.accuracy [--scenes cone-and-cylinder head frog] [--seeds 1 2 3] [--iterations 1000]
 
-For every scene and seed one noisy scan is made and trained four times: as `sl-neus` does it (`refined`), with
-the starting poses kept (`unrefined`), with the true poses given (`oracle`: nobody can do much better with this
-field), and with rigid frames only (`known-rig`). `--variants` names others: each part of the method left out
-(`no-pattern`, `no-annealing`, `no-direct`, `no-warm-start`, `no-coarse-to-fine`), or poses trained by the rendering
-losses instead of adjusted (`by-gradient`, `independent`). Prints a table; writes benchmarks/results/accuracy.json.
+For every scene and seed, one noisy scan is made and trained four times: by `sl-neus` with its defaults (`refined`),
+with the starting poses kept (`unrefined`), with the true poses given (`oracle`, about the best this field can do), and
+with the relative poses kept (`known-rig`). `--variants` selects others: one part of the method left out (`no-pattern`,
+`no-annealing`, `no-direct`, `no-warm-start`, `no-coarse-to-fine`), or poses refined by the rendering losses instead of
+the bundle adjustment (`by-gradient`, `independent`). Prints a table and writes benchmarks/results/accuracy.json.
 """
 
 import argparse
@@ -52,7 +52,7 @@ class Row(Score):
 
 
 def measure(scene: str, seed: int, method: str, iterations: int, folder: Path, variants: Sequence[str]) -> list[Row]:
-    """All variants on one scan."""
+    """Train and score all variants on one scan."""
     scan = folder / "scan"
     run("sl-synth", "--output", str(scan), "--scene", scene, "--frames", str(FRAMES[scene]), "--seed", str(seed))
     rows = []

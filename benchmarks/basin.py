@@ -1,11 +1,10 @@
-"""From how far away the joint adjustment finds the poses again.
+"""How far off the starting poses may be for the bundle adjustment to converge.
 
     python -m benchmarks.basin [--scene cone-and-cylinder] [--frames 22] [--seeds 1 2 3] [--output FILE]
 
-For every seed one noisy scan is made; starting poses of growing error take the place of its own (registration errors as
-given, auto-calibration errors as sl-synth's default), and are adjusted as `ns-train
-sl-neus` does before its first step.
-`astray` counts frames that end more than a degree off.
+For every seed, one noisy scan is made. Its starting poses are replaced by ones with growing registration errors (and
+sl-synth's default calibration errors), and adjusted as `ns-train sl-neus` does before its first step. `over_1_deg`
+counts frames that end more than one degree off.
 """
 
 import argparse
@@ -40,7 +39,7 @@ LEVELS = (
 
 @dataclass(frozen=True)
 class Row:
-    """One adjustment; RMS over the frames' cameras after one similarity, in mm and degrees."""
+    """One adjustment; RMS errors of the cameras after one similarity, in mm and degrees."""
 
     seed: int
     frame_deg: float
@@ -49,13 +48,13 @@ class Row:
     start_deg: float
     end_mm: float
     end_deg: float
-    astray: int
+    over_1_deg: int
     kept: bool
     seconds: float
 
 
 def from_errors(scan: Scan, setup: Setup) -> Scan:
-    """The scan with the starting poses of a setup."""
+    """The scan with the starting poses of `setup`."""
     poses = zip(scan.frames, setup.start.T_world_camera, setup.start.T_world_projector, strict=True)
     frames = (replace(f, T_world_camera=c, T_world_projector=p, pose_sigma=setup.sigma) for f, c, p in poses)
     return replace(scan, frames=tuple(frames))
@@ -97,7 +96,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=22)
     parser.add_argument("--resolution", type=int, default=400)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--folder", type=Path, default=Path("outputs/basin"), help="for the scans; made once")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/basin"), help="folder of the scans, made once")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/basin.json"))
     options = parser.parse_args()
     rows: list[Row] = []
@@ -114,8 +113,8 @@ def text(r: Row) -> str:
     """One line of the table."""
     return (
         f"seed {r.seed}  frames off by {r.frame_deg:5.2f} deg {r.frame_mm:4.0f} mm | cameras {r.start_mm:6.2f} mm "
-        f"{r.start_deg:6.3f} deg -> {r.end_mm:6.3f} mm {r.end_deg:6.3f} deg, {r.astray} astray"
-        f"{'' if r.kept else ', start kept'} | {r.seconds:.0f} s"
+        f"{r.start_deg:6.3f} deg -> {r.end_mm:6.3f} mm {r.end_deg:6.3f} deg, {r.over_1_deg} over 1 deg"
+        f"{'' if r.kept else ', starting poses kept'} | {r.seconds:.0f} s"
     )
 
 

@@ -1,4 +1,4 @@
-"""The network decoder on rendered captures of objects that it was not trained on, with exact truth.
+"""The network decoder on rendered captures, with exact truth, of objects that it was not trained on.
 
 python -m benchmarks.decoding [--scenes head frog] [--resolutions 400 800] [--frames 8] [--output results.json]
 """
@@ -27,11 +27,11 @@ from sl_nerfstudio.synthesis.synthesise import GAIN
 
 @dataclass(frozen=True)
 class Conditions:
-    """How hard captures are: `plain` is what sl-synth renders."""
+    """How difficult the captures are: `plain` is what sl-synth renders."""
 
     name: str
     sensor_noise: float  # at full scale, as a fraction of it
-    blur: float  # sigma of the lens in pixels, for a period of ten pixels; grows with it
+    blur: float  # sigma in pixels, for a period of ten pixels; grows with the period
     albedo_contrast: float
     room_light: float
 
@@ -44,42 +44,42 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class Config:
-    """Share decoded, error and wrong share of the network decoder."""
+    """Share decoded, error and share wrong of the network decoder."""
 
     scenes: tuple[str, ...] = ("cone-and-cylinder", "head", "frog")
     """scenes of sl-synth"""
     resolutions: tuple[int, ...] = (400, 800)
     """widths of the images, pixels"""
     frames: int = 8
-    """captures of each scene and resolution, from all around"""
+    """captures of each scene and resolution, from all sides"""
     doe: bool = False
     """a diffractive projector instead of a pinhole"""
     seed: int = 5
-    """of paths, textures and noise"""
+    """seed of paths, textures and noise"""
     output: Path | None = None
     """where to write the figures as JSON, with machine, date and commit"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one scene at one resolution; errors in projector pixels, of a period of 20."""
+    """Figures of one scene at one resolution; errors in projector pixels (a period is 20)."""
 
     conditions: str
     scene: str
     resolution: int
-    period: float  # pixels of the image, median
+    period: float  # median, in pixels of the image
     decoded: float  # share of the lit pixels
     median: float
     percentile_90: float
     wrong: float  # share of the decoded pixels that are off by more than half a period
     outside: float  # share of the decoded pixels that are not lit
-    failed: int  # frames
-    seconds: float  # a frame
+    failed: int  # number of frames
+    seconds: float  # per frame
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What one capture gave."""
+    """Result of one capture."""
 
     lit: int
     error: Float32[ndarray, "n"]  # at decoded lit pixels
@@ -88,7 +88,7 @@ class Frame:
 
 
 def measure(config: Config, conditions: Conditions, scene: str, resolution: int) -> Row:
-    """Render captures and decode them."""
+    """Render captures, decode them, and compare with the truth."""
     setup = harder(
         make_setup(
             SynthConfig(
@@ -132,7 +132,7 @@ def measure(config: Config, conditions: Conditions, scene: str, resolution: int)
 
 
 def harder(setup: Setup, conditions: Conditions, resolution: int) -> Setup:
-    """The same scene with other light, texture and lens."""
+    """The same scene with different light, texture and lens."""
     appearance = replace(
         setup.appearance,
         blur=conditions.blur * (resolution / 400 if conditions.name != "plain" else 1.0),
@@ -154,14 +154,14 @@ def _decode(
 
 
 def _period(coords: Float32[ndarray, "h w 2"], period: float) -> float:
-    """Median width of a period in the image, pixels."""
+    """Median width of a period in the image, in pixels."""
     right, down = coords[:-1, 1:] - coords[:-1, :-1], coords[1:, :-1] - coords[:-1, :-1]
     area = np.abs(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0])
     return period / float(np.sqrt(np.nanmedian(area)))
 
 
 def main() -> None:
-    """Print a line for each case and write all to JSON."""
+    """Print a line for each case, and write all to JSON."""
     config = tyro.cli(Config, description=__doc__)
     torch.set_num_threads(2)
     cv2.setNumThreads(2)

@@ -1,4 +1,4 @@
-"""Graph network against window matching, on grid graphs of the default pattern with misread symbols and missing nodes.
+"""Graph network against window matching on grid graphs of the default pattern, with misread symbols and missing nodes.
 
 python -m benchmarks.decoding_graphs [--graphs 10] [--output results.json]
 """
@@ -22,23 +22,23 @@ from training.graphs import Damage, DamagedGraph, damage_graph
 
 @dataclass(frozen=True)
 class Config:
-    """Shares of nodes that find their place."""
+    """Shares of nodes that are placed rightly and wrongly."""
 
     misread: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
     """shares of symbols misread"""
     missing: float = 0.2
-    """share of the nodes that are not found"""
+    """share of the nodes that are missing"""
     graphs: int = 12
-    """graphs of each kind, a random part of the pattern each"""
+    """graphs of each kind, each a random part of the pattern"""
     seed: int = 100
-    """of the graphs; training uses others"""
+    """seed of the graphs; training uses others"""
     output: Path | None = None
     """where to write the figures as JSON, with machine, date and commit"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Shares of all nodes: at their true place, and at another one; the rest got none."""
+    """Shares of all nodes: at their true place, and at a wrong one. The rest were given none."""
 
     misread: float
     missing: float
@@ -51,7 +51,7 @@ METHODS = ("windows, exact", "windows, one symbol off", "graph network, each nod
 
 
 def answers(decoder: NetworkDecoder, graph: DamagedGraph) -> dict[str, np.ndarray]:
-    """(turn, row, column) that each method gives every node, -1 for none."""
+    """(quarter turn, row, column) that each method gives to every node, -1 for none."""
     pattern = turned_pattern(np.asarray(decoder.pattern.codes))
     around = neighbourhoods(graph.neighbour)
     places = np.column_stack([pattern.turn, pattern.place]).astype(np.int64)

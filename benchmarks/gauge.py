@@ -1,10 +1,10 @@
-"""What becomes of a scan's lengths and place under each rule for the gauge, or if the joint adjustment's is left alone.
+"""Scale and position of a scan under each rule for the gauge, and as the bundle adjustment leaves them.
 
     python -m benchmarks.gauge [--scenes cone-and-cylinder head frog] [--seeds 1 2 3] [--output FILE]
 
-No residual feels a similarity of the whole scene, so only what is known of it can say which one is right. Compared
-are the result as the last step leaves it, and moved onto the starting poses with the scale of one known baseline, of
-all baselines, or of all lengths (`calibration.gauge`).
+The residuals do not change under a similarity of the whole scene, so only prior knowledge can fix it. Compared are the
+result as the last step leaves it, and the result aligned with the starting poses at the scale of one known baseline,
+of all baselines, or of all lengths (`bundle_adjustment/gauge.py`).
 """
 
 import argparse
@@ -34,9 +34,9 @@ class Row:
     scene: str
     seed: int
     rule: str
-    scale_percent: float  # by which all lengths are too large
-    shift_mm: float  # of the object's centre
-    turn_deg: float  # of the whole scene
+    scale_percent: float  # how much too large all lengths are
+    shift_mm: float  # of the object's centre, from its true position
+    turn_deg: float  # rotation of the whole scene
 
 
 def rules(loaded: LoadedScan) -> dict[str, Rig]:
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=list(FRAMES), choices=FRAMES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--folder", type=Path, default=Path("outputs/gauge"), help="for the scans; made once")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/gauge"), help="folder of the scans, made once")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/gauge.json"))
     options = parser.parse_args()
     rows: list[Row] = []

@@ -1,10 +1,10 @@
-"""A scan made by `sl-process` from real Gray-code photographs, compared with another decoding of the same ones.
+"""A scan made by `sl-process` from real Gray-code photographs, compared with another decoding of the same photographs.
 
     python -m benchmarks.gray_code --scan SCAN --reference REFERENCE
 
-Both are scan folders with the same frames in the same order; the reference may be undistorted and of another size.
-Every decoded pixel of the reference is looked up in the scan, coordinates are compared without the lenses' distortion,
-and points are triangulated with each scan's own poses and compared after one common similarity.
+Both are scan folders with the same frames in the same order. The reference may be undistorted and of a different size.
+Every decoded pixel of the reference is looked up in the scan. Coordinates are compared without lens distortion; points
+are triangulated with the poses of their own scan and compared after one common similarity.
 """
 
 import sys
@@ -29,17 +29,17 @@ class Arguments:
     """Compare a scan of real photographs with a reference."""
 
     scan: Path
-    """folder that sl-process wrote"""
+    """scan folder that sl-process wrote"""
     reference: Path
     """scan folder of the same captures, decoded and calibrated by other means"""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pixels that both decoded."""
+    """Pixels that both scans decoded."""
 
-    share: float  # of the reference's decoded pixels that the scan decoded, too
-    difference: Float64[ndarray, "n 2"]  # scan minus reference, projector pixels without distortion
+    share: float  # of the reference's decoded pixels that the scan decoded as well
+    difference: Float64[ndarray, "n 2"]  # scan minus reference, in projector pixels without distortion
     p_scan: Float64[ndarray, "n 3"]
     p_reference: Float64[ndarray, "n 3"]
 
@@ -74,7 +74,7 @@ def main() -> None:
 
 
 def compare(scan: Scan, frame: Frame, reference: Scan, wanted: Frame) -> Pairs:
-    """Look every decoded pixel of the reference frame up in the scan's frame, at the nearest pixel centre."""
+    """Look up every decoded pixel of the reference frame in the scan's frame."""
     target = wanted.read_coords()
     known = np.isfinite(target).all(-1)
     uv_reference = pixel_centres(wanted.camera, torch.float64)[torch.from_numpy(known)]
@@ -93,7 +93,7 @@ def compare(scan: Scan, frame: Frame, reference: Scan, wanted: Frame) -> Pairs:
 def look_up(
     image: Float64[ndarray, "h w 2"], uv: Float64[ndarray, "n 2"]
 ) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Bilinear value of the known ones of the four pixels around each place; known if the nearest pixel is."""
+    """Bilinear value from those of the four surrounding pixels that are known; known where the nearest pixel is."""
     h, w = image.shape[:2]
     place = uv - 0.5
     corner = np.floor(place).astype(np.int64)
@@ -116,7 +116,7 @@ def look_up(
 
 
 def without_lens(uv: Float64[ndarray, "n 2"], device: Device) -> Float64[ndarray, "n 2"]:
-    """Pixels as the same device without lens distortion has them."""
+    """The pixels that the same device would have without lens distortion."""
     ideal = replace(device, k1=0.0, k2=0.0, p1=0.0, p2=0.0)
     return project(_of(ideal), unproject(_of(device), torch.from_numpy(uv)))[0].numpy()
 
@@ -142,7 +142,7 @@ def _relative(scan: Scan, k: int) -> Float64[ndarray, "4 4"]:
 
 
 def _angles(a: Float64[ndarray, "4 4"], b: Float64[ndarray, "4 4"]) -> tuple[float, float]:
-    """Angles, in degrees, between two rotations and between two directions of translation."""
+    """Angles in degrees between two rotations, and between two directions of translation."""
     turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
     t, s = a[:3, 3], b[:3, 3]
     swing = np.arctan2(np.linalg.norm(np.cross(t, s)), t @ s)

@@ -1,7 +1,7 @@
-"""One training step, done by our field and by nerfstudio's torch HashEncoding with the same MLP.
+"""One training step, with our field and with nerfstudio's torch HashEncoding and the same MLP.
 
-A step: sample rays, evaluate the field, render projector coordinates by SDF weights, L1, Eikonal term, backward to
-table, MLP and poses, optimiser. Nothing of it is left out for either side.
+A step: sample rays, evaluate the field, render projector coordinates with SDF weights, L1 and Eikonal losses, backward
+pass to table, MLP and poses, optimiser. Both sides do all of it.
 """
 
 from collections.abc import Callable
@@ -21,17 +21,17 @@ FRAMES = 22
 
 @dataclass(frozen=True)
 class Size:
-    """How much a step computes."""
+    """Size of a step."""
 
     rays: int
     samples: int
     eikonal: int
     near_surface: bool
-    """Samples in a band of 0.1 about the surface, or from the near side of the scene to its far side."""
+    """Samples in a band of 0.1 around the surface, or else from the near to the far side of the scene."""
 
     @property
     def points(self) -> int:
-        """Points rendered."""
+        """Number of points rendered."""
         return self.rays * self.samples
 
 
@@ -42,12 +42,12 @@ SIZES = {
 
 
 class Job:
-    """The part of a step that is the same for everybody: rays of a sphere seen from outside, poses, losses."""
+    """The part of a step that all variants share: rays onto a sphere seen from outside, poses, losses."""
 
     def __init__(self, size: Size, seed: int = 0) -> None:
         generator = torch.Generator().manual_seed(seed)
         self.size = size
-        self.shift = nn.Parameter(torch.zeros(FRAMES, 3))  # stands for the poses: points are differentiated, too
+        self.shift = nn.Parameter(torch.zeros(FRAMES, 3))  # stands for the poses: points are differentiated
         self.frame = torch.randint(FRAMES, (size.rays,), generator=generator)
         aim = F.normalize(torch.randn(size.rays, 3, generator=generator), dim=-1) * 0.5
         eye = F.normalize(aim + 0.3 * torch.randn(size.rays, 3, generator=generator), dim=-1) * 3.0
@@ -59,7 +59,7 @@ class Job:
 
     @staticmethod
     def _coordinates(p: Tensor) -> Tensor:
-        """Pinhole projector at (0, 0, 4)."""
+        """Coordinates in a pinhole projector at (0, 0, 4)."""
         return p[..., :2] / (4.0 - p[..., 2:])
 
     def rays(self) -> Tensor:
@@ -71,13 +71,13 @@ class Job:
         return self.origin[:, None] + self.shift[self.frame][:, None] + t[..., None] * self.direction[:, None]
 
     def eikonal_points(self) -> Tensor:
-        """Half of them anywhere, half near the surface."""
+        """Points for the Eikonal term: half anywhere, half near the surface."""
         p = torch.rand(self.size.eikonal, 3, generator=self.generator) * 2 - 1
         p[::2] = F.normalize(p[::2], dim=-1) * (0.5 + 0.02 * torch.randn(len(p[::2]), 1, generator=self.generator))
         return p
 
     def loss(self, sdf: Tensor, points: Tensor, gradient: Tensor) -> Tensor:
-        """Rendered coordinates against their target, and the Eikonal term."""
+        """L1 error of the rendered coordinates, and the Eikonal term."""
         phi = torch.sigmoid(KAPPA * sdf.view(self.size.rays, self.size.samples))
         alpha = ((phi[:, :-1] - phi[:, 1:]) / phi[:, :-1].clamp_min(1e-12)).clamp(0, 1)
         light = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha + 1e-7], -1), -1)[:, :-1]
@@ -98,7 +98,7 @@ class Ours:
         ]
 
     def step(self) -> float:
-        """One step; the loss before it."""
+        """Do one step, and return the loss before it."""
         for optimiser in self.optimisers:
             optimiser.zero_grad()
         points = self.job.rays()
@@ -112,7 +112,7 @@ class Ours:
 
 
 class Theirs:
-    """nerfstudio's encoding in torch, gradients by double backward, torch's default Adam over everything."""
+    """nerfstudio's encoding in torch, gradients by double backward, torch's default Adam for all parameters."""
 
     def __init__(self, size: Size, activation: Callable[[Tensor], Tensor]) -> None:
         from nerfstudio.field_components.encodings import HashEncoding
@@ -128,14 +128,14 @@ class Theirs:
         self.optimiser = torch.optim.Adam(parameters, lr=1e-3)
 
     def sdf(self, p: Tensor) -> Tensor:
-        """The same network on nerfstudio's features, which want points in [0, 1]^3."""
+        """The same network on nerfstudio's features, which expect points in [0, 1]^3."""
         h = torch.cat([p, self.encoding((p + 1) / 2)], -1)
         for layer in list(self.mlp)[:-1]:
             h = self.activation(layer(h))
         return self.mlp[-1](h)[:, 0]
 
     def step(self) -> float:
-        """One step; the loss before it."""
+        """Do one step, and return the loss before it."""
         self.optimiser.zero_grad()
         points = self.job.rays()
         sdf = self.sdf(points.reshape(-1, 3))
@@ -157,4 +157,4 @@ VARIANTS: dict[str, Callable[[Size], Ours | Theirs]] = {
     "nerfstudio, our activation": lambda size: Theirs(size, lambda z: knee(z, 0.02)),
     "nerfstudio, ReLU": lambda size: Theirs(size, F.relu),
 }
-"""Softplus with beta 100 is nerfstudio's own choice for SDFs; ReLU costs least, but its gradient does not train."""
+"""Softplus with beta 100 is nerfstudio's own choice for SDFs; ReLU is cheapest, but its gradient cannot be trained."""

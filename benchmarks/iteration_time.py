@@ -1,13 +1,13 @@
-"""Time of one whole training step: ours, nerfstudio's torch HashEncoding with the same MLP, and the machine's floor.
+"""Time of one training step: ours, nerfstudio's torch HashEncoding with the same MLP, and the machine's lower bound.
 
 python -m benchmarks.iteration_time [--sizes paper lean] [--rounds 15] [--output benchmarks/results/iteration_time.json]
 
-The variants take turns, one step each, so that whatever else the machine does hits all of them alike.
+The variants take turns, one step each, so that other load on the machine affects all of them equally.
 """
 
 import os
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads sleep: they would slow down whoever is measured next
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads would slow down the next variant
 
 import json
 import re
@@ -32,20 +32,20 @@ class Config:
     """Time of one whole training step."""
 
     sizes: tuple[str, ...] = ("paper", "lean")
-    """Which steps: paper (2024 rays x 64 samples), lean (1024 x 16)."""
+    """Sizes of the step: paper (2024 rays x 64 samples), lean (1024 x 16)."""
     rounds: int = 15
-    """Steps of each variant that are timed, after two that are not."""
+    """Timed steps of each variant, after two that are not timed."""
     threads: int = 0
-    """Threads; 0: as many as there are cores."""
+    """Number of threads; 0: as many as there are cores."""
     output: Path | None = None
     """Where to write the figures as JSON."""
     memory_of: str | None = None
-    """Only run this variant of the first size for three steps and print the process's peak memory in MB."""
+    """Only run this variant of the first size for three steps, and print the peak memory of the process in MB."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Milliseconds a step."""
+    """Milliseconds per step."""
 
     size: str
     variant: str
@@ -53,11 +53,11 @@ class Row:
     best: float
     quartiles: tuple[float, float]
     peak_memory_mb: float
-    """Of a process that does nothing else, with everything it imports."""
+    """Peak memory of a process that does nothing else, including everything it imports."""
 
 
 def measure(size: str, rounds: int, threads: int) -> list[Row]:
-    """Time all variants, taking turns."""
+    """Time all variants in turn."""
     jobs = {name: make(SIZES[size]) for name, make in VARIANTS.items()}
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for turn in range(rounds + 2):
@@ -80,7 +80,7 @@ def _memory(size: str, variant: str, threads: int) -> float:
 
 
 def _peak_memory_mb() -> float:
-    """Of this process; `getrusage` would count the process that started it, too."""
+    """Peak memory of this process; `getrusage` would include the process that started it."""
     status = Path("/proc/self/status")
     if status.is_file():
         return int(re.search(r"VmHWM:\s+(\d+) kB", status.read_text())[1]) / 1024  # pyright: ignore
@@ -88,11 +88,11 @@ def _peak_memory_mb() -> float:
 
 
 def report(rows: list[Row], floor: Floor, machine: Machine) -> str:
-    """A table for people."""
+    """The results of one size as a table."""
     ours = next(row for row in rows if row.variant == "ours")
     lines = [
         f"{ours.size}: {SIZES[ours.size]}",
-        f"{'':28s}{'median':>9s}{'best':>9s}{'quartiles':>19s}{'x ours':>8s}{'x floor':>9s}{'peak MB':>9s}",
+        f"{'':28s}{'median':>9s}{'best':>9s}{'quartiles':>19s}{'x ours':>8s}{'x bound':>9s}{'peak MB':>9s}",
     ]
     for row in rows:
         quartiles = "{:.1f} .. {:.1f}".format(*row.quartiles)
@@ -101,7 +101,7 @@ def report(rows: list[Row], floor: Floor, machine: Machine) -> str:
             f"{row.best / floor.total_ms:9.2f}{row.peak_memory_mb:9.0f}"
         )
     lines.append(
-        f"floor {floor.total_ms:.1f} ms: {floor.gflop:.2f} GFLOP at {machine.product_gflops:.0f} GFLOP/s "
+        f"lower bound {floor.total_ms:.1f} ms: {floor.gflop:.2f} GFLOP at {machine.product_gflops:.0f} GFLOP/s "
         f"= {floor.products_ms:.1f} ms, {floor.megabytes:.0f} MB at {machine.bandwidth_gb:.1f} GB/s "
         f"= {floor.memory_ms:.1f} ms ({floor.rows} table rows touched)"
     )

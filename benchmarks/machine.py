@@ -1,4 +1,4 @@
-"""What a figure was measured on."""
+"""The machine that a figure was measured on."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def describe() -> dict[str, str | int]:
 
 
 def write_rows(output: Path, rows: Sequence[Any], **settings: Any) -> None:
-    """The rows of a benchmark (dataclasses) as JSON, with the machine and the settings; makes the folder."""
+    """Write the rows of a benchmark (dataclasses) as JSON, with machine and settings; create the folder if needed."""
     output.parent.mkdir(parents=True, exist_ok=True)
     document = {"machine": describe(), **settings, "rows": [asdict(row) for row in rows]}
     output.write_text(json.dumps(document, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""Time and memory of surface extraction, beside dense marching cubes over the whole box.
+"""Time and memory of surface extraction, compared with dense marching cubes over the whole box.
 
 python -m benchmarks.mesh_time [--resolutions 128 256 512 1024] [--load-config RUN/config.yml] [--output results.json]
 """
@@ -26,31 +26,31 @@ class Config:
     resolutions: tuple[int, ...] = (128, 256, 512, 1024)
     """Cells along each side of the box."""
     dense_up_to: int = 256
-    """Dense marching cubes (scikit-image) are run up to here; they need resolution^3 evaluations."""
+    """Largest resolution at which dense marching cubes (scikit-image) are run; they need resolution^3 evaluations."""
     repeats: int = 3
-    """Sparse and dense take turns this many times; the median and the range are given."""
+    """How often sparse and dense take turns; median and range are reported."""
     load_config: Path | None = None
-    """config.yml of a trained run: its field is extracted instead of the torus."""
+    """config.yml of a trained run, whose field is extracted instead of the torus."""
     output: Path | None = None
     """Where to write the figures as JSON, with machine, date and commit."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One resolution; times in seconds: median, least, most."""
+    """One resolution; times in seconds: median, shortest, longest."""
 
     field: str
     resolution: int
     triangles: int
     evaluations: int
     total: tuple[float, float, float]
-    own: tuple[float, float, float]  # without the evaluations of the field
+    own: tuple[float, float, float]  # excluding evaluations of the field
     dense: tuple[float, float, float] | None
-    peak_gb: float  # of the process so far
+    peak_gb: float  # of the process up to now
 
 
 class Counted:
-    """A field that remembers how often and how long it was asked."""
+    """A field that counts its evaluations and their time."""
 
     def __init__(self, field: Callable[[Tensor], Tensor]) -> None:
         self.field, self.evaluations, self.seconds = field, 0, 0.0
@@ -65,12 +65,12 @@ class Counted:
 
 
 def torus(p: Tensor) -> Tensor:
-    """Distance from a torus of radii 0.55 and 0.2."""
+    """Signed distance from a torus of radii 0.55 and 0.2."""
     return torch.stack([p[:, :2].norm(dim=-1) - 0.55, p[:, 2]], -1).norm(dim=-1) - 0.2
 
 
 def dense(field: Callable[[Tensor], Tensor], resolution: int, device: torch.device) -> float:
-    """Seconds of evaluating the whole grid and of scikit-image's marching cubes on it."""
+    """Seconds for evaluating the whole grid and running scikit-image's marching cubes on it."""
     from skimage.measure import marching_cubes
 
     start = time.perf_counter()
@@ -85,7 +85,7 @@ def dense(field: Callable[[Tensor], Tensor], resolution: int, device: torch.devi
 
 
 def measure(name: str, field: Callable[[Tensor], Tensor], resolution: int, device: torch.device, config: Config) -> Row:
-    """All repeats of one resolution."""
+    """Measure all repeats of one resolution."""
     totals, owns, denses, triangles, evaluations = [], [], [], 0, 0
     for _ in range(config.repeats):
         counted = Counted(field)

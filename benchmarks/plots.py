@@ -1,8 +1,8 @@
-"""Draws the curves of the documentation from benchmarks/results: accuracy, ablation, basin, sweeps.
+"""Draws the plots of the documentation from benchmarks/results: accuracy, ablation, basin, sweeps, error over time.
 
     python -m benchmarks.plots [--results benchmarks/results] [--output docs/pictures]
 
-Every result that is there gives its picture.
+Results that do not exist are skipped.
 """
 
 import argparse
@@ -24,7 +24,7 @@ Rows = list[dict[str, Any]]
 
 
 def panels(count: int, height: float = 3.0) -> tuple[Figure, list[Any]]:
-    """A figure of some panels in a row, in the colours of the reports."""
+    """A figure with panels in a row, in the colours of the reports."""
     figure = Figure(figsize=(3.6 * count, height), dpi=130, layout="constrained")
     axes = [figure.add_subplot(1, count, k + 1) for k in range(count)]
     for ax in axes:
@@ -36,20 +36,20 @@ def panels(count: int, height: float = 3.0) -> tuple[Figure, list[Any]]:
 
 
 def plain_decades(axis: Axis) -> None:
-    """0.1 in place of a power of ten, and ticks at 1, 2 and 5."""
+    """Write 0.1 instead of a power of ten, with ticks at 1, 2 and 5."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def series(rows: Rows, key: str, value: str) -> tuple[list[float], list[float]]:
-    """Values by a key, in its order."""
+    """Keys in ascending order, and their values."""
     ordered = sorted(rows, key=lambda row: row[key])
     return [row[key] for row in ordered], [row[value] for row in ordered]
 
 
 def accuracy(rows: Rows) -> Figure:
-    """Surface error of every scene: refined poses, true ones (oracle), and fusion."""
+    """Surface error of every scene: refined poses, true poses (oracle), and fusion."""
     shown = [v for v in ("refined", "oracle", "unrefined", FUSION) if any(row["variant"] == v for row in rows)]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, (ax,) = panels(1)
@@ -70,7 +70,7 @@ def accuracy(rows: Rows) -> Figure:
 
 
 def ablation(rows: Rows) -> Figure:
-    """How many times the whole method's surface error each part left out makes, on the same scan."""
+    """Surface error with each part left out, relative to that of the whole method on the same scan."""
     whole = {(row["scene"], row["seed"]): row["rigid_rmse"] for row in rows if row["variant"] == "refined"}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     shown = [v for v in dict.fromkeys(row["variant"] for row in rows) if v != "refined"]
@@ -92,7 +92,7 @@ def ablation(rows: Rows) -> Figure:
 
 
 def basin(rows: Rows) -> Figure:
-    """Camera rotation before and after joint adjustment."""
+    """Camera rotation error before and after bundle adjustment."""
     figure, (ax,) = panels(1)
     figure.set_size_inches(5.2, 3.2)
     for k, seed in enumerate(sorted({row["seed"] for row in rows})):
@@ -107,7 +107,7 @@ def basin(rows: Rows) -> Figure:
 
 
 def sweeps(rows: Rows) -> Figure:
-    """Surface error against quality of decoding, number of frames and size of images."""
+    """Surface error against decoding quality, number of frames and image size."""
     titles = {
         "noise": "noise, pattern pixels",
         "missing": "share of cells missing",
@@ -139,19 +139,19 @@ def error_over_time(rows: Rows) -> Figure:
     ax.set_yscale("log")
     plain_decades(ax.xaxis)
     plain_decades(ax.yaxis)
-    ax.set_xlabel("seconds of ns-train, start and adjustment included", color=INK)
+    ax.set_xlabel("seconds of ns-train, start-up and adjustment included", color=INK)
     ax.set_ylabel("rigid RMSE of the surface, mm", color=INK)
     ax.legend(frameon=False)
     return figure
 
 
 def read_rows(path: Path) -> Rows:
-    """The rows of a result file; none if it is not there."""
+    """The rows of a result file; none if it does not exist."""
     return json.loads(path.read_text())["rows"] if path.exists() else []
 
 
 def accuracy_rows(results: Path) -> Rows:
-    """Our surfaces, and beside them those of fusion on the same scans."""
+    """Our surfaces, and those of fusion on the same scans."""
     fused = [row for row in read_rows(results / "tsdf_baseline.json") if row["poses"] == "registered"]
     return read_rows(results / "accuracy.json") + [
         {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]} for row in fused
@@ -159,7 +159,7 @@ def accuracy_rows(results: Path) -> Rows:
 
 
 def sweep_rows(results: Path, timed: bool) -> Rows:
-    """The sweeps over time, or all others."""
+    """The sweeps over time, or all other sweeps."""
     return [row for row in read_rows(results / "sweeps.json") if (row["sweep"] == "time") == timed]
 
 
@@ -173,7 +173,7 @@ PICTURES: dict[str, tuple[Callable[[Path], Rows], Callable[[Rows], Figure]]] = {
 
 
 def main() -> None:
-    """Draw all."""
+    """Draw all pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=Path("benchmarks/results"))
     parser.add_argument("--output", type=Path, default=Path("docs/pictures"))

@@ -1,13 +1,14 @@
-"""Auto-calibration and registration against the truth of synthetic scans, and on captures with known poses.
+"""Calibration of each frame and registration, against the truth of synthetic scans and on captures with known poses.
 
     python -m benchmarks.registration [--scenes cone-and-cylinder head frog] [--scans FOLDER ...]
 
-For every scene a noisy scan is made with sl-synth (200 x 200 pixels, its default noise), its frames are calibrated one
-by one, registered without starting poses in the order of capture, and adjusted jointly. `--scans` adds existing scan
-folders, whose poses are taken for the truth where they have no ground_truth/.
+For every scene, a noisy scan is made with sl-synth (200 x 200 pixels, its default noise). Its frames are calibrated one
+by one, registered in the order of capture without starting poses, and adjusted jointly. `--scans` adds existing scan
+folders; their poses count as the truth if they have no ground_truth/.
 
-Printed are: the errors of rotation and baseline direction, and how often they stay within one stated sigma; rotation,
-position and scale of every frame after registration and after the joint adjustment, after one common similarity.
+It prints the errors of rotation and baseline direction, and how often they are within one stated sigma; and the errors
+of rotation, position and scale of the frames after registration and after the bundle adjustment, both after one common
+similarity.
 """
 
 import argparse
@@ -35,7 +36,7 @@ FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 43}
 
 @dataclass(frozen=True)
 class Calibration:
-    """Errors of the frames' relative poses."""
+    """Errors of the relative poses of the frames."""
 
     rotation_deg_median: float
     rotation_deg_max: float
@@ -43,13 +44,13 @@ class Calibration:
     direction_deg_max: float
     rotation_within_sigma: float  # fraction of the frames
     direction_within_sigma: float
-    mahalanobis: float  # mean squared error in units of the covariance over its 5 degrees of freedom: 1 is exact
+    mahalanobis: float  # mean squared error in units of the covariance, per degree of freedom (5): 1 is exact
     seconds_a_frame: float
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Errors of the frames' places after one similarity; positions in mean camera distances."""
+    """Errors of the registered frames after one similarity; positions in mean camera distances."""
 
     registered: int
     rotation_deg_median: float
@@ -75,7 +76,7 @@ class Row:
 
 
 def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
-    """True poses, or the ones in the file."""
+    """True poses of cameras and projectors; those in the file if there is no ground truth."""
     truth = read_ground_truth(scan)
     if truth.T_world_camera is None or truth.T_world_projector is None:
         return scan.T_world_camera, scan.T_world_projector
@@ -83,7 +84,7 @@ def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
 
 
 def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Calibration]:
-    """All frames, one by one."""
+    """Calibrate all frames, one by one."""
     from scipy.spatial.transform import Rotation
 
     from sl_nerfstudio.relative_pose.epipolar_fit import direction_basis
@@ -121,7 +122,7 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
 
 
 def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray], seconds: float) -> Poses:
-    """Errors of registered frames after one similarity that fits cameras and the places they look at.
+    """Errors of registered frames after one similarity, fitted to the cameras and the points they look at.
 
     `truth` holds the true poses of cameras and projectors.
     """
@@ -150,7 +151,7 @@ def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndar
 
 
 def measure(root: Path, sequence: bool = True) -> Row:
-    """Calibrate, register, adjust."""
+    """Calibrate, register and adjust one scan."""
     scan = read_scan(root)
     camera, projector = truth_of(scan)
     clouds, calibration = calibrate(scan, np.linalg.inv(camera) @ projector)
@@ -172,14 +173,14 @@ def measure(root: Path, sequence: bool = True) -> Row:
 
 
 def text_of(row: Row) -> str:
-    """A few lines."""
+    """The figures of one scan in a few lines."""
     c = row.calibration
     lines = [
         f"{row.scan} ({row.frames} frames, {row.projector})",
         f"  calibration   rotation {c.rotation_deg_median:.3f} deg (max {c.rotation_deg_max:.3f}), direction "
         f"{c.direction_deg_median:.3f} deg (max {c.direction_deg_max:.3f}); within 1 sigma "
         f"{c.rotation_within_sigma:.0%} and {c.direction_within_sigma:.0%}, squared error over "
-        f"covariance {c.mahalanobis:.2f}; {c.seconds_a_frame:.2f} s a frame",
+        f"covariance {c.mahalanobis:.2f}; {c.seconds_a_frame:.2f} s per frame",
     ]
     for name, p in (("registration", row.registration), ("joint", row.joint)):
         lines.append(
@@ -199,8 +200,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--projector-model", choices=["OPENCV", "DOE"], default="OPENCV")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--resolution", type=int, default=200)
-    parser.add_argument("--unordered", action="store_true", help="the order of capture is not known")
-    parser.add_argument("--folder", type=Path, default=Path("outputs/registration"), help="for the scans that are made")
+    parser.add_argument("--unordered", action="store_true", help="frames were not taken in order")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("outputs/registration"), help="folder of the scans made here"
+    )
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/registration.json"))
     options = parser.parse_args(arguments)
     roots = list(options.scans)

@@ -1,10 +1,10 @@
-"""Memory and time per step against the number of frames and their size.
+"""Memory and time per step against the number and size of frames.
 
     python -m benchmarks.resources [--frames 5 22 57] [--sizes 400 1200] [--steps 60] [--output FILE]
 
-Every scan is checked, read and trained for a few steps in a process of its own: by what `ns-train sl-neus` runs, joint
-adjustment included. Larger images are those of the 400-pixel scan with every pixel repeated: they hold no more truth,
-but they cost what real ones cost.
+Every scan is checked, read, adjusted and trained for a few steps in a separate process, with the code that `ns-train
+sl-neus` runs. Larger images are those of the 400-pixel scan with every pixel repeated: they contain no more detail, but
+cost as much as real ones.
 """
 
 import argparse
@@ -35,7 +35,7 @@ class Row:
 
     frames: int
     size: int
-    peak_gb: float  # resident memory of the whole process, libraries included
+    peak_gb: float  # resident memory of the whole process, including libraries
     check_seconds: float
     read_seconds: float
     adjust_seconds: float
@@ -79,7 +79,7 @@ def make_scan(source: Path, frames: int, factor: int, to: Path) -> None:
 
 
 def measure_here(scan: Path, steps: int) -> dict[str, float]:
-    """Check, read, adjust and train in this process."""
+    """Check, read, adjust and train a scan in this process."""
     from sl_nerfstudio.dataparser.dataparser import load_scan
     from sl_nerfstudio.methods import sl_neus
     from sl_nerfstudio.scan import check_scan
@@ -118,7 +118,7 @@ def measure_here(scan: Path, steps: int) -> dict[str, float]:
 
 
 def measure(scan: Path, steps: int) -> dict[str, float]:
-    """The same in a fresh process, whose peak of memory is its own."""
+    """The same in a fresh process, so that its peak memory is measured alone."""
     command = [sys.executable, "-m", "benchmarks.resources", "--scan", str(scan), "--steps", str(steps)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
@@ -132,9 +132,9 @@ def main() -> None:
     parser.add_argument("--frames", nargs="+", type=int, default=[5, 22, 57])
     parser.add_argument("--sizes", nargs="+", type=int, default=[400, 1200], help="multiples of 400")
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/resources"), help="for the scans; made once")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/resources"), help="folder of the scans, made once")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/resources.json"))
-    parser.add_argument("--scan", type=Path, help="measure this scan, in this process, and print the figures only")
+    parser.add_argument("--scan", type=Path, help="only measure this scan, in this process, and print the figures")
     options = parser.parse_args()
     if options.scan:
         print(json.dumps(measure_here(options.scan, options.steps)))

@@ -1,12 +1,12 @@
-"""The least time a training step can take on a machine, from what it must compute and what it must move.
+"""Lower bound for the time of a training step on a machine, from what it must compute and what it must move.
 
 Time = (FLOPs of the MLP) / (speed of matrix products of the MLP's shapes) + (bytes of table rows) / (bandwidth).
-- FLOPs: each layer's product once forward and twice backward (gradient to input and to weights) for rendered points;
+- FLOPs: each layer's product once forward and twice backward (gradients of input and weights) for rendered points;
   twice that for Eikonal points (value and gradient forward; their directional derivatives, adjoints and two weight
-  products backward). Activation, interpolation, rendering and losses count nothing.
-- Bytes: each table row that a step touches is read forward, read backward (for the points' gradients), and its
-  gradient read and written, once however many points share it; Adam reads row, gradient and two moments, and writes
-  row and moments. As if caches were perfect, and rows that are not touched cost nothing.
+  products backward). Activation, interpolation, rendering and losses count as free.
+- Bytes: each table row that a step touches is read forward, read backward (for the gradients of the points), and its
+  gradient read and written, once, however many points share it. Adam reads row, gradient and two moments, and writes
+  row and moments. Caches are assumed to be perfect, and rows that are not touched cost nothing.
 """
 
 import time
@@ -21,33 +21,33 @@ INPUT, HIDDEN = 43, 128
 
 @dataclass(frozen=True)
 class Machine:
-    """What this machine can do, with torch's number of threads."""
+    """Speed of this machine, with torch's number of threads."""
 
     product_gflops: float
-    """float32 matrix products of the MLP's shapes, 10^9 operations a second."""
+    """float32 matrix products of the MLP's shapes, in 10^9 operations per second."""
     bandwidth_gb: float
-    """Read plus written by a copy of 256 MB, GB a second."""
+    """Bytes read plus written by a copy of 256 MB, in GB per second."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Least time of a step, milliseconds."""
+    """Shortest possible time of a step, in milliseconds."""
 
     products_ms: float
     memory_ms: float
     gflop: float
     megabytes: float
     rows: int
-    """Table rows touched."""
+    """Number of table rows touched."""
 
     @property
     def total_ms(self) -> float:
-        """Both, one after the other."""
+        """Sum of both."""
         return self.products_ms + self.memory_ms
 
 
 def measure_machine() -> Machine:
-    """Best of many short runs: the speed that is there when nobody else wants it."""
+    """Best of many short runs: the speed of the machine when it is otherwise idle."""
     n = 8192
     x, h = torch.randn(n, INPUT), torch.randn(n, HIDDEN)
     w1, w2 = torch.randn(INPUT, HIDDEN), torch.randn(HIDDEN, HIDDEN)
@@ -82,7 +82,7 @@ def _best(function: object, repeats: int) -> float:
 
 
 def floor_of(size: Size, machine: Machine) -> Floor:
-    """The least time of a step of this size on this machine."""
+    """Shortest possible time of a step of this size on this machine."""
     unit = 2 * (INPUT * HIDDEN + HIDDEN * HIDDEN + HIDDEN)
     flop = unit * (3 * size.points + 6 * size.eikonal)
     rows = _touched_rows(size)
@@ -97,7 +97,7 @@ def floor_of(size: Size, machine: Machine) -> Floor:
 
 
 def _touched_rows(size: Size) -> int:
-    """Table rows with a gradient after the backward pass of a step, every point counted."""
+    """Number of table rows with a gradient after the backward pass of one step."""
     ours = Ours(size)
     points = ours.job.rays().detach().reshape(-1, 3)
     ours.field.sdf(torch.cat([points, ours.job.eikonal_points()])).sum().backward()

@@ -1,4 +1,4 @@
-"""Synthetic scans that benchmarks load directly, without the commands of a user."""
+"""Synthetic scans that benchmarks load directly, without running commands."""
 
 from pathlib import Path
 
@@ -8,9 +8,9 @@ from sl_nerfstudio.synthesis.synthesise import synthesise
 
 
 def made_once(config: SynthConfig, parent: Path) -> LoadedScan:
-    """The scan of `config`, from a folder of its own below `parent`, which is made if it is not there.
+    """The scan of `config`, from its folder below `parent`; it is made if it does not exist.
 
-    Raises UserError where a run that was broken off has left half of it.
+    Raises UserError if an interrupted run has left an incomplete scan there.
     """
     folder = parent / f"{config.scene}-{config.frames}-{config.resolution}-{config.seed}"
     if not (folder / "transforms.json").exists():

@@ -1,9 +1,10 @@
-"""What the error depends on: quality of decoding, number of frames, size of images, time.
+"""What the error depends on: decoding quality, number of frames, image size, time.
 
     python -m benchmarks.sweeps [--sweeps noise missing wrong frames resolution time] [--scene cone-and-cylinder]
 
-Whole runs by the commands a user types, on scans of sl-synth with its default noise where the sweep does not set it.
-Prints a table; writes benchmarks/results/sweeps.json, from which `python -m benchmarks.plots` draws the curves.
+Whole runs with the commands a user types, on scans from sl-synth with its default noise, except for what the sweep
+changes. Prints a table and writes benchmarks/results/sweeps.json, from which `python -m benchmarks.plots` draws the
+curves.
 """
 
 import argparse
@@ -36,11 +37,11 @@ class Row(Score):
 
     sweep: str
     variant: str
-    value: float  # of what the sweep changes; iterations in the sweep over time
+    value: float  # of what the sweep changes; number of iterations in the sweep over time
 
 
 def synth(options: argparse.Namespace, folder: Path, *flags: str) -> Path:
-    """A scan with other flags than the default ones."""
+    """A scan made with these flags, unless it exists."""
     scan = folder / "scan"
     if not scan.exists():
         fixed = ("--scene", options.scene, "--seed", str(options.seed))
@@ -60,7 +61,7 @@ def over_scans(options: argparse.Namespace, sweep: str) -> Iterator[Row]:
 
 
 def over_time(options: argparse.Namespace) -> Iterator[Row]:
-    """One scan; runs of growing length, whose schedules are stretched with them."""
+    """One scan; runs of growing length, each with its schedules stretched to fit."""
     folder = options.folder / "time"
     folder.mkdir(exist_ok=True)
     scan = synth(options, folder)
@@ -79,7 +80,7 @@ def main() -> None:
     parser.add_argument("--sweeps", nargs="+", default=list(SWEEPS), choices=SWEEPS)
     parser.add_argument("--scene", default="cone-and-cylinder")
     parser.add_argument("--seed", type=int, default=4)
-    parser.add_argument("--iterations", type=int, default=400, help="of all sweeps but that over time")
+    parser.add_argument("--iterations", type=int, default=400, help="of all sweeps except the one over time")
     parser.add_argument("--folder", type=Path, default=Path("outputs/sweeps"), help="must not exist yet")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/sweeps.json"))
     options = parser.parse_args()

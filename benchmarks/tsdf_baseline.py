@@ -1,4 +1,4 @@
-"""What classical fusion reaches: Open3D TSDF with initial, ICP-registered and true poses, on scans with truth.
+"""Classical fusion: Open3D's TSDF with initial, ICP-registered and true poses, on scans with known truth.
 
 python -m benchmarks.tsdf_baseline SCAN [SCAN ...] [--output results.json]
 """
@@ -54,7 +54,7 @@ class Row:
 
 
 def measure(root: Path, meshes: Path | None) -> list[Row]:
-    """All three kinds of poses on one scan. Raises UserError for a scan without truth."""
+    """Fuse one scan with all three kinds of poses. Raises UserError for a scan without truth."""
     scan = read_scan(root)
     truth = read_ground_truth(scan)
     if truth.mesh_path is None or truth.T_world_camera is None or truth.T_world_projector is None:

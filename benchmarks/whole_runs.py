@@ -1,4 +1,4 @@
-"""Whole runs by the commands a user types, scored against the truth of synthetic scans."""
+"""Whole runs with the commands a user types, scored against the truth of synthetic scans."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Score:
-    """What one run reached; lengths in mm."""
+    """Errors of one run; lengths in mm."""
 
     rigid_rmse: float
     rigid_median: float
@@ -21,10 +21,10 @@ class Score:
     camera_translation_rmse: float
     camera_rotation_rmse_deg: float
     coordinate_px: float
-    training_seconds: float  # of the whole command: start, joint adjustment, training
+    training_seconds: float  # of the whole command: start-up, bundle adjustment, training
 
     def text(self) -> str:
-        """The end of a line of a table."""
+        """The figures as the end of a table row."""
         return (
             f"rigid RMSE {self.rigid_rmse:.3f} median {self.rigid_median:.3f} | similarity {self.similarity_rmse:.3f} "
             f"| complete {self.completeness_rmse:.3f} | camera {self.camera_translation_rmse:.3f} mm "
@@ -33,7 +33,7 @@ class Score:
 
 
 def run(*command: str) -> None:
-    """A command of this environment; its output only if it fails."""
+    """Run a command of this environment, showing its output only if it fails."""
     program = Path(sys.executable).parent / command[0]
     done = subprocess.run([str(program), *command[1:]], capture_output=True, text=True)
     if done.returncode:
@@ -53,7 +53,7 @@ def with_true_poses(scan: Path, to: Path) -> Path:
 
 
 def train_and_score(data: Path, folder: Path, name: str, options: Sequence[str], method: str = "sl-neus") -> Score:
-    """Train on a scan with truth, export, evaluate; `name` tells the runs in `folder` apart."""
+    """Train on a scan with truth, export, evaluate; `name` distinguishes the runs in `folder`."""
     begin = time.monotonic()
     fixed = ("--output-dir", str(folder), "--experiment-name", "run", "--timestamp", name)
     run("ns-train", method, "--data", str(data), *fixed, *options)

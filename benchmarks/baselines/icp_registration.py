@@ -1,4 +1,4 @@
-"""Rigid multiway registration of the frames' point clouds (Open3D): what classical pipelines do about poses.
+"""Rigid multiway registration of the frames' point clouds (Open3D), as in classical pipelines.
 
 Each frame moves as a whole, camera and projector together, so a wrong relative pose or baseline stays wrong.
 """
@@ -17,7 +17,7 @@ from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Scan
 
 _SIZE = 100.0
-_LEAST_OVERLAP = 0.3  # share of a cloud's points with a partner; pairs with less say little
+_LEAST_OVERLAP = 0.3  # share of a cloud's points with a partner; pairs with less are unreliable
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class RegistrationConfig:
     """Settings, lengths relative to the size of the object."""
 
     voxel: float = 1 / 80
-    distances: tuple[float, ...] = (0.08, 0.03, 0.015)  # of correspondence, coarse to fine
-    neighbours: int = 8  # pairs per frame: those whose cameras look from the most similar directions
+    distances: tuple[float, ...] = (0.08, 0.03, 0.015)  # maximum correspondence distance, coarse to fine
+    neighbours: int = 8  # pairs per frame: those with the most similar viewing directions
     rounds: int = 2
 
 
@@ -63,7 +63,7 @@ def _multiway(
     distances: Sequence[float],
     neighbours: int,
 ) -> Float[ndarray, "n 4 4"]:
-    """Motion of each cloud; the first one stays."""
+    """Motion of each cloud; the first one stays in place."""
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()
     for _ in clouds:
@@ -90,7 +90,7 @@ def _multiway(
 
 
 def _pairs(T_world_camera: Float[ndarray, "n 4 4"], neighbours: int) -> list[tuple[int, int]]:
-    """Frames to register with each other: each with its successor and with those that look most alike."""
+    """Frames to register with each other: each with its successor and with those of most similar viewing direction."""
     looking = -T_world_camera[:, :3, 2]
     alike = looking @ looking.T
     pairs = {(i, i + 1) for i in range(len(looking) - 1)}

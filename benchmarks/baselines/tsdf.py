@@ -1,4 +1,4 @@
-"""The classical way, as a yardstick: triangulate each frame, register rigidly, fuse into a truncated SDF (Open3D)."""
+"""Classical fusion: triangulate each frame, and fuse the depth maps into a truncated SDF (Open3D)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Scan
 
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
-_UNIT_SIZE = 100.0  # the object is brought to about this size: Open3D's defaults think in such numbers
+_UNIT_SIZE = 100.0  # the object is scaled to about this size, which Open3D's defaults assume
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class TsdfConfig:
 
     voxel: float = 1 / 250  # of the object's size
     truncation_voxels: float = 5.0
-    least_component: float = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
+    least_component: float = 0.02  # of the largest connected piece's triangles; smaller ones are dropped
 
 
 def fuse(scan: Scan, poses: Poses, config: TsdfConfig | None = None) -> Mesh:
@@ -64,7 +64,7 @@ def depth_maps(scan: Scan, poses: Poses) -> list[DepthMap]:
 
 
 def object_size(depths: Sequence[DepthMap]) -> float:
-    """Rough extent of what the depth maps show: the widest frame's, between its 2nd and 98th percentile."""
+    """Rough extent of the depth maps: that of the widest frame, between its 2nd and 98th percentile."""
     return max((_extent(depth) for depth in depths), default=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Epipolar geometry between a camera and a projector."""
+"""Epipolar geometry of a camera and a projector."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,7 +10,7 @@ from sl_nerfstudio.geometry.triangulation import closest_approach
 
 
 def essential_matrix(T_projector_camera: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """`E = [t]x R`: `d_projector^T E d_camera = 0` for directions (device axes) of one world point."""
+    """`E = [t]x R`, with `d_projector^T E d_camera = 0` for the directions (device axes) of the same world point."""
     return hat(T_projector_camera[..., :3, 3]) @ T_projector_camera[..., :3, :3]
 
 
@@ -24,9 +24,9 @@ def epipolar_residual(
 ) -> Float[Tensor, "*#batch"]:
     """Signed distance, in projector pixels, of `uv_projector` from the epipolar curve of `uv_camera`.
 
-    The curve is the image of the camera ray in the projector. It is linearised where the two rays
-    are nearest to each other, so the value holds for pinhole, distorted and DOE projectors alike.
-    NaN where that point lies behind either device or the rays are parallel.
+    The curve is the image of the camera ray in the projector. It is linearised where the two rays come
+    closest to each other, so it is valid for pinhole, distorted and DOE projectors alike.
+    NaN if that point is behind either device or the rays are parallel.
     """
     o_c, d_c = pixel_rays(camera, T_world_camera, uv_camera)
     o_p, d_p = pixel_rays(projector, T_world_projector, uv_projector)

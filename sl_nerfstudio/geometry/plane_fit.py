@@ -1,14 +1,14 @@
-"""Least-squares planes from sums over points, for compiled loops."""
+"""Least-squares planes from sums over points, for use in compiled loops."""
 
 from sl_nerfstudio.compiled import compiled
 
 
 @compiled
 def solve_plane(n, sx, sy, sxx, sxy, syy, s, sxs, sys, least_determinant):
-    """`(solvable, c, u, v)` of the plane `s = c + u x + v y` nearest to n points, given their sums.
+    """`(solvable, c, u, v)` of the least-squares plane `s = c + u x + v y` through n points, given their sums.
 
-    Not solvable where the determinant of [[n, sx, sy], [sx, sxx, sxy], [sy, sxy, syy]] is below `least_determinant`:
-    the points lie on a line, or nearly.
+    Not solvable if the determinant of [[n, sx, sy], [sx, sxx, sxy], [sy, sxy, syy]] is below `least_determinant`,
+    because the points are (nearly) on a line.
     """
     c00, c01, c02 = sxx * syy - sxy * sxy, sxy * sy - sx * syy, sx * sxy - sxx * sy
     c11, c12, c22 = n * syy - sy * sy, sx * sy - n * sxy, n * sxx - sx * sx

@@ -1,4 +1,4 @@
-"""Rays of pixels in the world."""
+"""Pixel centres, and the rays of pixels in the world."""
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from sl_nerfstudio.geometry.se3 import rotate
 
 
 def pixel_centres(device: Device, dtype: torch.dtype = torch.float32) -> Float[Tensor, "h w 2"]:
-    """Coordinates (x, y) of all pixel centres of a device: (0.5, 0.5) first."""
+    """Coordinates (x, y) of all pixel centres of a device, starting with (0.5, 0.5)."""
     y, x = torch.meshgrid(
         torch.arange(device.h, dtype=dtype) + 0.5, torch.arange(device.w, dtype=dtype) + 0.5, indexing="ij"
     )

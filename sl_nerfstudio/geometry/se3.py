@@ -1,8 +1,8 @@
-"""Rigid motions SE(3) as 4x4 matrices, with exact behaviour at small angles.
+"""Rigid motions SE(3) as 4x4 matrices, accurate at small angles as well.
 
 A pose `T_a_b` maps points of frame b to frame a: `p_a = transform(T_a_b, p_b)`.
-Tangent vectors are ordered `(v, w)`: three of translation, then three of rotation (radian).
-Every function takes any leading batch shape.
+Tangent vectors are ordered `(v, w)`: translation first, then rotation (radian).
+Every function accepts any leading batch shape.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Below these angles Taylor series replace quotients that would lose digits there, and lose more in derivatives.
+# Below these angles, Taylor series replace quotients that would lose digits, and even more in their derivatives.
 # Each row holds the coefficients of one power of t^2.
 _SERIES_BELOW = 0.3
 _SERIES = [[(-1) ** k / factorial(2 * k + first) for first in (1, 2, 3)] for k in range(6)]
@@ -60,9 +60,9 @@ def exp_so3(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def log_so3(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vector of `R`, angle in [0, pi]; by way of the unit quaternion, good near 0 and pi."""
+    """Rotation vector of `R`, with an angle in [0, pi]; via the unit quaternion, which is accurate near 0 and pi."""
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    candidates = torch.stack(  # each row is 4 q_i * q for one i: the one with the largest q_i is stable
+    candidates = torch.stack(  # each row is 4 q_i * q for one i; the one with the largest q_i is stable
         [
             torch.stack(
                 [
@@ -146,14 +146,14 @@ def log_se3(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
 
 
 def pose(R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """The 4x4 matrix of rotation `R` and translation `t`."""
+    """The 4x4 matrix with rotation `R` and translation `t`."""
     top = torch.cat([R, t[..., None]], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
 
 
 def inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Inverse of a rigid motion, without a general matrix inversion."""
+    """Inverse of a rigid motion, without inverting a general matrix."""
     R_t = T[..., :3, :3].transpose(-1, -2)
     return pose(R_t, -(R_t @ T[..., :3, 3:]).squeeze(-1))
 
@@ -166,12 +166,12 @@ def adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6 6"]:
 
 
 def transform(T: Float[Tensor, "*#batch 4 4"], p: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
-    """`p_a` of `p_b` under `T_a_b`; batch shapes broadcast."""
+    """Points `p` of frame b in frame a, given `T_a_b`; batch shapes broadcast."""
     return rotate(T, p) + T[..., :3, 3]
 
 
 def rotate(T: Float[Tensor, "*#batch 4 4"], d: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 3"]:
-    """Direction `d` turned by the rotation of `T`; batch shapes broadcast."""
+    """Direction `d` rotated by the rotation of `T`; batch shapes broadcast."""
     R = T[..., :3, :3]
-    # three products of columns: several times faster on long batches than a batched 3x3 product
+    # products with the three columns: on long batches several times faster than a batched 3x3 product
     return R[..., 0] * d[..., :1] + R[..., 1] * d[..., 1:2] + R[..., 2] * d[..., 2:]

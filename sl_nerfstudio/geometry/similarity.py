@@ -1,4 +1,4 @@
-"""Similarities Sim(3): uniform scale, rotation, translation; and their least-squares fit."""
+"""Similarities Sim(3) (uniform scale, rotation, translation) and their least-squares fit."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from numpy import ndarray
 
 @dataclass(frozen=True)
 class Similarity:
-    """Maps `p_b` to `p_a = scale * R @ p_b + t`. Named `S_a_b`, as poses are."""
+    """Maps `p_b` to `p_a = scale * R @ p_b + t`. Named `S_a_b`, like poses."""
 
     scale: float
     R: Float[ndarray, "3 3"]
@@ -17,7 +17,7 @@ class Similarity:
 
     @staticmethod
     def identity() -> "Similarity":
-        """The map that changes nothing."""
+        """The identity."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     def points(self, p: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
@@ -25,7 +25,7 @@ class Similarity:
         return self.scale * p @ self.R.T + self.t
 
     def poses(self, T: Float[ndarray, "*batch 4 4"]) -> Float[ndarray, "*batch 4 4"]:
-        """Rigid poses `T_b_device` as `T_a_device`: rotations are turned, positions are mapped."""
+        """Poses `T_b_device` as `T_a_device`: rotations are rotated, positions are mapped; the result is rigid."""
         out = np.array(T, dtype=np.float64)
         out[..., :3, :3] = self.R @ T[..., :3, :3]
         out[..., :3, 3] = self.points(T[..., :3, 3])
@@ -40,7 +40,7 @@ class Similarity:
         return Similarity(self.scale * other.scale, self.R @ other.R, self.points(other.t))
 
     def matrix(self) -> Float[ndarray, "4 4"]:
-        """The same map on homogeneous coordinates."""
+        """The same map as a 4x4 matrix, for homogeneous coordinates."""
         out = np.eye(4)
         out[:3, :3] = self.scale * self.R
         out[:3, 3] = self.t
@@ -53,7 +53,7 @@ def fit_similarity(
     with_scale: bool = True,
     weights: Float[ndarray, "n"] | None = None,
 ) -> Similarity:
-    """Least-squares map of `source` onto `target`, point by point (Umeyama, PAMI 1991, eq. 40 to 42).
+    """Least-squares similarity that maps `source` onto `target`, point by point (Umeyama, PAMI 1991, eq. 40 to 42).
 
     Raises ValueError for fewer than three pairs.
     """

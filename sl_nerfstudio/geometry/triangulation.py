@@ -1,4 +1,4 @@
-"""Where a camera ray and a projector ray meet, and how well that is known."""
+"""Triangulation of a camera ray and a projector ray, with its uncertainty."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ from sl_nerfstudio.geometry.devices import Intrinsics, project_jacobian
 from sl_nerfstudio.geometry.rays import pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 
-_PARALLEL = 1e-12  # sin^2 of the angle between rays below which they have no meeting point
+_PARALLEL = 1e-12  # sin^2 of the angle between rays, below which they count as parallel
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points of correspondences, with what tells good ones from bad ones."""
+    """Triangulated points of correspondences, and measures of their quality."""
 
-    p_world: Float[Tensor, "*batch 3"]  # midpoint of the rays' closest approach; NaN for parallel rays
-    depth_camera: Float[Tensor, "*batch"]  # distance along the unit camera ray; negative: behind the camera
+    p_world: Float[Tensor, "*batch 3"]  # midpoint of the rays' closest approach; NaN if they are parallel
+    depth_camera: Float[Tensor, "*batch"]  # distance along the unit camera ray; negative behind the camera
     depth_projector: Float[Tensor, "*batch"]  # the same along the projector ray
-    gap: Float[Tensor, "*batch"]  # length of the closest approach
+    gap: Float[Tensor, "*batch"]  # distance between the rays at their closest approach
     sigma_depth: Float[Tensor, "*batch"]  # 1 sigma along the camera ray for 1 px of projector noise
 
 
@@ -30,12 +30,12 @@ def closest_approach(
     o2: Float[Tensor, "*#batch 3"],
     d2: Float[Tensor, "*#batch 3"],
 ) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch"]]:
-    """Distances along two lines (unit directions) of the points where they are nearest to each other.
+    """Distances along two lines (unit directions) to the points where they come closest to each other.
 
-    Lines closer to parallel than 1e-6 rad give NaN.
+    NaN if the angle between the lines is below 1e-6 rad.
     """
     between, d1, d2 = torch.broadcast_tensors(o2 - o1, d1, d2)
-    # By cross products: 1 - cos^2 of the angle between the lines would lose all digits of float32 at small baselines.
+    # Cross products, because 1 - cos^2 of the angle would lose all digits of float32 at small baselines.
     normal = torch.linalg.cross(d1, d2)
     sin2 = (normal * normal).sum(-1)
     scaled = normal / sin2.where(sin2 > _PARALLEL, sin2.new_tensor(float("nan")))[..., None]
@@ -50,10 +50,10 @@ def triangulate(
     T_world_projector: Float[Tensor, "*#batch 4 4"],
     uv_projector: Float[Tensor, "*#batch 2"],
 ) -> Triangulation:
-    """Midpoints of camera rays and projector rays; differentiable in both poses.
+    """Midpoints between camera rays and projector rays; differentiable with respect to both poses.
 
-    `sigma_depth` is 1 / |d uv_projector / d depth|: how far along the camera ray the point moves
-    for one pixel of the projector; multiply by the coordinate noise in pixels.
+    `sigma_depth` is 1 / |d uv_projector / d depth|: how far the point moves along the camera ray
+    per projector pixel. Multiply it by the coordinate noise in pixels.
     """
     o_c, d_c = pixel_rays(camera, T_world_camera, uv_camera)
     o_p, d_p = pixel_rays(projector, T_world_projector, uv_projector)

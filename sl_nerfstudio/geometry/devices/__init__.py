@@ -1,6 +1,6 @@
-"""Cameras and projectors: how a direction becomes a pixel, and back. One file a model.
+"""Cameras and projectors: from directions to pixels, and back; one file per device model.
 
-Device axes: a device looks along its own -z, +x to the right, +y up (OpenGL, as nerfstudio).
+Device axes: a device looks along its own -z, with +x to the right and +y up (OpenGL, nerfstudio).
 Pixels: continuous, the centre of the first pixel is (0.5, 0.5), x to the right, y down.
 """
 

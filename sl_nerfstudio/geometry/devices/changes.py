@@ -1,4 +1,4 @@
-"""Changes of focal lengths and principal points, as shares of the focal length: how captures correct a calibration."""
+"""Changes of focal lengths and principal points, as shares of the focal length, by which a calibration is corrected."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
@@ -8,10 +8,10 @@ from sl_nerfstudio.geometry.devices.device import Device
 
 @dataclass(frozen=True)
 class DeviceChange:
-    """A change of one device's intrinsics; all three numbers are shares of its fl_x. Distortion stays."""
+    """A change of one device's intrinsics; all three numbers are shares of its fl_x. Distortion does not change."""
 
     focal: float = 0.0
-    """Change of both focal lengths, as a share of them."""
+    """Relative change of both focal lengths."""
     x: float = 0.0
     """Shift of the principal point to the right, as a share of the focal length."""
     y: float = 0.0
@@ -30,7 +30,7 @@ class DeviceChange:
 
 @dataclass(frozen=True)
 class IntrinsicsChange:
-    """A change of the intrinsics of all cameras alike, and of the projector."""
+    """A change of the intrinsics of the cameras (the same for all) and of the projector."""
 
     camera: DeviceChange = field(default_factory=DeviceChange)
     """Change of all cameras."""
@@ -49,11 +49,11 @@ class IntrinsicsChange:
         return (*astuple(self.camera), *astuple(self.projector))
 
     def __bool__(self) -> bool:
-        """Whether anything changes."""
+        """Whether it changes anything."""
         return any(self.values)
 
     def __add__(self, other: "IntrinsicsChange") -> "IntrinsicsChange":
-        """Both changes together, to first order."""
+        """Both changes combined, to first order."""
         return IntrinsicsChange.of([a + b for a, b in zip(self.values, other.values, strict=True)])
 
 

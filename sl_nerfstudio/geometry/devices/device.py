@@ -1,4 +1,4 @@
-"""Intrinsics of one device, and of a batch of them as a tensor."""
+"""Intrinsics of one device, and of a batch of devices as a tensor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 DeviceKind = Literal["OPENCV", "DOE"]
-"""Names of the device models, as `models.MODELS` has them."""
+"""Names of the device models, the keys of `models.MODELS`."""
 PARAMETERS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -30,7 +30,7 @@ class Device:
     model: DeviceKind = "OPENCV"
 
     def scaled(self, factor: float) -> "Device":
-        """The same device with its image resized by `factor` (no half pixel: centres are at .5)."""
+        """The same device with its image resized by `factor` (no half-pixel shift, because centres are at .5)."""
         return replace(
             self,
             w=round(self.w * factor),
@@ -52,7 +52,7 @@ class Intrinsics:
 
     @staticmethod
     def of(devices: Device | Sequence[Device], dtype: torch.dtype = torch.float32) -> "Intrinsics":
-        """Batch of shape () of one device, or (n,) of a sequence. Raises ValueError for mixed models."""
+        """Batch of shape () from one device, or (n,) from a sequence. Raises ValueError for mixed models."""
         if isinstance(devices, Device):
             one = Intrinsics.of([devices], dtype)
             return Intrinsics(one.params[0], one.model, one.distorted)
@@ -63,11 +63,11 @@ class Intrinsics:
         return Intrinsics(params, models[0], bool((params[:, 4:] != 0).any()))
 
     def __getitem__(self, index: Int[Tensor, "*n"] | int | slice) -> "Intrinsics":
-        """Devices chosen along the first batch dimension."""
+        """Devices selected along the first batch dimension."""
         return Intrinsics(self.params[index], self.model, self.distorted)
 
     def to(self, *args: torch.device | torch.dtype | str) -> "Intrinsics":
-        """On another device or of another dtype."""
+        """On another torch device, or with another dtype."""
         return Intrinsics(self.params.to(*args), self.model, self.distorted)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     def reshape(self, *shape: int) -> "Intrinsics":

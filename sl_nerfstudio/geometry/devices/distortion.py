@@ -1,6 +1,6 @@
 """Lens distortion as OpenCV defines it: radial k1, k2 and tangential p1, p2, on normalised coordinates.
 
-`distort` and `distortion_jacobian` are plain arithmetic, so they serve tensors and, compiled, the numbers of a loop.
+`distort` and `distortion_jacobian` are plain arithmetic, so they work on tensors and, compiled, on single numbers.
 """
 
 from typing import Any
@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-Number = Any  # a tensor, or in compiled loops a float
+Number = Any  # a tensor, or a float in compiled loops
 
 
 def distort(x: Number, y: Number, k1: Number, k2: Number, p1: Number, p2: Number) -> tuple[Number, Number]:
-    """Distorted from ideal normalised coordinates."""
+    """Distorted normalised coordinates, from ideal ones."""
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * k2)
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
@@ -23,7 +23,7 @@ def distort(x: Number, y: Number, k1: Number, k2: Number, p1: Number, p2: Number
 def distortion_jacobian(
     x: Number, y: Number, k1: Number, k2: Number, p1: Number, p2: Number
 ) -> tuple[Number, Number, Number]:
-    """d(xd)/dx, d(xd)/dy = d(yd)/dx, d(yd)/dy: the matrix is symmetric."""
+    """d(xd)/dx, d(xd)/dy = d(yd)/dx, d(yd)/dy; the matrix is symmetric."""
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * k2)
     slope = 2 * k1 + 4 * k2 * r2
@@ -36,7 +36,7 @@ def distortion_jacobian(
 def undistort(
     xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, iterations: int = 12
 ) -> tuple[Tensor, Tensor]:
-    """Newton's method on `distort(x, y) = (xd, yd)`, started at the distorted point."""
+    """Ideal normalised coordinates, from distorted ones: Newton's method, started at the distorted point."""
     x, y = xd, yd
     for _ in range(iterations):
         ex, ey = distort(x, y, k1, k2, p1, p2)

@@ -1,6 +1,7 @@
-"""The projector with a diffractive optical element, "DOE": (x, y) = (x' / |p|, -y' / |p|), direction cosines.
+"""The projector with a diffractive optical element, "DOE": (x, y) = (x' / |p|, -y' / |p|) for a point p = (x', y', z').
 
-Diffraction orders leave in directions whose direction cosines are evenly spaced, not their tangents.
+Its normalised coordinates are direction cosines, because those of the diffraction orders are evenly spaced (and their
+tangents are not).
 """
 
 import torch
@@ -8,11 +9,11 @@ from torch import Tensor
 
 from sl_nerfstudio.geometry.devices.distortion import Number
 
-_MIN_DEPTH = 1e-6  # of |p|: nearer to the plane of the device than this counts as behind it
+_MIN_DEPTH = 1e-6  # of |p|; a point closer to the plane of the device counts as behind it
 
 
 def normalised(x: Number, y: Number, z: Number) -> tuple[Number, Number]:
-    """Normalised coordinates (y down) of a point in front; plain arithmetic, for tensors and for compiled loops."""
+    """Normalised coordinates (y down) of a point in front; plain arithmetic, for tensors and compiled loops."""
     q = 1 / (x * x + y * y + z * z) ** 0.5
     return x * q, -y * q
 
@@ -23,7 +24,7 @@ def in_front(x: Number, y: Number, z: Number) -> bool | Tensor:
 
 
 def normalised_anywhere(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Normalised coordinates and `in_front`; finite, with finite gradients, for points behind, too."""
+    """Normalised coordinates and `in_front`; finite, with finite gradients, for points behind as well."""
     x, y, z = p.unbind(-1)
     norm = (p * p).sum(-1).clamp_min(1e-30).sqrt()
     q = 1 / norm
@@ -31,7 +32,7 @@ def normalised_anywhere(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def jacobian(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Normalised coordinates, and their derivatives [..., 3] by the point."""
+    """Normalised coordinates, and their derivatives [..., 3] with respect to the point."""
     x, y, z = p.unbind(-1)
     r = p.norm(dim=-1)
     q, q3 = 1 / r, 1 / r**3
@@ -41,5 +42,5 @@ def jacobian(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def direction(x: Tensor, y: Tensor) -> Tensor:
-    """Unit direction [..., 3] in device axes of normalised coordinates; NaN beyond 90 degrees, where there is none."""
+    """Unit direction [..., 3], in device axes, of normalised coordinates; NaN beyond 90 degrees, where none exists."""
     return torch.stack([x, -y, -(1 - x * x - y * y).sqrt()], -1)

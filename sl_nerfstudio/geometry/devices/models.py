@@ -1,4 +1,4 @@
-"""The device models by name. A new one is a file beside `pinhole` and a line in each table."""
+"""The device models by name. A new one is a file beside `pinhole`, an entry in `MODELS` and a branch in `pixel_of`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from sl_nerfstudio.geometry.devices.distortion import distort
 
 @dataclass(frozen=True)
 class DeviceModel:
-    """What a model adds to what all share: distortion of normalised coordinates, focal lengths, principal point."""
+    """The part of a device that differs between models; lens distortion, focal lengths and principal point do not."""
 
-    code: int  # in compiled loops
+    code: int  # identifies the model in compiled loops
     normalised_anywhere: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
     jacobian: Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
     direction: Callable[[Tensor, Tensor], Tensor]
@@ -33,9 +33,10 @@ _distort = compiled(distort)
 
 @compiled
 def pixel_of(code, x, y, z, parameters):
-    """`project` of one point in a compiled loop: column, row, and whether it lies in front; `parameters` as PARAMETERS.
+    """`project` for one point, in compiled loops: column, row, and whether the point is in front.
 
-    Like `project` but for one thing: where the distortion polynomial turns back is not looked for.
+    `parameters` are ordered as PARAMETERS. Unlike `project`, it does not detect where the distortion polynomial folds
+    back.
     """
     if code == 0:
         front = _pinhole_in_front(x, y, z)

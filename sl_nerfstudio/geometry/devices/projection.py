@@ -1,7 +1,7 @@
 """From points in device axes to pixels, and back.
 
-Every model makes normalised coordinates (image axes, y down); lens distortion, focal lengths and principal point then
-act alike in all of them.
+Every model maps points to normalised coordinates (image axes, y down). Lens distortion, focal lengths and principal
+point are then applied in the same way for all models.
 """
 
 import torch
@@ -16,11 +16,11 @@ from sl_nerfstudio.geometry.devices.models import MODELS
 def project(
     intrinsics: Intrinsics, p: Float[Tensor, "*batch 3"]
 ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """Pixels of points given in device axes, and whether each has one: it lies in front of the device.
+    """Pixels of points given in device axes, and a flag for each: whether it has a pixel.
 
-    A point behind the device (or in its plane) has no pixel: its value is finite but meaningless,
-    its gradient is finite, and its flag is False. So has a point so far off the axis that the distortion
-    polynomial has turned back there: it would appear a second time, inside the image.
+    A point behind the device (or in its plane) has none: its value is finite but meaningless, its gradient is finite,
+    and its flag is False. The same holds for a point so far off the axis that the distortion polynomial folds back: it
+    would appear a second time, inside the image.
     """
     xn, yn, in_front = MODELS[intrinsics.model].normalised_anywhere(p)
     fx, fy, cx, cy, k1, k2, p1, p2 = intrinsics.params.unbind(-1)
@@ -32,7 +32,7 @@ def project(
 
 
 def project_jacobian(intrinsics: Intrinsics, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-    """Derivative of `project`'s pixels with respect to `p`, in closed form; for points in front."""
+    """Derivative of the pixels of `project` with respect to `p`, in closed form; for points in front."""
     xn, yn, dx, dy = MODELS[intrinsics.model].jacobian(p)
     fx, fy, _, _, k1, k2, p1, p2 = intrinsics.params.unbind(-1)
     if intrinsics.distorted:
@@ -42,7 +42,7 @@ def project_jacobian(intrinsics: Intrinsics, p: Float[Tensor, "*batch 3"]) -> Fl
 
 
 def unproject(intrinsics: Intrinsics, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    """Unit direction, in device axes, of a pixel; NaN where the model has none, as a DOE beyond 90 degrees."""
+    """Unit direction, in device axes, of a pixel; NaN where the model has none, such as a DOE beyond 90 degrees."""
     fx, fy, cx, cy, k1, k2, p1, p2 = intrinsics.params.unbind(-1)
     xd = (uv[..., 0] - cx) / fx
     yd = (uv[..., 1] - cy) / fy
