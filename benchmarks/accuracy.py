@@ -27,11 +27,8 @@ COMPARED = {
 ABLATIONS = {
     "no-pattern": ("--pipeline.model.losses.pattern", "0"),
     "no-annealing": ("--pipeline.model.annealing.anneal-kappa", "False"),
-    "by-gradient": ("--pipeline.model.adjust-poses", "False", "--pipeline.model.train-poses", "True"),
-    "independent": (
-        *("--pipeline.model.adjust-poses", "False", "--pipeline.model.train-poses", "True"),
-        *("--pipeline.model.pose-parameters", "independent"),
-    ),
+    "by-gradient": ("--pipeline.model.pose-method", "render"),
+    "independent": ("--pipeline.model.pose-method", "render-independently"),
     "no-direct": (
         *("--pipeline.model.losses.surface", "0", "--pipeline.model.losses.free-space", "0"),
         *("--pipeline.model.losses.coordinates", "1", "--pipeline.model.warm-start", "0"),

@@ -1,0 +1,100 @@
+"""A step lowers the whole objective or is not taken, and is the solution of the damped normal equations."""
+
+from dataclasses import replace
+from math import radians
+
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.free_parameters import free_parameters
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
+from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm
+from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
+from sl_nerfstudio.bundle_adjustment.settings import StepSettings
+
+from .analytic import ExactMaps, disturbed, rig_of
+
+FRAMES, SIZE = 4, 80
+SETTINGS = StepSettings()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Disturbed poses, with rows and residuals of exact maps."""
+    true = rig_of(FRAMES, SIZE)
+    maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(0)
+    rig = disturbed(true, 1, degrees=0.5, shift=0.02, relative=0.2)
+    anchors = place_anchors(rig, maps, 60, generator)
+    rows = observe(rig, anchors, maps, 3, float("inf"), 0.1, generator)
+    return true, maps, rig, anchors, rows
+
+
+def prior_of(weight: float, start, scale: float = 1.0) -> PriorTerm:
+    sigmas = (0.03 * scale, radians(1) * scale, 0.01 * scale, radians(0.3) * scale)
+    prior = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in sigmas))
+    return PriorTerm(prior, start, weight)
+
+
+def objective(state: LMState, rows, maps, kernel: Kernel, prior: PriorTerm, valid) -> float:
+    return kernel.cost(residuals_of(state.rig, state.anchors, rows, maps), valid) + prior.energy(state.rig)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-2, 1e4])
+@pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig", "static-projector"])
+def test_a_step_lowers_data_and_prior_together(scene, mode, weight):
+    _, maps, rig, anchors, rows = scene
+    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    prior, state = prior_of(weight, rig), LMState(rig, anchors, SETTINGS.damping)
+    for _ in range(4):
+        linear = linearise(state.rig, state.anchors, rows, maps)
+        after = lm_step(state, linear, rows, maps, kernel, prior, free_parameters(mode, state.rig), SETTINGS)
+        both = linear.residuals.cross_valid & residuals_of(after.rig, after.anchors, rows, maps).cross_valid
+        if after.size == 0:
+            assert after.rig is state.rig and after.damping > state.damping
+            break
+        assert objective(after, rows, maps, kernel, prior, both) < objective(state, rows, maps, kernel, prior, both)
+        state = after
+
+
+def test_a_step_that_only_the_data_want_is_not_taken(scene):
+    """The prior holds all poses: judged by the data alone, steps away from it would go on for ever."""
+    true, maps, rig, anchors, rows = scene
+    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    prior = prior_of(1.0, rig, scale=1e-7)
+    state = LMState(rig, anchors, SETTINGS.damping)
+    for _ in range(3):
+        linear = linearise(state.rig, state.anchors, rows, maps)
+        state = lm_step(state, linear, rows, maps, kernel, prior, free_parameters("free", rig), SETTINGS)
+    assert (state.rig.T_world_camera - rig.T_world_camera).abs().max() < 1e-6
+    assert (state.rig.T_world_camera - true.T_world_camera).abs().max() > 1e-3
+
+
+def test_an_undamped_step_solves_the_normal_equations(scene):
+    true, maps, _, _, _ = scene
+    rig, generator = disturbed(true, 2, degrees=0.02, shift=0.0005, relative=0.2), torch.Generator().manual_seed(1)
+    anchors = place_anchors(rig, maps, 60, generator)
+    rows = observe(rig, anchors, maps, 3, 2.0, 0.1, generator)
+    kernel = Kernel(torch.full((FRAMES,), 1e3, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    linear, prior = linearise(rig, anchors, rows, maps), prior_of(1.0, rig)
+    settings = replace(SETTINGS, damping=0.0, least_depth=0.0, most_depth=10.0)
+    B = free_parameters("free", rig)
+    found = lm_step(LMState(rig, anchors, 0.0), linear, rows, maps, kernel, prior, B, settings)
+    equations = normal_equations(linear, rows, *kernel.weights(linear.residuals))
+    H, g = prior.equations(rig)
+    x = -torch.linalg.solve(equations.H + H, equations.g + g)
+    wanted = rig.moved(*x.reshape(2, FRAMES, 6))
+    assert 1e-5 < found.size < 0.05
+    assert torch.allclose(found.rig.T_world_camera, wanted.T_world_camera, atol=1e-9)
+    assert torch.allclose(found.rig.T_camera_projector, wanted.T_camera_projector, atol=1e-9)
+    assert torch.allclose(found.anchors.depth, anchors.depth + equations.depth_step(x), atol=1e-9)
+
+
+def test_with_nothing_free_nothing_moves(scene):
+    _, maps, rig, anchors, rows = scene
+    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    state, linear = LMState(rig, anchors, 0.1), linearise(rig, anchors, rows, maps)
+    found = lm_step(state, linear, rows, maps, kernel, prior_of(1.0, rig), free_parameters("off", rig), SETTINGS)
+    assert found == LMState(rig, anchors, 0.1)

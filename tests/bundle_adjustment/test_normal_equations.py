@@ -1,0 +1,51 @@
+"""The normal equations against dense least squares with all depths as unknowns."""
+
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
+from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.residuals import linearise
+
+from .analytic import ExactMaps, disturbed, rig_of
+
+FRAMES, SIZE = 3, 60
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_eliminated_depths_change_no_step(seed):
+    """Dense equations of poses and depths together, their Schur complement, and the depths that go with a step."""
+    true = rig_of(FRAMES, SIZE)
+    maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(seed)
+    rig = disturbed(true, seed, degrees=0.3, shift=0.01, relative=0.5)
+    anchors = place_anchors(rig, maps, 25, generator)
+    rows = observe(rig, anchors, maps, 2, float("inf"), 0.1, generator)
+    linear = linearise(rig, anchors, rows, maps)
+    own_weight = torch.rand(len(anchors.frame), generator=generator, dtype=torch.float64) + 0.1
+    cross_weight = torch.rand(len(rows.anchor), generator=generator, dtype=torch.float64) * linear.residuals.cross_valid
+    found = normal_equations(linear, rows, own_weight, cross_weight)
+
+    n, m = linear.unknowns, len(anchors.frame)
+    blocks = []
+    every = torch.arange(m)
+    for J, J_depth, r, w, columns, anchor in (
+        (linear.own, linear.own_depth, linear.residuals.own, own_weight, linear.own_columns, every),
+        (linear.cross, linear.cross_depth, linear.residuals.cross, cross_weight, linear.cross_columns, rows.anchor),
+    ):
+        dense = torch.zeros(len(w), 2, n + m, dtype=torch.float64)
+        for k in range(len(w)):
+            dense[k][:, columns[k]] += J[k]
+            dense[k][:, n + anchor[k]] += J_depth[k]
+        root = w.sqrt()[:, None]
+        blocks.append(((dense * root[..., None]).reshape(-1, n + m), (r * root).reshape(-1)))
+    A, b = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    H, g = A.T @ A, A.T @ b
+    poses, depths = slice(n), slice(n, None)
+    over = torch.linalg.solve(H[depths, depths], torch.cat([H[depths, poses], g[depths, None]], 1))
+    size = float(H.abs().max())
+    assert torch.allclose(found.H, H[poses, poses] - H[poses, depths] @ over[:, :n], rtol=0, atol=1e-12 * size)
+    assert torch.allclose(found.g, g[poses] - H[poses, depths] @ over[:, n], rtol=0, atol=1e-12 * size)
+    assert torch.allclose(found.H, found.H.T, rtol=0, atol=1e-12 * size)
+    x = torch.randn(n, generator=generator, dtype=torch.float64)
+    wanted = -torch.linalg.solve(H[depths, depths], g[depths] + H[depths, poses] @ x)
+    assert torch.allclose(found.depth_step(x), wanted, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,90 @@
+"""Which pixels take part, and who else sees them: against ray casting of a scene by formula."""
+
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.geometry.se3 import rotate, transform
+
+from .analytic import ExactMaps, cast, rig_of
+
+FRAMES, SIZE = 5, 90
+ALL = float("inf")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    rig = rig_of(FRAMES, SIZE)
+    maps, generator = ExactMaps.around(rig, SIZE), torch.Generator().manual_seed(0)
+    return rig, maps, place_anchors(rig, maps, 60, generator)
+
+
+def world(rig, anchors):
+    return transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)
+
+
+def test_anchors_lie_on_the_surface_with_its_normal(scene):
+    rig, _, anchors = scene
+    assert (torch.bincount(anchors.frame, minlength=FRAMES) > 20).all()
+    origin = rig.T_world_camera[anchors.frame, :3, 3]
+    direction = rotate(rig.T_world_camera[anchors.frame], anchors.d_camera)
+    depth, _ = cast(origin, direction)
+    assert (anchors.depth - depth).abs().max() < 1e-6
+    normal, (p, step) = rotate(rig.T_world_camera[anchors.frame], anchors.normal), (world(rig, anchors), 1e-3)
+    flat = []
+    for axis in torch.eye(3, dtype=torch.float64):  # a step in the tangent plane stays on the surface
+        along = torch.linalg.cross(normal, axis.expand_as(normal))
+        to = p + step * along - origin
+        there, _ = cast(origin, to / to.norm(dim=-1, keepdim=True))
+        flat.append((there - to.norm(dim=-1)).abs())
+    assert torch.stack(flat).median() < 1e-3 and ((normal * direction).sum(-1) < 0).all()
+
+
+def test_frames_that_decoded_the_place_are_found_and_no_others(scene):
+    rig, maps, anchors = scene
+    rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(1))
+    assert (anchors.frame[rows.anchor] != rows.frame).all()
+    pairs = set(zip(rows.anchor.tolist(), rows.frame.tolist(), strict=True))
+    assert len(pairs) == len(rows.anchor)  # none twice
+    gated = observe(rig, anchors, maps, FRAMES, 4.0, 0.1, torch.Generator().manual_seed(1))
+    right = set(zip(gated.anchor.tolist(), gated.frame.tolist(), strict=True))
+    assert right < pairs
+    p = world(rig, anchors)
+    a, j = gated.anchor, gated.frame
+    way = p[a] - rig.T_world_camera[j, :3, 3]
+    length = way.norm(dim=-1)
+    met = cast(rig.T_world_camera[j, :3, 3], way / length[:, None])[0]
+    seen = (met - length).abs() < 1e-5  # nothing is between camera and place
+    assert seen.double().mean() > 0.97  # the rest lies within the gate of an edge
+
+
+def test_surfaces_seen_at_a_flat_angle_are_left_out(scene):
+    rig, maps, anchors = scene
+    loose, strict = (
+        observe(rig, anchors, maps, FRAMES, ALL, cosine, torch.Generator().manual_seed(1)) for cosine in (0.1, 0.6)
+    )
+    assert 0 < len(strict.anchor) < len(loose.anchor)
+    p, normal = world(rig, anchors), rotate(rig.T_world_camera[anchors.frame], anchors.normal)
+    for T in (rig.T_world_camera, rig.T_world_projector):
+        way = torch.nn.functional.normalize(T[strict.frame, :3, 3] - p[strict.anchor], dim=-1)
+        assert ((way * normal[strict.anchor]).sum(-1) > 0.6).all()
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_no_anchor_is_looked_up_more_often_than_wanted(scene, most):
+    rig, maps, anchors = scene
+    rows = observe(rig, anchors, maps, most, ALL, 0.1, torch.Generator().manual_seed(1))
+    count = torch.bincount(rows.anchor)
+    assert count.max() == most
+    everything = torch.bincount(observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(2)).anchor)
+    assert torch.equal(count, everything.clamp_max(most))
+
+
+def test_around_one_frame_is_all_that_it_takes_part_in(scene):
+    rig, maps, anchors = scene
+    generator = torch.Generator().manual_seed(1)
+    rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator)
+    around = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator, around=2)
+    mine = (anchors.frame[rows.anchor] == 2) | (rows.frame == 2)
+    wanted = set(zip(rows.anchor[mine].tolist(), rows.frame[mine].tolist(), strict=True))
+    assert set(zip(around.anchor.tolist(), around.frame.tolist(), strict=True)) == wanted

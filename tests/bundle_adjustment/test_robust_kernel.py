@@ -1,0 +1,82 @@
+"""Geman-McClure's kernel: weights are the derivative of the cost, widths follow the residuals down."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sl_nerfstudio.bundle_adjustment.residuals import Residuals
+from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
+from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
+
+SETTINGS = KernelSettings()
+FRAME = torch.tensor([0, 0, 1, 2])  # of four anchors
+PAIR = torch.tensor([[0, 0, 1, 2, 2], [1, 2, 0, 0, 1]])  # of five rows
+
+
+def residuals(seed: int, size: float = 1.0, invalid: bool = False) -> Residuals:
+    generator = torch.Generator().manual_seed(seed)
+    own, cross = (size * torch.randn(n, 2, generator=generator, dtype=torch.float64) for n in (4, 5))
+    valid = torch.ones(5, dtype=torch.bool)
+    valid[3] = not invalid
+    return Residuals(own, cross, valid)
+
+
+def kernel(*widths: float) -> Kernel:
+    return Kernel(torch.tensor(widths, dtype=torch.float64), FRAME, PAIR)
+
+
+@given(st.integers(0, 50), st.floats(0.05, 20.0), st.booleans())
+def test_weights_are_the_derivative_of_the_cost(seed, size, invalid):
+    """Half the gradient of the cost is weight times residual: what makes a step of the normal equations descend."""
+    r, k = residuals(seed, size, invalid), kernel(0.5, 2.0, 1.0)
+    own, cross = r.own.clone().requires_grad_(), r.cross.clone().requires_grad_()
+    (w_own, w_cross), own2, cross2 = k.weights(r), k.width[FRAME] ** 2, k.width[PAIR].amax(0) ** 2
+    squares = ((own**2).sum(-1), own2), ((cross**2).sum(-1)[r.cross_valid], cross2[r.cross_valid])
+    cost = k.narrowest**2 * sum((r2 / (w2 + r2)).sum() for r2, w2 in squares)
+    assert k.cost(r, r.cross_valid) == pytest.approx(cost.item(), rel=1e-12)
+    g_own, g_cross = torch.autograd.grad(cost, (own, cross))
+    assert torch.allclose(g_own / 2, w_own[:, None] * r.own, rtol=1e-10, atol=1e-14)
+    assert torch.allclose(g_cross / 2, w_cross[:, None] * r.cross, rtol=1e-10, atol=1e-14)
+
+
+def test_a_gross_error_costs_the_same_whatever_the_width():
+    far = Residuals(*(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)), torch.ones(5, dtype=torch.bool))
+    assert kernel(0.5, 2.0, 1.0).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
+    assert kernel(0.5, 0.5, 0.5).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
+
+
+def test_rows_that_cannot_be_seen_weigh_nothing():
+    r = residuals(1, invalid=True)
+    weight = kernel(1.0, 1.0, 1.0).weights(r)[1]
+    assert weight[3] == 0 and (weight[r.cross_valid] > 0).all()
+
+
+def test_medians_are_of_what_a_frame_takes_part_in():
+    r = residuals(2)
+    size = r.cross.norm(dim=-1)
+    found = frame_medians(r, PAIR, 4)
+    assert found[0] == size[[0, 1, 2, 3]].median() and found[1] == size[[0, 2, 4]].median()
+    assert torch.isinf(found[3])
+
+
+def column(value: float) -> torch.Tensor:
+    return torch.tensor([value], dtype=torch.float64)
+
+
+@given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
+def test_widths_narrow_gently_and_never_widen(width, target):
+    found = float(narrowed(column(width), column(target), SETTINGS))
+    assert found == pytest.approx(min(width, max(target, width / SETTINGS.fastest)), rel=1e-12)
+    first = narrowed(column(float("inf")), column(target), SETTINGS)
+    assert float(first) == pytest.approx(target)
+
+
+def test_the_noise_is_the_robust_sigma_of_the_inliers():
+    generator = torch.Generator().manual_seed(0)
+    cross = 0.3 * torch.randn(20000, 2, generator=generator, dtype=torch.float64)
+    cross[::10] += 50.0
+    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20000, dtype=torch.bool))
+    assert noise_of(r, 0.9, SETTINGS) == pytest.approx(0.3, rel=0.03)
+    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
+    assert noise_of(exact, 0.9, SETTINGS) == SETTINGS.noise_floor_px
