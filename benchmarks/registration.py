@@ -1,10 +1,11 @@
-"""Auto-calibration and registration against the truth of synthetic scans, and on captures with known poses.
+"""Relative poses and registration against the truth of synthetic scans, and on captures with known poses.
 
     python -m benchmarks.registration [--scenes cone-and-cylinder head frog] [--scans FOLDER ...]
 
-For every scene a noisy scan is made with sl-synth (200 x 200 pixels, its default noise), its frames are calibrated one
-by one, registered without starting poses in the order of capture, and adjusted jointly. `--scans` adds existing scan
-folders, whose poses are taken for the truth where they have no ground_truth/.
+For every scene a noisy scan is made with sl-synth (200 x 200 pixels, its default noise), the relative pose
+of each frame is estimated, all frames are registered without starting poses in the order of capture, and bundle
+adjustment follows. `--scans` adds existing scan folders, whose poses are taken for the truth where they have no
+ground_truth/.
 
 Printed are: the errors of rotation and baseline direction, and how often they stay within one stated sigma; rotation,
 position and scale of every frame after registration and after the joint adjustment, after one common similarity.
@@ -22,6 +23,7 @@ from numpy import ndarray
 from benchmarks.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.processing.words import exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
@@ -86,7 +88,7 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
     """All frames, one by one."""
     from scipy.spatial.transform import Rotation
 
-    from sl_nerfstudio.relative_pose.epipolar_fit import direction_basis
+    from sl_nerfstudio.relative_pose.sampson import direction_basis
 
     clouds, rows = [], []
     start = time.process_time()
@@ -167,8 +169,8 @@ def measure(root: Path, sequence: bool = True) -> Row:
         calibration,
         pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
         pose_errors(joint.T_world_camera, baseline, (camera, projector), end - middle),
-        found.reasons,
-        found.remarks,
+        {e.frame: exclusion_sentence(e) for e in found.exclusions},
+        tuple(map(uncertainty_sentence, found.uncertainties)),
     )
 
 

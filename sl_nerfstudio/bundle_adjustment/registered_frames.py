@@ -18,7 +18,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.register import Registration
+from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import PoseSigma
 
 # What registration by surfaces leaves, 1 sigma per axis: turns in radian, shifts in radii of the object.
@@ -70,8 +70,11 @@ def adjust_registered(
     """
     index: list[int] = np.flatnonzero(registration.registered).tolist()
     if len(index) < 2:
-        why = "".join(f"\n    {name}: {reason}" for name, reason in registration.reasons.items())
-        raise UserError(f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed{why}")
+        lost = ", ".join(exclusion.frame for exclusion in registration.exclusions)
+        raise UserError(
+            f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed\n"
+            f"    not registered: {lost}"
+        )
     camera = registration.T_world_camera[index]
     projector = np.stack([_projector_pose(clouds[k], registration, k) for k in index])
     S_scene_world = _scene(clouds, registration, index)
