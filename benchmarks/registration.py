@@ -23,6 +23,7 @@ from numpy import ndarray
 from benchmarks.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.processing.words import exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
@@ -87,7 +88,7 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
     """Calibrate all frames, one by one."""
     from scipy.spatial.transform import Rotation
 
-    from sl_nerfstudio.relative_pose.epipolar_fit import direction_basis
+    from sl_nerfstudio.relative_pose.sampson import direction_basis
 
     clouds, rows = [], []
     start = time.process_time()
@@ -167,8 +168,8 @@ def measure(root: Path, sequence: bool = True) -> Row:
         calibration,
         pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
         pose_errors(joint.poses.T_world_camera, joint.poses.baseline, (camera, projector), end - middle),
-        found.reasons,
-        found.remarks,
+        {e.frame: exclusion_sentence(e) for e in found.exclusions},
+        tuple(map(uncertainty_sentence, found.uncertainties)),
     )
 
 

@@ -20,7 +20,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.register import Registration
+from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import PoseSigma
 
 
@@ -86,7 +86,11 @@ def adjust_registered(
     s = settings or RegisteredFramesSettings()
     index: list[int] = np.flatnonzero(registration.registered).tolist()
     if len(index) < 2:
-        raise UserError(f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed")
+        lost = ", ".join(exclusion.frame for exclusion in registration.exclusions)
+        raise UserError(
+            f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed\n"
+            f"    not registered: {lost}"
+        )
     camera = registration.T_world_camera[index]
     projector = np.stack([_projector_pose(clouds[k], registration, k) for k in index])
     S_scene_world = _scene(clouds, registration, index)

@@ -28,9 +28,10 @@ from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length, scale_to
-from sl_nerfstudio.registration.register import Registration, register
+from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.relative_pose.estimation import RelativePose, estimate_relative_pose
-from sl_nerfstudio.relative_pose.projector_focal import CalibratedView, refine_projector_focal
+from sl_nerfstudio.relative_pose.projector_focal import PosedFrame, refine_projector_focal
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
 from sl_nerfstudio.scan.types import Scale
@@ -134,7 +135,7 @@ def _with_refined_focal(
 ) -> tuple[FrameJob, list[FrameOutcome]]:
     """The projector's focal length from all frames, and every frame calibrated anew with it."""
     views = [
-        CalibratedView(*correspondences_of(o.cloud.coords), job.camera, _all_inliers(o.cloud))
+        PosedFrame(*correspondences_of(o.cloud.coords), job.camera, _all_inliers(o.cloud))
         for o in outcomes
         if o.cloud is not None
     ]

@@ -12,7 +12,8 @@ from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_stage import FrameOutcome
 from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
-from sl_nerfstudio.registration.register import Registration
+from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
+from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import Scale
 
 
@@ -48,7 +49,7 @@ def _remarks(
     outcomes: Sequence[FrameOutcome], registration: Registration | None, joint: AdjustedFrames | None
 ) -> tuple[str, ...]:
     """What remains uncertain."""
-    placed = () if registration is None else tuple(registration.remarks)
+    placed = () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
     clouds = [o.cloud for o in outcomes if o.cloud is not None]
     if joint is None or not clouds:
         return placed
@@ -71,9 +72,7 @@ def _record(
         return FrameRecord(outcome.name, False, outcome.stage, outcome.reason, rate, share)
     pose = cloud.pose
     placed = registration is not None and k is not None and bool(registration.registered[k])
-    reason = ""
-    if not placed:
-        reason = "too few other frames could be used" if registration is None else registration.reasons[outcome.name]
+    reason = "" if placed else _exclusion(outcome.name, registration)
     baseline = fitness = None
     if placed and joint is not None and registration is not None and k is not None:
         baseline = float(joint.poses.baseline[k])
@@ -90,5 +89,12 @@ def _record(
         sigma_direction_deg=pose.sigma_direction_deg,
         fitness=fitness,
         baseline=baseline,
-        degeneracies=tuple(degeneracy.message for degeneracy in pose.degeneracies),
+        degeneracies=tuple(map(degeneracy_sentence, pose.degeneracies)),
     )
+
+
+def _exclusion(name: str, registration: Registration | None) -> str:
+    """Why a frame with a relative pose is not in the scan."""
+    if registration is None:
+        return "too few other frames could be used"
+    return next(exclusion_sentence(e) for e in registration.exclusions if e.frame == name)

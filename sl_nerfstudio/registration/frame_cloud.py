@@ -1,4 +1,4 @@
-"""One frame's surface in camera axes, in units of its own baseline, with the uncertainty of every point."""
+"""The surface of one frame in camera axes, in units of its own baseline, with the uncertainty of every point."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.triangulation import triangulate
-from sl_nerfstudio.relative_pose.epipolar_fit import moved
+from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, FRAME_CLOUD_DEFAULTS, FrameCloudSettings
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, ray_pairs
-
-_STEP = 1e-4  # radian: for differences by the relative pose
-_FEWEST = 50  # points
+from sl_nerfstudio.relative_pose.sampson import moved
 
 
 @dataclass(frozen=True)
@@ -28,12 +26,12 @@ class FrameCloud:
     coords: Float32[ndarray, "h w 2"]  # decoded coordinates that agree with the pose; NaN elsewhere
     uv_camera: Float64[ndarray, "n 2"]
     points: Float64[ndarray, "n 3"]
-    sigma_noise: Float64[ndarray, "n"]  # along the camera ray, of decoding noise: independent of other cells
-    sigma_pose: Float64[ndarray, "n"]  # along the camera ray, of the pose's uncertainty: all points err together
+    sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
+    sigma_pose: Float64[ndarray, "n"]  # along the camera ray, from the pose's covariance: points err together
 
     @property
     def sigma(self) -> Float64[ndarray, "n"]:
-        """One standard deviation along the camera ray, of everything but the unknown length of the baseline."""
+        """One standard deviation along the camera ray, without that of the unknown length of the baseline."""
         return np.hypot(self.sigma_noise, self.sigma_pose)
 
     @property
@@ -48,17 +46,22 @@ class FrameCloud:
 
 
 def frame_cloud(
-    name: str, coords: Float32[ndarray, "h w 2"], camera: Device, projector: Device, pose: RelativePose
+    name: str,
+    coords: Float32[ndarray, "h w 2"],
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+    settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
 ) -> FrameCloud:
-    """Triangulate one frame with its calibration. `coords` are those that `pose` was found from.
+    """Triangulate one frame. `coords` are those from which `pose` was found.
 
-    Raises CalibrationError where hardly any point lies in front of both devices.
+    Raises RelativePoseError where hardly any point agrees with the pose.
     """
     uv_camera, uv_projector = correspondences_of(coords)
     keep = pose.inliers
-    if keep.sum() < _FEWEST:
+    if keep.sum() < settings.fewest_points:
         raise RelativePoseError(
-            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {_FEWEST})\n"
+            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {settings.fewest_points})\n"
             "    cause:  too little of the pattern was decoded\n"
             "    remedy: capture this view again"
         )
@@ -74,7 +77,7 @@ def frame_cloud(
     agreeing = np.full_like(coords, np.nan)
     row, column = np.floor(uv_camera[keep]).astype(np.int64).T[::-1]
     agreeing[row, column] = coords[row, column]
-    # On the camera ray, not halfway to the projector's: camera pixels are exact, coordinates are not.
+    # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
     points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
     return FrameCloud(
         name,
@@ -85,7 +88,7 @@ def frame_cloud(
         uv_camera[keep],
         points,
         sigma_noise=pose.residual_px * found.sigma_depth.numpy(),
-        sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+        sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
     )
 
 
@@ -95,15 +98,17 @@ def _sigma_of_pose(
     camera: Device,
     projector: Device,
     pose: RelativePose,
+    settings: FrameCloudSettings,
 ) -> Float64[ndarray, "n"]:
-    """Standard deviation of depth by the pose's covariance, by differences of the rays' closest approach."""
+    """Standard deviation of depth from the pose's covariance, by differences of the rays' closest approach."""
     rays, _ = ray_pairs(uv_camera, uv_projector, camera, projector)
     R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
     slopes = []
+    h = settings.difference_step_rad
     for k in range(5):
-        step = _STEP * np.eye(5)[k]
+        step = h * np.eye(5)[k]
         ahead, behind = (camera_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
-        slopes.append((ahead - behind) / (2 * _STEP))
+        slopes.append((ahead - behind) / (2 * h))
     J = np.stack(slopes, 1)
     return np.sqrt(np.einsum("ni,ij,nj->n", J, pose.covariance, J).clip(0))
 
@@ -116,14 +121,16 @@ def camera_depth(
 ) -> Float64[ndarray, "n"]:
     """Depth along camera rays where they come nearest to projector rays, each in its device's axes.
 
-    `R`, `t` lead from the projector to the camera.
+    `R`, `t` map from the projector to the camera.
     """
     d_p = d_projector @ R.T
     normal = np.cross(d_camera, d_p)
     return (np.cross(t, d_p) * normal).sum(-1) / (normal * normal).sum(-1).clip(1e-300)
 
 
-def well_known(cloud: FrameCloud, times_median: float = 4.0) -> Bool[ndarray, "n"]:
+def reliable_points(
+    cloud: FrameCloud, largest_ratio: float = DEFAULT_SETTINGS.surface_map.largest_sigma_ratio
+) -> Bool[ndarray, "n"]:
     """Points whose uncertainty is not far above the frame's median: those next to an epipole are left out."""
     sigma = cloud.sigma
-    return sigma < times_median * np.median(sigma)
+    return sigma < largest_ratio * np.median(sigma)

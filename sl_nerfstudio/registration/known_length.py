@@ -1,4 +1,4 @@
-"""One known length makes a registration metric: a frame's baseline, or the distance between two pixels' points."""
+"""One known length sets the scale: the baseline of a frame, or the distance between two points picked in images."""
 
 import re
 from collections.abc import Sequence
@@ -10,9 +10,9 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth
+from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
-_NEAR = 3.0  # pixels around a picked one whose points are averaged
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 _NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
@@ -22,16 +22,16 @@ _BAR = re.compile(rf"distance (?:between|from) {_PIXEL} (?:and|to) {_PIXEL} *= *
 
 @dataclass(frozen=True)
 class KnownLength:
-    """A length in metres, and what it is the length of: a baseline, or a distance between two picked pixels."""
+    """A length in metres and what it belongs to: a baseline, or the distance between two picked pixels."""
 
     metres: float
     unit: str
     frames: tuple[str, ...]  # number or name of the frame, or of the two frames
-    pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y) as in DATA: first pixel's centre is (.5, .5)
+    pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y); the centre of the first pixel is (.5, .5)
 
     @property
     def source(self) -> str:
-        """What a scan says its scale is known by."""
+        """Where the scale of a scan comes from, in words."""
         if self.pixels:
             return "scale bar between frame {} and frame {}".format(*self.frames)
         return f"baseline of frame {self.frames[0]}"
@@ -56,7 +56,7 @@ def parse_known_length(text: str) -> KnownLength:
     if unit not in _METRES:
         raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
     if length <= 0:
-        raise UserError(f'known length "{text}": a length is above zero')
+        raise UserError(f'known length "{text}": a length must be above zero')
     return KnownLength(length * _METRES[unit], unit, frames, pixels)
 
 
@@ -66,6 +66,7 @@ def scale_to(
     clouds: Sequence[FrameCloud],
     T_world_camera: Float64[ndarray, "n 4 4"],
     T_world_projector: Float64[ndarray, "n 4 4"],
+    settings: KnownLengthSettings = KNOWN_LENGTH_DEFAULTS,
 ) -> float:
     """Factor by which all positions must be multiplied for the length to be true, in `unit` ("m", "cm", "mm", "um").
 
@@ -75,12 +76,12 @@ def scale_to(
     for k in index:
         if not np.isfinite(T_world_camera[k]).all():
             raise UserError(
-                f"{clouds[k].name} was not registered, so a length in it says nothing\n"
+                f"{clouds[k].name} was not registered, so a length in it cannot set the scale\n"
                 "    remedy: give a length that involves registered frames"
             )
     if known.pixels:
         ends = [
-            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k])
+            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k], settings.picking_radius_px)
             for k, pixel in zip(index, known.pixels, strict=True)
         ]
         found = float(np.linalg.norm(ends[0] - ends[1]))
@@ -88,7 +89,7 @@ def scale_to(
         k = index[0]
         found = float(np.linalg.norm(T_world_camera[k, :3, 3] - T_world_projector[k, :3, 3]))
     if found <= 0:
-        raise UserError(f"{known.source}: the two ends are the same point\n    remedy: pick two places apart")
+        raise UserError(f"{known.source}: the two ends are the same point\n    remedy: pick two different places")
     return known.metres / _METRES[unit] / found
 
 
@@ -106,15 +107,16 @@ def _point_at(
     pixel: tuple[float, float],
     T_world_camera: Float64[ndarray, "4 4"],
     T_world_projector: Float64[ndarray, "4 4"],
+    radius_px: float,
 ) -> Float64[ndarray, "3"]:
-    """World point of a picked pixel: the median depth of what was decoded within three pixels of it."""
-    near = np.linalg.norm(cloud.uv_camera - pixel, axis=1) < _NEAR
+    """World point of a picked pixel, at the median depth of what was decoded around it."""
+    near = np.linalg.norm(cloud.uv_camera - pixel, axis=1) < radius_px
     if not near.any():
         raise UserError(
-            f"{cloud.name}: nothing was decoded within {_NEAR:g} pixels of ({pixel[0]:g}, {pixel[1]:g})\n"
-            "    remedy: pick a place where the pattern is"
+            f"{cloud.name}: nothing was decoded within {radius_px:g} pixels of ({pixel[0]:g}, {pixel[1]:g})\n"
+            "    remedy: pick a place where the pattern can be seen"
         )
-    # The cloud's points have baseline one; the adjusted one may point elsewhere by a little, which depth feels.
+    # Not the cloud's points: bundle adjustment may have changed the relative pose, and depth depends on it.
     T = np.linalg.inv(T_world_camera) @ T_world_projector
     row, column = np.floor(cloud.uv_camera[near]).astype(int).T[::-1]
     d_projector = directions(cloud.projector, cloud.coords[row, column].astype(np.float64))

@@ -1,8 +1,8 @@
-"""How well two frames' surfaces agree under a similarity, and how to move it: sums over looked-up points.
+"""How well the surfaces of two frames agree under a similarity, and how to improve it: sums over looked-up points.
 
 Points of one frame are projected into the other's camera and compared with the tangent plane of the surface seen
-there, both ways. Unlike nearest neighbours this also tells what speaks *against* a similarity: a point in front of a
-surface that the other camera saw would have hidden it.
+there, both ways. Unlike nearest neighbours this also finds contradictions: a point in front of a surface that the other
+camera saw would have hidden that surface.
 
 A similarity maps the source's points to the target's axes. Increments (v, w, l) act there, about the target's centroid
 c: `p <- c + exp(l) exp(w) (p - c) + v`.
@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled_parallel
+from sl_nerfstudio.compiled import compiled, compiled_parallel
 from sl_nerfstudio.geometry.devices.models import pixel_of
+from sl_nerfstudio.geometry.robust import geman_mcclure_weight
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.hypotheses import Hypotheses
+from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
-_HIDDEN = 0.35  # radii behind a surface: farther back a point is hidden by it, nearer it contradicts it
-_FACING = 0.3  # cosine between normals of places that may be the same
+_kernel_weight = compiled(geman_mcclure_weight)
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,11 @@ class Side:
     points: Float64[ndarray, "n 3"]
     normals: Float64[ndarray, "n 3"]
 
+    @staticmethod
+    def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
+        """With about `count` points spread evenly over the image."""
+        return Side(surface, *surface.sample(count, rng))
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -39,49 +47,71 @@ class Agreement:
     H: Float64[ndarray, "k 7 7"]  # of robustly weighted point-to-plane distances
     g: Float64[ndarray, "k 7"]
     agreeing: Float64[ndarray, "k"]  # fraction of the points that lie on the other surface
-    in_front: Float64[ndarray, "k"]  # that would hide what the other camera saw
-    behind: Float64[ndarray, "k"]  # a little below what the other camera saw
+    in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
+    behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
     squares: Float64[ndarray, "k"]  # mean squared distance of those that agree
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
         """Of the points that could be judged, the fraction that agree."""
-        return self.agreeing / (self.agreeing + self.in_front + self.behind).clip(1e-9)
+        return self.agreeing / self.judged.clip(1e-9)
 
     @property
-    def score(self) -> Float64[ndarray, "k"]:
-        """What speaks for a similarity less what speaks against it."""
-        return self.agreeing - self.in_front - 0.5 * self.behind
+    def judged(self) -> Float64[ndarray, "k"]:
+        """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
+        return self.agreeing + self.in_front + self.behind
+
+    def score(self, behind_penalty: float) -> Float64[ndarray, "k"]:
+        """Points that agree less those that contradict the similarity."""
+        return self.agreeing - self.in_front - behind_penalty * self.behind
 
 
 def agreement(
-    source: Side, target: Side, scale: Float64[ndarray, "k"], R: Float64[ndarray, "k 3 3"], t: Float64[ndarray, "k 3"],
-    tolerance: float, width: float,
-) -> Agreement:  # fmt: skip
+    source: Side,
+    target: Side,
+    hypotheses: Hypotheses,
+    tolerance: float,
+    width: float,
+    settings: AgreementSettings = DEFAULT_SETTINGS.pair.agreement,
+) -> Agreement:
     """Both ways, for k similarities `p_target = scale R p_source + t`.
 
-    `tolerance` is the distance up to which points agree, `width` that of the robust kernel, both in radii of the
+    `tolerance` is the distance within which points agree, `width` that of the robust kernel, both in radii of the
     target's points.
     """
-    k, radius = len(scale), target.map.radius
+    k, radius = len(hypotheses), target.map.radius
     H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 4))
-    tolerances = np.array([tolerance, width, _HIDDEN]) * radius
+    tolerances = np.array([tolerance, width, settings.hidden_depth]) * radius
+    scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
         _sums(
-            mover.points, mover.normals, scale, np.ascontiguousarray(R), np.ascontiguousarray(t), bool(reverse),
+            mover.points, mover.normals, scale, R, t, bool(reverse),
             m.point, m.normal, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
-            H, g, counts[reverse],
+            settings.least_facing_cosine, settings.kernel_cutoff, H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
     squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
     return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares)
 
 
+def agreement_at(
+    maps: tuple[SurfaceMap, SurfaceMap],
+    S_target_source: Similarity,
+    rng: np.random.Generator,
+    tolerance: float,
+    settings: PairSettings,
+) -> Agreement:
+    """How two frames agree under one similarity."""
+    source, target = (Side.sampled(m, settings.coarse_points, rng) for m in maps)
+    return agreement(source, target, Hypotheses.of(S_target_source), tolerance, tolerance, settings.agreement)
+
+
 @compiled_parallel
 def _sums(
-    points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances, H, g, counts
-):
+    points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances, least_facing,
+    cutoff, H, g, counts
+):  # fmt: skip
     """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
     h, w = valid.shape
     tau, width, hidden = tolerances[0], tolerances[1], tolerances[2]
@@ -119,17 +149,16 @@ def _sums(
             if reverse:
                 r *= s
             facing = na * A + nb * B + nc * C
-            if abs(r) < tau and facing > _FACING:
+            if abs(r) < tau and facing > least_facing:
                 counts[k, 0] += 1
                 counts[k, 3] += r * r
             elif r > tau:
                 counts[k, 1] += 1
             elif r > -hidden:
                 counts[k, 2] += 1
-            if facing < _FACING or abs(r) > 4 * width:
+            if facing < least_facing or abs(r) > cutoff * width:
                 continue
-            q = 1 / (1 + (r / width) ** 2)
-            weight = q * q * facing
+            weight = _kernel_weight((r / width) ** 2) * facing
             if reverse:  # the normal, in the target's axes and against the motion of the source
                 ma = -(R[k, 0, 0] * na + R[k, 0, 1] * nb + R[k, 0, 2] * nc)
                 mb = -(R[k, 1, 0] * na + R[k, 1, 1] * nb + R[k, 1, 2] * nc)

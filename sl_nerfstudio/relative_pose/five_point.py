@@ -1,59 +1,58 @@
-"""Starting poses of a projector against its camera: five-point solutions of random samples, best ones polished.
+"""First solutions for the pose of a projector relative to its camera, by five-point samples.
 
-Samples and scores use rays, so every projector model is served alike. (Nister's solver, PAMI 2004, as in OpenCV; its
-"image points" are rays divided by their last component.)
+Random samples are solved (Nister, PAMI 2004, as in OpenCV), scored, and the best solutions refined. Samples and scores
+use rays, so every projector model is treated alike: what OpenCV takes for image points are rays divided by their last
+component.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, fit_epipolar
-from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
-
-_SAMPLES = 100  # with a third of wrong coordinates all of them meet one with probability 1e-6
-_SCORED = 300  # rays by which samples are told apart
-_POLISHED = 800  # rays by which the best are refined before they are compared
-_KEPT = 6
-_POLISHING = 12  # iterations
-_TOLERANCE = 4.0  # projector pixels: beyond it a residual counts as wrong while samples are compared
-_STEEPEST = 1e-3  # cosine: rays closer than this to the plane of a device cannot be written as image points
+from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, distinct, fit_epipolar
+from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
+from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, RelativePoseSettings, Separation
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A distinct solution."""
+    """A solution that differs from the others."""
 
     fit: EpipolarFit
-    in_front: float  # fraction of the well-fitting rays that meet in front of both devices
+    in_front: float  # share of the well-fitting rays that meet in front of both devices
 
 
-def five_point_candidates(rays: RayPairs, rng: np.random.Generator) -> list[Candidate]:
-    """Distinct local optima with most rays meeting in front, the best first; may be empty."""
-    usable = (rays.d_camera[:, 2] < -_STEEPEST) & (rays.d_projector[:, 2] < -_STEEPEST)
+def five_point_candidates(
+    rays: RayPairs, rng: np.random.Generator, settings: RelativePoseSettings = DEFAULT_SETTINGS
+) -> list[Candidate]:
+    """Distinct local optima with most rays meeting in front of both devices, the best first; may be empty."""
+    s = settings.five_point
+    usable = (rays.d_camera[:, 2] < -s.least_cosine) & (rays.d_projector[:, 2] < -s.least_cosine)
     candidates = np.flatnonzero(usable)
     if len(candidates) < 5:
         return []
-    score_rays = rays.chosen(_some(candidates, _SCORED, rng))
-    polish_rays = rays.chosen(_some(np.arange(len(rays)), _POLISHED, rng))
-    samples = [rays.chosen(rng.choice(candidates, 5, replace=False)) for _ in range(_SAMPLES)]
-    matrices = [(E, sample) for sample in samples for E in _five_point(sample)]
+    scoring_rays = rays.chosen(subsample(candidates, s.scoring_rays, rng))
+    polishing_rays = rays.chosen(subsample(np.arange(len(rays)), s.polishing_rays, rng))
+    samples = [rays.chosen(rng.choice(candidates, 5, replace=False)) for _ in range(s.samples)]
+    matrices = [(E, sample) for sample in samples for E in essential_matrices(sample)]
     if not matrices:
         return []
-    scores = _scores(np.stack([E for E, _ in matrices]), score_rays)
-    starts = _distinct([matrices[k] for k in np.argsort(scores)])
+    scores = _scores(np.stack([E for E, _ in matrices]), scoring_rays, s.outlier_px)
+    starts = _distinct_starts([matrices[k] for k in np.argsort(scores)], s.polished, s.start_separation)
+    polishing = replace(settings.fit, iterations=s.polishing_iterations)
     found: list[Candidate] = []
     for R, t in starts:
-        polished = fit_epipolar(R, t, polish_rays, _POLISHING)
-        front = float(in_front(polished.R, polished.t, polish_rays)[_fitting(polished)].mean())
-        if front < 0.5:  # the same essential matrix, seen the other way round
+        fit = fit_epipolar(R, t, polishing_rays, polishing)
+        fitting = np.abs(fit.residual) <= s.inlier_sigmas * fit.noise_px
+        front = float(in_front(fit.R, fit.t, polishing_rays)[fitting].mean())
+        if front < s.least_in_front:  # the same essential matrix with the surface behind the devices
             continue
-        if all(_apart(polished, other.fit) for other in found):
-            found.append(Candidate(polished, front))
+        if all(distinct((fit.R, fit.t), (other.fit.R, other.fit.t), s.solution_separation) for other in found):
+            found.append(Candidate(fit, front))
     return sorted(found, key=lambda c: c.fit.noise_px)
 
 
@@ -66,60 +65,42 @@ def in_front(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPair
     return (camera > 0) & (projector > 0)
 
 
-def _some(index: ndarray, count: int, rng: np.random.Generator) -> ndarray:
-    return index if len(index) <= count else rng.choice(index, count, replace=False)
-
-
-def _five_point(sample: RayPairs) -> list[Float64[ndarray, "3 3"]]:
-    """All essential matrices `d_camera^T E d_projector = 0` of five pairs."""
+def essential_matrices(sample: RayPairs) -> list[Float64[ndarray, "3 3"]]:
+    """All essential matrices `d_camera^T E d_projector = 0` of five pairs; none of a degenerate sample."""
     projector, camera = (d[:, :2] / d[:, 2:] for d in (sample.d_projector, sample.d_camera))
     try:
         stacked, _ = cv2.findEssentialMat(projector, camera, np.eye(3))
-    except cv2.error:  # a degenerate sample
+    except cv2.error:
         return []
     if stacked is None or not np.isfinite(stacked).all():
         return []
     return [stacked[k : k + 3] for k in range(0, len(stacked) - 2, 3)]
 
 
-def _decompose(E: Float64[ndarray, "3 3"], sample: RayPairs) -> list[tuple[ndarray, ndarray]]:
-    """The poses of an essential matrix that have most of the sample in front: usually one of four."""
+def poses_of(E: Float64[ndarray, "3 3"], sample: RayPairs) -> list[tuple[ndarray, ndarray]]:
+    """The poses (R, t) of an essential matrix that have most of the sample in front: usually one of four."""
     R1, R2, t = cv2.decomposeEssentialMat(E)
     poses = [(R, s * t[:, 0] / np.linalg.norm(t)) for R in (R1, R2) for s in (1.0, -1.0)]
     return [(R, t) for R, t in poses if in_front(R, t, sample).sum() >= 4]
 
 
-def _scores(E: Float64[ndarray, "m 3 3"], rays: RayPairs) -> Float64[ndarray, "m"]:
+def _scores(E: Float64[ndarray, "m 3 3"], rays: RayPairs, outlier_px: float) -> Float64[ndarray, "m"]:
     """Mean of the squared residuals (as `sampson`), each at most 1, for every matrix."""
     m = np.einsum("ni,kij->knj", rays.d_camera, E)
     a = np.einsum("knj,nj->kn", m, rays.d_projector)
     h = np.einsum("knj,njc->knc", m, rays.d_projector_by_uv)
-    return np.minimum(a * a / (h * h).sum(-1).clip(1e-300) / _TOLERANCE**2, 1.0).mean(-1)
+    return np.minimum(a * a / (h * h).sum(-1).clip(1e-300) / outlier_px**2, 1.0).mean(-1)
 
 
-def _distinct(ranked: Iterable[tuple[ndarray, RayPairs]]) -> list[tuple[ndarray, ndarray]]:
+def _distinct_starts(
+    ranked: Iterable[tuple[ndarray, RayPairs]], count: int, separation: Separation
+) -> list[tuple[ndarray, ndarray]]:
     """Poses of the best matrices, without those that are close to a better one."""
     kept: list[tuple[ndarray, ndarray]] = []
     for E, sample in ranked:
-        for R, t in _decompose(E, sample):
-            if all(_angle(R, k[0]) > 0.05 or _swing(t, k[1]) > 0.1 for k in kept):
+        for R, t in poses_of(E, sample):
+            if all(distinct((R, t), other, separation) for other in kept):
                 kept.append((R, t))
-        if len(kept) >= _KEPT:
+        if len(kept) >= count:
             break
     return kept
-
-
-def _apart(a: EpipolarFit, b: EpipolarFit) -> bool:
-    return _angle(a.R, b.R) > 0.02 or _swing(a.t, b.t) > 0.05
-
-
-def _angle(a: ndarray, b: ndarray) -> float:
-    return float(np.linalg.norm(a - b) / np.sqrt(2))  # radian, for small angles
-
-
-def _swing(a: ndarray, b: ndarray) -> float:
-    return float(np.linalg.norm(a - b))
-
-
-def _fitting(found: EpipolarFit) -> Bool[ndarray, "n"]:
-    return np.abs(found.residual) <= 3 * found.noise_px

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian, unproject
-
-_BLOCKS_A_SIDE = 25  # of the pattern: two periods of a grid of 50 lines, about as far as a decoder's errors reach
+from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
+from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, PatternBlocks
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class RayPairs:
     d_camera: Float64[ndarray, "n 3"]
     d_projector: Float64[ndarray, "n 3"]
     d_projector_by_uv: Float64[ndarray, "n 3 2"]  # derivative by the projector's pixel
-    block: Int64[ndarray, "n"]  # square of the pattern: decoding errors within one are taken to be dependent
+    block: Int64[ndarray, "n"]  # square of the pattern; errors within one may depend on each other
 
     def __len__(self) -> int:
         """Number of pairs."""
@@ -28,6 +28,13 @@ class RayPairs:
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "RayPairs":
         """Some of the pairs."""
         return RayPairs(self.d_camera[index], self.d_projector[index], self.d_projector_by_uv[index], self.block[index])
+
+    def block_sums(self, values: Float64[ndarray, "n *k"]) -> Float64[ndarray, "blocks *k"]:
+        """Sums of values over the pairs of each square of the pattern that holds any."""
+        found, group = np.unique(self.block, return_inverse=True)
+        sums = np.zeros((len(found), *values.shape[1:]))
+        np.add.at(sums, group, values)
+        return sums
 
 
 def correspondences_of(
@@ -39,7 +46,11 @@ def correspondences_of(
 
 
 def ray_pairs(
-    uv_camera: Float[ndarray, "n 2"], uv_projector: Float[ndarray, "n 2"], camera: Device, projector: Device
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+    blocks: PatternBlocks = DEFAULT_SETTINGS.blocks,
 ) -> tuple[RayPairs, Int64[ndarray, "m"]]:
     """Rays of correspondences, and the indices of those that have a ray in both devices.
 
@@ -51,9 +62,10 @@ def ray_pairs(
     d_camera, d_projector = d_camera[usable], d_projector[usable]
     intrinsics = Intrinsics.of(projector, torch.float64)
     J = project_jacobian(intrinsics, torch.from_numpy(d_projector))
-    # Projection does not feel the length of a ray, so J d = 0 and the right inverse square to d is the pseudo-inverse.
+    # Projection does not depend on the length of a ray, so J d = 0: the right inverse whose columns are perpendicular
+    # to d is the pseudo-inverse.
     by_uv = J.transpose(-1, -2) @ torch.linalg.inv(J @ J.transpose(-1, -2))
-    return RayPairs(d_camera, d_projector, by_uv.numpy(), _blocks(uv_projector[usable], projector)), usable
+    return RayPairs(d_camera, d_projector, by_uv.numpy(), blocks_of(uv_projector[usable], projector, blocks)), usable
 
 
 def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
@@ -62,7 +74,6 @@ def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n
     return unproject(Intrinsics.of(device, torch.float64), pixels).numpy()
 
 
-def _blocks(uv: Float[ndarray, "n 2"], projector: Device) -> Int64[ndarray, "n"]:
-    side = max(projector.w, projector.h) / _BLOCKS_A_SIDE
-    column, row = np.floor(uv / side).astype(np.int64).clip(-1, 4 * _BLOCKS_A_SIDE).T
-    return (row + 1) * (5 * _BLOCKS_A_SIDE) + column + 1
+def subsample(index: Int64[ndarray, "n"], most: int, rng: np.random.Generator) -> Int64[ndarray, "m"]:
+    """All of the indices, or a random choice of `most` of them."""
+    return index if len(index) <= most else rng.choice(index, most, replace=False)

@@ -1,5 +1,7 @@
 """Frame clouds of the analytic scene, with known relative poses, and what registration should make of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy import ndarray
@@ -10,7 +12,7 @@ from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import judge_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
-from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of, rig_of
+from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of
 
 
 def clouds_of(rig: Rig, size: int, projector: str = "pinhole", noise: float = 0.0) -> list[FrameCloud]:
@@ -60,4 +62,25 @@ def pose_errors(
     return np.degrees(turn), shift, baseline * S.scale / true_baseline - 1
 
 
-__all__ = ["clouds_of", "errors_against", "part_of", "pose_errors", "rig_of", "similarities_of"]
+def difference(a: Similarity, b: Similarity, centre: ndarray) -> tuple[float, float, float]:
+    """Angle in degrees, shift of the centre and relative scale."""
+    D = a @ b.inverse()
+    angle = np.degrees(Rotation.from_matrix(D.R).magnitude())
+    return float(angle), float(np.linalg.norm(D.points(centre[None])[0] - centre)), abs(D.scale - 1)
+
+
+def rolled(degrees: float) -> ndarray:
+    """Rotation about the line of sight."""
+    return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+
+
+def on_a_ball(cloud: FrameCloud, radius: float, name: str) -> FrameCloud:
+    """The frame as if it had seen nothing but a ball about the middle of its points."""
+    centre = cloud.centroid * (1 + 0.5 * cloud.radius / np.linalg.norm(cloud.centroid))
+    ray = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
+    b = ray @ centre
+    root = b * b - centre @ centre + (radius * cloud.radius) ** 2
+    hit = root > 0
+    points = ray[hit] * (b[hit] - np.sqrt(root[hit]))[:, None]
+    parts = {k: getattr(cloud, k)[hit] for k in ("uv_camera", "sigma_noise", "sigma_pose")}
+    return replace(cloud, name=name, points=points, **parts)

@@ -6,11 +6,11 @@ import torch
 
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.registration.frame_cloud import frame_cloud, well_known
+from sl_nerfstudio.registration.frame_cloud import frame_cloud, reliable_points
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.relative_pose.epipolar_fit import moved
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
+from sl_nerfstudio.relative_pose.sampson import moved
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, cast, rig_of, seen
 from tests.registration.analytic_clouds import clouds_of
 
@@ -84,12 +84,12 @@ def test_a_frame_without_points_is_refused_by_name():
         frame_cloud("photo_7", _image(0), camera_of(SIZE), PROJECTORS["pinhole"], none)
 
 
-def test_badly_known_points_are_left_out_of_surfaces():
+def test_unreliable_points_are_left_out_of_surfaces():
     cloud = clouds_of(RIG, SIZE, noise=0.1)[0]
     sigma = cloud.sigma_noise.copy()
     sigma[:25] *= 100
-    assert not well_known(replace(cloud, sigma_noise=sigma))[:25].any()
-    assert well_known(cloud).mean() > 0.9
+    assert not reliable_points(replace(cloud, sigma_noise=sigma))[:25].any()
+    assert reliable_points(cloud).mean() > 0.9
 
 
 def test_normals_of_the_map_are_those_of_the_surface():

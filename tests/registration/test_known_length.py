@@ -46,7 +46,7 @@ def test_lengths_are_understood(text, known):
     [
         ("85 mm", 'not understood(.|\n)*remedy: write "baseline of frame 0 = 85 mm"'),
         ("baseline of frame 0 = 85 inch", 'unit "inch" is none of m, cm, mm, um'),
-        ("baseline of frame 0 = -85 mm", "a length is above zero"),
+        ("baseline of frame 0 = -85 mm", "a length must be above zero"),
         ("distance between frame 3 and frame 7 = 50 mm", "not understood"),
     ],
 )

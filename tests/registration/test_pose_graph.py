@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pair_registration import PairMatch
-from sl_nerfstudio.registration.pose_graph import Anchoring, loop_support, oriented, place
-from sl_nerfstudio.registration.register import trust_in
+from sl_nerfstudio.registration.cycle_consistency import cycle_consistency
+from sl_nerfstudio.registration.edge_weights import edge_weights
+from sl_nerfstudio.registration.graph_residuals import Pivots
+from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 
 
 def random_nodes(n: int, rng: np.random.Generator) -> list[Similarity]:
@@ -31,8 +33,8 @@ def edge(nodes: list[Similarity], i: int, j: int, noise: float = 0.0, rng=None) 
     return PairMatch(i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, 0.95, 0.02, 0.0, 0.5)
 
 
-def anchoring_of(nodes: list[Similarity]) -> Anchoring:
-    return Anchoring(np.array([[0.0, 0.0, -4 / S.scale] for S in nodes]), np.array([1 / S.scale for S in nodes]))
+def pivots_of(nodes: list[Similarity]) -> Pivots:
+    return Pivots(np.array([[0.0, 0.0, -4 / S.scale] for S in nodes]), np.array([1 / S.scale for S in nodes]))
 
 
 def ring(n: int) -> list[tuple[int, int]]:
@@ -50,22 +52,22 @@ def largest_error(found, nodes) -> float:
 
 @settings(max_examples=5)
 @given(st.integers(0, 10**6), st.integers(4, 9))
-def test_exact_edges_give_the_exact_placement(seed, n):
+def test_exact_edges_give_the_exact_solution(seed, n):
     nodes = random_nodes(n, np.random.default_rng(seed))
     edges = [edge(nodes, i, j) for i, j in ring(n)]
-    placement = place(edges, anchoring_of(nodes), 0, *2 * [np.ones(len(edges))])
-    assert largest_error(placement.S_world_camera, nodes) < 1e-6
-    assert placement.used.all()
+    solution = optimise_pose_graph(edges, pivots_of(nodes), 0, *2 * [np.ones(len(edges))])
+    assert largest_error(solution.S_world_camera, nodes) < 1e-6
+    assert solution.consistent.all()
 
 
 def test_closing_loops_averages_errors():
-    """Of a chain alone the last frame carries the errors of all steps; with the loops they are shared out."""
+    """Of a chain alone the last frame carries the errors of all steps; loops spread them over all frames."""
     rng = np.random.default_rng(3)
     nodes = random_nodes(12, rng)
     edges = [edge(nodes, i, j, 0.01, rng) for i, j in ring(12)]
     chain = edges[:11]
     errors = [
-        largest_error(place(some, anchoring_of(nodes), 0, *2 * [np.ones(len(some))]).S_world_camera, nodes)
+        largest_error(optimise_pose_graph(some, pivots_of(nodes), 0, *2 * [np.ones(len(some))]).S_world_camera, nodes)
         for some in (chain, edges)
     ]
     assert errors[1] < 0.6 * errors[0]
@@ -78,20 +80,20 @@ def test_wrong_pairs_are_rejected_and_do_no_harm(wrong):
     edges = [edge(nodes, i, j, 0.005, rng) for i, j in ring(8)]
     bad = rng.choice(len(edges), wrong, replace=False)
     for k in bad:
-        # each in its own way: wrong ones that agree with each other cannot be told from right ones
+        # each in its own way: wrong ones that agree with each other would look like right ones
         turn = Rotation.from_rotvec(rng.uniform(0.5, 1.5, 3) * rng.choice([-1, 1], 3)).as_matrix()
         edges[k] = replace(
             edges[k], S_target_source=Similarity(1.1, turn, rng.normal(size=3)) @ edges[k].S_target_source
         )
-    anchoring = anchoring_of(nodes)
-    trust = np.ones(len(edges))
-    support = loop_support(edges, anchoring, trust)
+    pivots = pivots_of(nodes)
+    weight = np.ones(len(edges))
+    cycles = cycle_consistency(edges, pivots, weight)
     good = np.setdiff1d(np.arange(len(edges)), bad)
-    assert support[bad].max() < support[good].max()
-    placement = place(edges, anchoring, 0, support, trust)
-    assert not placement.used[bad].any()
-    assert placement.used[good].all()
-    assert largest_error(placement.S_world_camera, nodes) < 0.05
+    assert cycles[bad].max() < cycles[good].max()
+    solution = optimise_pose_graph(edges, pivots, 0, cycles, weight)
+    assert not solution.consistent[bad].any()
+    assert solution.consistent[good].all()
+    assert largest_error(solution.S_world_camera, nodes) < 0.05
 
 
 def test_a_few_good_pairs_outweigh_many_that_agree_with_each_other_and_fit_worse():
@@ -103,23 +105,23 @@ def test_a_few_good_pairs_outweigh_many_that_agree_with_each_other_and_fit_worse
     right = [edge(nodes, i, j, 0.005, rng) for i, j in ring(8) if 4 not in (i, j)]
     right += [replace(edge(nodes, i, j, 0.005, rng), fitness=0.99) for i, j in ((3, 4), (4, 5))]
     wrong = [replace(edge(slid, i, j, 0.005, rng), fitness=0.87) for i, j in ((0, 4), (1, 4), (2, 4), (4, 6), (4, 7))]
-    edges, anchoring = right + wrong, anchoring_of(nodes)
-    trust = trust_in(edges)
-    placement = place(edges, anchoring, 0, loop_support(edges, anchoring, trust), trust)
-    assert largest_error(placement.S_world_camera, nodes) < 0.05
-    assert placement.used.tolist() == [True] * len(right) + [False] * len(wrong)
+    edges, pivots = right + wrong, pivots_of(nodes)
+    weight = edge_weights(edges)
+    solution = optimise_pose_graph(edges, pivots, 0, cycle_consistency(edges, pivots, weight), weight)
+    assert largest_error(solution.S_world_camera, nodes) < 0.05
+    assert solution.consistent.tolist() == [True] * len(right) + [False] * len(wrong)
 
 
-def test_frames_without_an_edge_are_not_placed():
+def test_frames_without_an_edge_have_no_pose():
     nodes = random_nodes(5, np.random.default_rng(0))
     edges = [edge(nodes, 0, 1), edge(nodes, 1, 2), edge(nodes, 3, 4)]
-    placement = place(edges, anchoring_of(nodes), 0, np.ones(3), np.ones(3))
-    assert [S is None for S in placement.S_world_camera] == [False, False, False, True, True]
-    assert placement.used.tolist() == [True, True, False]
+    solution = optimise_pose_graph(edges, pivots_of(nodes), 0, np.ones(3), np.ones(3))
+    assert [S is None for S in solution.S_world_camera] == [False, False, False, True, True]
+    assert solution.consistent.tolist() == [True, True, False]
 
 
 def test_an_edge_can_be_read_both_ways():
     nodes = random_nodes(2, np.random.default_rng(0))
     e = edge(nodes, 0, 1)
     p = np.array([[0.1, 0.2, -3.0]])
-    np.testing.assert_allclose(oriented(e, 1, 0).points(oriented(e, 0, 1).points(p)), p)
+    np.testing.assert_allclose(e.between(1, 0).points(e.between(0, 1).points(p)), p)

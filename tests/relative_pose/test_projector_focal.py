@@ -4,7 +4,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.projector_focal import CalibratedView, refine_projector_focal
+from sl_nerfstudio.relative_pose.projector_focal import PosedFrame, refine_projector_focal
 from tests.relative_pose.two_views import PROJECTORS, view
 
 OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2))
@@ -18,7 +18,7 @@ def views_with(projector: str, factor: float, noise: float = 0.0):
     for k, offset in enumerate(OFFSETS):
         frame = view(projector, offset=offset, count=300, seed=k, roll_deg=40 * k).noisy(noise, seed=k)
         pose = estimate_relative_pose(frame.uv_camera, frame.uv_projector, frame.camera, wrong)
-        views.append(CalibratedView(frame.uv_camera, frame.uv_projector, frame.camera, pose))
+        views.append(PosedFrame(frame.uv_camera, frame.uv_projector, frame.camera, pose))
     return views, wrong
 
 
@@ -41,5 +41,5 @@ def test_noise_moves_it_by_about_its_sigma_and_a_right_one_is_left_alone():
 
 
 def test_no_frame_is_an_error():
-    with pytest.raises(UserError, match="no calibrated frame"):
+    with pytest.raises(UserError, match="there is no frame with a relative pose"):
         refine_projector_focal([], PROJECTORS["pinhole"])

@@ -38,7 +38,7 @@ class View:
 
     @property
     def arguments(self) -> tuple[ndarray, ndarray, Device, Device]:
-        """What calibrate_frame takes."""
+        """What estimate_relative_pose takes."""
         return self.uv_camera, self.uv_projector, self.camera, self.projector
 
 

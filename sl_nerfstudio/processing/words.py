@@ -1,0 +1,67 @@
+"""Sentences for what relative pose estimation and registration found out about frames."""
+
+from sl_nerfstudio.registration.result import (
+    AmbiguousPose,
+    Exclusion,
+    InconsistentPair,
+    NoCommonSurface,
+    SurfaceDisagrees,
+    Uncertainty,
+)
+from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
+
+_DEGENERACIES: dict[DegeneracyKind, str] = {
+    "few points": "only {:.0f} decoded pixels agree with each other; capture the object larger in the image, or with "
+    "more light",
+    "small part of the pattern": "decoded pixels cover only {:.0f} of {:.0f} squares of the pattern; let more of the "
+    "pattern fall on the object",
+    "pure rotation": "a rotation of the projector alone, without any distance to the camera, explains the coordinates "
+    "to within {:.2g} px; hold the projector farther from the camera",
+    "small parallax": "camera rays and projector rays meet at only {:.2g} degrees; hold the projector farther from the "
+    "camera",
+    "planar": "all points lie in one plane to within {:.2g} px, and a plane does not determine the pose; show parts at "
+    "other depths in this view",
+    "epipole in view": "one device stands in the other's view of the object, and depth cannot be measured around that "
+    "place; move the projector to the side",
+    "ambiguous": "a second pose explains the coordinates nearly as well; show parts at other depths in this view",
+    "many outliers": "{:.0%} of the coordinates contradict the rest; check the pattern file and the light",
+    "poor fit": "coordinates miss their epipolar curves by {:.2g} px; check the intrinsics of both devices and the "
+    "projector's model (OPENCV or DOE)",
+    "uncertain": "the pose is known only to {:.2g} degrees (rotation) and {:.2g} degrees (direction of the baseline)",
+}
+
+
+def degeneracy_sentence(degeneracy: Degeneracy) -> str:
+    """What was found in a frame, and what to do about it."""
+    return _DEGENERACIES[degeneracy.kind].format(*degeneracy.figures)
+
+
+def exclusion_sentence(exclusion: Exclusion) -> str:
+    """Why a frame was not registered, and what to do about it."""
+    if isinstance(exclusion, SurfaceDisagrees):
+        return (
+            f"only {exclusion.fitness:.0%} of its surface agrees with that of the other frames where its pairs place "
+            "it; the object moved, or the relative pose of this frame is wrong: capture this view again"
+        )
+    if isinstance(exclusion, NoCommonSurface):
+        return "no other frame shows any of its surface; capture views in between"
+    if isinstance(exclusion, InconsistentPair):
+        return (
+            f"its best partner, {exclusion.partner}, contradicts the pose that other frames give it, or is not "
+            "connected to them either; capture views in between"
+        )
+    return (
+        f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "
+        f"{exclusion.fitness:.0%} of what both saw agrees (needed: {exclusion.least_overlap:.0%} and "
+        f"{exclusion.least_fitness:.0%}); capture views in between"
+    )
+
+
+def uncertainty_sentence(uncertainty: Uncertainty) -> str:
+    """What is uncertain about a registered frame."""
+    if isinstance(uncertainty, AmbiguousPose):
+        return f"{uncertainty.frame}: a clearly different pose fits nearly as well (symmetric surface?)"
+    return (
+        f"{uncertainty.frame}: its rotation is known only to {uncertainty.sigma_deg:.1f} degrees (surface of "
+        "revolution?)"
+    )

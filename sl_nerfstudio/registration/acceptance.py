@@ -1,0 +1,131 @@
+"""Which frames are registered in the end, why the others are not, and what is uncertain."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.edge_weights import is_accepted, is_ambiguous, quality
+from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
+from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.registration.result import (
+    AmbiguousPose,
+    Edge,
+    Exclusion,
+    InconsistentPair,
+    NoCommonSurface,
+    PoorPair,
+    Registration,
+    SurfaceDisagrees,
+    UncertainRotation,
+    Uncertainty,
+)
+from sl_nerfstudio.registration.surface_agreement import agreement_at
+from sl_nerfstudio.registration.view_graph import ViewGraph, connected_components
+
+
+def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
+    """Poses and baselines of the frames that agree with each other; every other frame with its reason."""
+    n, edges, settings = len(names), graph.edges, graph.settings
+    solution = graph.solve()
+    consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
+    connected = _largest_component(consistent, n)
+    fitness = np.array([_fitness_of(k, solution, connected, graph) for k in range(n)])
+    registered = connected & (fitness >= settings.acceptance.least_fitness)
+    poses, baseline = _in_first_camera(solution.S_world_camera, registered)
+    return Registration(
+        names,
+        poses,
+        baseline,
+        registered,
+        np.where(registered, fitness, np.nan),
+        tuple(
+            Edge(
+                (names[e.source], names[e.target]), e.overlap, e.fitness, bool(used), is_ambiguous(e, settings.edge),
+                e.rotation_sigma_deg,
+            )
+            for e, used in zip(edges, solution.consistent, strict=True)
+        ),
+        tuple(
+            SurfaceDisagrees(names[k], float(fitness[k])) if connected[k] else _exclusion(k, names, graph)
+            for k in np.flatnonzero(~registered).tolist()
+        ),
+        tuple(_uncertainties(names, consistent, registered, graph)),
+    )  # fmt: skip
+
+
+def _largest_component(edges: Sequence[PairMatch], n: int) -> Bool[ndarray, "n"]:
+    """Frames of the largest group that edges connect; none where nothing is connected."""
+    component = connected_components(edges, n)[0]
+    inside = np.zeros(n, dtype=bool)
+    if len(component) > 1:
+        inside[component] = True
+    return inside
+
+
+def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph) -> float:
+    """Of a frame's points that other frames can judge, the share that agrees, as placed."""
+    S, settings = solution.S_world_camera[k], graph.settings.pair
+    if S is None or not connected[k]:
+        return 0.0
+    agreeing = judged = 0.0
+    for j in np.flatnonzero(connected).tolist():
+        other = solution.S_world_camera[j]
+        if j == k or other is None or not graph.see_same_side(S, other):
+            continue
+        maps = graph.maps[k], graph.maps[j]
+        found = agreement_at(maps, other.inverse() @ S, graph.rng, settings.tolerance, settings)
+        agreeing += found.agreeing[0]
+        judged += found.judged[0]
+    return agreeing / judged if judged else 0.0
+
+
+def _in_first_camera(
+    nodes: Nodes, registered: Bool[ndarray, "n"]
+) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n"]]:
+    """Camera poses and baselines in the axes of the first registered camera, geometric mean of the baselines one."""
+    n = len(registered)
+    poses, baseline = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
+    frames: list[int] = np.flatnonzero(registered).tolist()
+    if not frames:
+        return poses, baseline
+    world = [node_at(nodes, k) for k in frames]
+    unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
+    gauge = Similarity(1 / unit, np.eye(3), np.zeros(3)) @ Similarity(1.0, world[0].R, world[0].t).inverse()
+    for k, S in zip(frames, (gauge @ S for S in world), strict=True):
+        baseline[k] = S.scale
+        poses[k] = np.eye(4)
+        poses[k, :3, :3], poses[k, :3, 3] = S.R, S.t
+    return poses, baseline
+
+
+def _exclusion(k: int, names: Sequence[str], graph: ViewGraph) -> Exclusion:
+    """Why a frame is not in the largest component."""
+    settings = graph.settings.edge
+    mine = [e for e in graph.matches if k in (e.source, e.target)]
+    if not mine:
+        return NoCommonSurface(names[k])
+    best = max(mine, key=lambda e: quality(e, settings))
+    partner = names[best.other(k)]
+    if is_accepted(best, settings):
+        return InconsistentPair(names[k], partner)
+    return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+
+
+def _uncertainties(
+    names: Sequence[str], consistent: Sequence[PairMatch], registered: Bool[ndarray, "n"], graph: ViewGraph
+) -> list[Uncertainty]:
+    """Registered frames that no pair determines well."""
+    out: list[Uncertainty] = []
+    frames: list[int] = np.flatnonzero(registered).tolist()
+    for k in frames:
+        mine = [e for e in consistent if k in (e.source, e.target)]
+        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
+        if mine and all(is_ambiguous(e, graph.settings.edge) for e in mine):
+            out.append(AmbiguousPose(names[k]))
+        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
+            out.append(UncertainRotation(names[k], sigma_deg))
+    return out

@@ -1,0 +1,70 @@
+"""The result of registering one frame to another: an edge of the pose graph."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.settings import PairSettings
+from sl_nerfstudio.registration.surface_agreement import Agreement
+
+
+@dataclass(frozen=True)
+class PairMatch:
+    """One frame on another. Similarities map camera axes to camera axes, each in units of its own baseline."""
+
+    source: int
+    target: int
+    S_target_source: Similarity
+    information: Float64[ndarray, "7 7"]  # of (v, w, l), see surface_agreement; lengths in radii of the target
+    overlap: float  # fraction of all points that lie on the other frame's surface
+    fitness: float  # the same among the points that could be judged
+    rms: float  # distance of agreeing points from the surface, in radii
+    second_best_ratio: float  # score of the best clearly different similarity over that of this one: 1 is ambiguous
+    rotation_sigma_deg: float  # standard deviation of the least known rotation: large on surfaces of revolution
+
+    def between(self, source: int, target: int) -> Similarity:
+        """The similarity from `source` to `target`, whichever way it was found."""
+        forward = (self.source, self.target) == (source, target)
+        return self.S_target_source if forward else self.S_target_source.inverse()
+
+    def other(self, frame: int) -> int:
+        """The frame at the other end."""
+        return self.target if self.source == frame else self.source
+
+
+def match_from(
+    pair: tuple[int, int],
+    S_target_source: Similarity,
+    found: Agreement,
+    k: int,
+    second_best_ratio: float,
+    target_radius: float,
+    settings: PairSettings,
+) -> PairMatch:
+    """The edge for similarity k of `found`, with the uncertainty that follows from the sums."""
+    D = np.array([target_radius] * 3 + [1] * 4)
+    H = found.H[k] * D[:, None] * D / target_radius**2
+    rms = max(float(np.sqrt(found.squares[k])) / target_radius, settings.least_rms)
+    count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
+    information = H * (settings.independent_points / count / rms**2) + 1e-3 * np.eye(7)
+    sigma = np.sqrt(1 / np.linalg.eigvalsh(_rotation_information(information))[0])
+    return PairMatch(
+        *pair,
+        S_target_source,
+        information,
+        float(found.agreeing[k]),
+        float(found.fitness[k]),
+        rms,
+        second_best_ratio,
+        float(np.degrees(sigma)),
+    )
+
+
+def _rotation_information(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "3 3"]:
+    """Information on the rotation with translation and scale free (Schur complement)."""
+    other = [0, 1, 2, 6]
+    cross = information[3:6][:, other]
+    return information[3:6, 3:6] - cross @ np.linalg.solve(information[np.ix_(other, other)], cross.T)

@@ -1,0 +1,90 @@
+"""What registration found: poses, the pairs that support them, frames that were left out, and what is uncertain."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Two frames that were registered with each other."""
+
+    frames: tuple[str, str]
+    overlap: float  # share of the points that agree
+    fitness: float  # share of those that could be judged
+    used: bool  # False: inconsistent with the other pairs
+    undecided: bool  # a clearly different similarity fits nearly as well
+    rotation_sigma_deg: float  # standard deviation of the rotation that this pair determines least
+
+
+@dataclass(frozen=True)
+class SurfaceDisagrees:
+    """A frame was left out because its surface, as placed, does not agree with that of the other frames."""
+
+    frame: str
+    fitness: float  # share of its points, of those that others can judge, that agree
+
+
+@dataclass(frozen=True)
+class NoCommonSurface:
+    """A frame was left out because no other frame shares any surface with it."""
+
+    frame: str
+
+
+@dataclass(frozen=True)
+class InconsistentPair:
+    """A frame was left out because its best pair does not connect it consistently with the registered frames."""
+
+    frame: str
+    partner: str
+
+
+@dataclass(frozen=True)
+class PoorPair:
+    """A frame was left out because even its best pair overlaps or agrees too little."""
+
+    frame: str
+    partner: str
+    overlap: float  # share of the points that agree
+    fitness: float  # share of those that could be judged
+    least_overlap: float  # that a pair must have
+    least_fitness: float
+
+
+Exclusion = SurfaceDisagrees | NoCommonSurface | InconsistentPair | PoorPair
+"""Why a frame was not registered."""
+
+
+@dataclass(frozen=True)
+class AmbiguousPose:
+    """In all consistent pairs of a frame a clearly different similarity fits nearly as well."""
+
+    frame: str
+
+
+@dataclass(frozen=True)
+class UncertainRotation:
+    """No consistent pair of a frame determines its rotation well."""
+
+    frame: str
+    sigma_deg: float  # of the least known rotation, by the best pair
+
+
+Uncertainty = AmbiguousPose | UncertainRotation
+"""What is uncertain about a registered frame."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Camera poses in the axes of the first registered frame's camera (looking along -z), and baselines."""
+
+    names: tuple[str, ...]
+    T_world_camera: Float64[ndarray, "n 4 4"]  # NaN where not registered
+    baseline: Float64[ndarray, "n"]  # camera to projector; geometric mean 1 over the registered frames; NaN elsewhere
+    registered: Bool[ndarray, "n"]
+    fitness: Float64[ndarray, "n"]  # of each frame with those it overlaps, as placed; NaN where not registered
+    edges: tuple[Edge, ...]
+    exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
+    uncertainties: tuple[Uncertainty, ...]

@@ -1,0 +1,127 @@
+"""The view graph: which pairs of frames have been registered with each other, and which to try next."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.progress import track
+from sl_nerfstudio.registration.cycle_consistency import cycle_consistency
+from sl_nerfstudio.registration.edge_weights import edge_weights, is_accepted, quality
+from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
+from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pair_registration import register_pair
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
+from sl_nerfstudio.registration.settings import RegistrationSettings, Search
+from sl_nerfstudio.registration.surface_agreement import agreement_at
+from sl_nerfstudio.registration.surface_map import SurfaceMap
+
+Pair = tuple[int, int]
+
+
+class ViewGraph:
+    """Pairs that were tried, with the best result of each."""
+
+    def __init__(
+        self, maps: list[SurfaceMap], start: Nodes, rng: np.random.Generator, settings: RegistrationSettings
+    ) -> None:
+        self.maps = maps
+        self.rng = rng
+        self.settings = settings
+        self._start = start  # S_world_camera of frames where it is known roughly
+        self._pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
+        self._tried: dict[Pair, PairMatch | None] = {}
+        self._searched: set[tuple[Pair, Search]] = set()
+
+    @property
+    def matches(self) -> list[PairMatch]:
+        """All pairs in which anything agreed."""
+        return [match for match in self._tried.values() if match is not None]
+
+    @property
+    def edges(self) -> list[PairMatch]:
+        """Pairs that agree well enough."""
+        return [match for match in self.matches if is_accepted(match, self.settings.edge)]
+
+    def try_pairs(self, pairs: Sequence[Pair], search: Search) -> None:
+        """Register pairs without a guess, or from the rough poses of both where there are any."""
+        for pair in track([p for p in pairs if (p, search) not in self._searched], "registering pairs"):
+            self._searched.add((pair, search))
+            guess = _relative(self._start, pair)
+            self._register(pair, search if guess is None else self.settings.pair.rough, guess)
+
+    def try_overlapping(self, S_world_camera: Nodes) -> None:
+        """Register pairs that should overlap by the given poses, starting from there."""
+        for pair in track(self._overlapping(S_world_camera), "closing loops"):
+            guess = _relative(S_world_camera, pair)
+            if guess is not None:
+                self._register(pair, self.settings.pair.nearby, guess)
+
+    def bridge_components(self) -> None:
+        """Where frames form several components, search between them everywhere: one may be upside down."""
+        main, *others = connected_components(self.edges, len(self.maps))
+        pairs: set[Pair] = set()
+        for k in (k for component in others for k in component):
+            nearest = sorted(main, key=lambda m: abs(m - k))[: self.settings.selection.bridges]
+            pairs |= {(min(k, m), max(k, m)) for m in nearest}
+        self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
+
+    def solve(self) -> PoseGraphSolution:
+        """Poses of the largest component of frames."""
+        edges, settings = self.edges, self.settings
+        root = connected_components(edges, len(self.maps))[0][0]
+        weight = edge_weights(edges, settings.edge)
+        # A spanning tree should prefer pairs that close cycles, then surfaces that agree and are not ambiguous.
+        cycles = cycle_consistency(edges, self._pivots, weight, settings.pose_graph)
+        strength = settings.pose_graph.cycle_weight * cycles + np.array([quality(e, settings.edge) for e in edges])
+        return optimise_pose_graph(edges, self._pivots, root, strength, weight, settings.pose_graph)
+
+    def see_same_side(self, a: Similarity, b: Similarity) -> bool:
+        """Whether the lines of sight of two cameras differ little enough to see a common surface."""
+        largest = np.radians(self.settings.selection.largest_view_angle_deg)
+        return bool(a.R[:, 2] @ b.R[:, 2] > np.cos(largest))
+
+    def _register(self, pair: Pair, search: Search, guess: Similarity | None) -> None:
+        maps, settings = (self.maps[pair[0]], self.maps[pair[1]]), self.settings
+        match = register_pair(maps, pair, search, self.rng, guess, settings.pair)
+        known = self._tried.get(pair)
+        if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
+            self._tried[pair] = match
+
+    def _overlapping(self, S_world_camera: Nodes) -> list[Pair]:
+        """For every frame the pairs with the largest expected overlap, without those that are edges already."""
+        selection, n = self.settings.selection, len(S_world_camera)
+        shares = np.zeros((n, n))
+        for i in range(n):
+            for j in range(i + 1, n):
+                a, b = S_world_camera[i], S_world_camera[j]
+                if a is not None and b is not None and self.see_same_side(a, b):
+                    maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
+                    found = agreement_at(maps, S, self.rng, selection.overlap_tolerance, self.settings.pair)
+                    shares[i, j] = shares[j, i] = found.agreeing[0]
+        pairs: set[Pair] = set()
+        for i in range(n):
+            for j in np.argsort(-shares[i], kind="stable")[: selection.partners].tolist():
+                if shares[i, j] > selection.least_overlap:
+                    pairs.add((min(i, j), max(i, j)))
+        return sorted(p for p in pairs if not self._is_edge(p))
+
+    def _is_edge(self, pair: Pair) -> bool:
+        match = self._tried.get(pair)
+        return match is not None and is_accepted(match, self.settings.edge)
+
+
+def connected_components(edges: Iterable[PairMatch], n: int) -> list[list[int]]:
+    """Connected frames, the largest component first."""
+    label = list(range(n))
+    for e in edges:
+        a, b = label[e.source], label[e.target]
+        label = [a if x == b else x for x in label]
+    components = [[k for k in range(n) if label[k] == x] for x in dict.fromkeys(label)]
+    return sorted(components, key=len, reverse=True)
+
+
+def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:
+    """The second frame of a pair from the first, where both are known."""
+    a, b = nodes[pair[0]], nodes[pair[1]]
+    return None if a is None or b is None else b.inverse() @ a

@@ -1,0 +1,159 @@
+"""Settings of relative pose estimation."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Separation:
+    """How far two relative poses must differ to count as two solutions: in rotation or in direction."""
+
+    rotation_rad: float
+    """angle between the rotations, radian (to first order)"""
+    direction: float
+    """distance between the unit baselines"""
+
+
+@dataclass(frozen=True)
+class FivePointSettings:
+    """Random minimal samples, and the choice of the best solutions."""
+
+    samples: int = 100
+    """samples of five correspondences; with a third of them wrong, no sample is good with probability 1e-6"""
+    scoring_rays: int = 300
+    """correspondences on which the solutions of all samples are scored"""
+    polishing_rays: int = 800
+    """correspondences with which the best solutions are refined before they are compared"""
+    polished: int = 6
+    """number of best solutions that are refined"""
+    polishing_iterations: int = 12
+    """iterations of that refinement"""
+    outlier_px: float = 4.0
+    """residual, in projector pixels, beyond which a correspondence counts as wrong in the score"""
+    least_cosine: float = 1e-3
+    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
+    inlier_sigmas: float = 3.0
+    """standard deviations of the noise within which a correspondence votes on which side the surface lies"""
+    least_in_front: float = 0.5
+    """share of these that must lie in front of both devices"""
+    start_separation: Separation = field(default_factory=lambda: Separation(0.05, 0.1))
+    """by how much the solutions that are refined differ from each other"""
+    solution_separation: Separation = field(default_factory=lambda: Separation(0.02, 0.05))
+    """by how much the refined solutions differ from each other"""
+
+
+@dataclass(frozen=True)
+class EpipolarFitSettings:
+    """Levenberg-Marquardt on the distances from the epipolar curves."""
+
+    noise_floor_px: float = 1e-3
+    """noise that is assumed at least, in projector pixels"""
+    kernel_sigmas: float = 3.0
+    """width of the robust kernel, in standard deviations of the residuals"""
+    iterations: int = 30
+    """iterations at most"""
+    converged_rad: float = 1e-10
+    """size of a step, in radian, below which the fit has converged"""
+    damping: float = 1e-4
+    """damping of the first step, relative to the diagonal of the normal equations"""
+    damping_factor: float = 10.0
+    """factor by which the damping falls after a good step and rises after a bad one"""
+    least_damping: float = 1e-12
+    """below this the damping does not fall"""
+    tries: int = 8
+    """dampings that are tried before the fit ends"""
+
+
+@dataclass(frozen=True)
+class PatternBlocks:
+    """Squares of the pattern within which decoding errors may depend on each other."""
+
+    along_longer_side: int = 25
+    """squares along the longer side of the pattern: with 50 grid lines, two periods each"""
+
+
+@dataclass(frozen=True)
+class DegeneracyLimits:
+    """When a frame's correspondences count as degenerate."""
+
+    least_points: int = 200
+    """correspondences that agree with the pose, at least"""
+    least_block_share: float = 30 / 625
+    """share of the squares of the pattern that must hold points, so that their errors can be judged"""
+    least_relief_sigmas: float = 6.0
+    """standard deviations of the noise by which points must depart from a plane, and from a pure rotation"""
+    least_parallax_deg: float = 2.0
+    """angle between camera ray and projector ray, in degrees, below which depth hangs on tiny errors"""
+    largest_outlier_share: float = 0.3
+    """share of the correspondences that may disagree with the pose"""
+    largest_noise_px: float = 2.0
+    """noise of the residuals, in projector pixels"""
+    least_second_best_ratio: float = 1.3
+    """noise of the second best solution relative to the best; below it the frame is ambiguous"""
+    largest_sigma_rotation_deg: float = 0.5
+    """standard deviation of the rotation, in degrees"""
+    largest_sigma_direction_deg: float = 1.5
+    """standard deviation of the direction of the baseline, in degrees"""
+    relief_iterations: int = 10
+    """iterations of the robust fits of a plane and of a pure rotation"""
+    relief_kernel_medians: float = 3.0
+    """width of their kernel, in medians of the residuals"""
+    relief_share: float = 0.9
+    """share of the smallest residuals that the relief is measured on: wrong coordinates are among the others"""
+    epipole_sectors: int = 8
+    """sectors around the baseline that must all hold rays for an epipole to be in view"""
+
+
+@dataclass(frozen=True)
+class RelativePoseSettings:
+    """All settings of the relative pose of one frame."""
+
+    fewest: int = 20
+    """correspondences: enough for five unknowns and a judgement of the result"""
+    most: int = 20000
+    """correspondences in the fit at most; neighbouring pixels add nothing new"""
+    inlier_sigmas: float = 4.0
+    """standard deviations of the noise within which a correspondence agrees with the pose"""
+    least_inlier_share: float = 0.3
+    """share of the correspondences that must agree with the pose"""
+    largest_noise_share: float = 0.02
+    """noise beyond which nothing fits, as a share of the pattern's width"""
+    second_best: Separation = field(default_factory=lambda: Separation(0.0354, 0.1))
+    """by how much the second best solution differs from the best: by more than an unfinished refinement does"""
+    blocks: PatternBlocks = field(default_factory=PatternBlocks)
+    """squares of the pattern"""
+    five_point: FivePointSettings = field(default_factory=FivePointSettings)
+    """the first solutions"""
+    fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
+    """the fit of the best one"""
+    degeneracy: DegeneracyLimits = field(default_factory=DegeneracyLimits)
+    """when a frame is degenerate"""
+
+
+@dataclass(frozen=True)
+class FocalSettings:
+    """Gauss-Newton on the projector's focal length and the relative poses of all frames."""
+
+    most: int = 3000
+    """correspondences of each frame at most"""
+    difference_step: float = 1e-5
+    """step of the differences, of the logarithm of the focal length"""
+    iterations: int = 12
+    """iterations at most"""
+    converged: float = 1e-9
+    """step of the logarithm below which the search has converged"""
+    largest_step: float = 0.05
+    """step of the logarithm at most"""
+    kernel_sigmas: float = 3.0
+    """width of the robust kernel, in standard deviations of the residuals"""
+    final_iterations: int = 10
+    """iterations of the fit of each pose in the end"""
+    significant_sigmas: float = 3.0
+    """standard deviations of its own uncertainty by which the focal length must change"""
+    blocks: PatternBlocks = field(default_factory=PatternBlocks)
+    """squares of the pattern"""
+    fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
+    """the fit of each pose in the end"""
+
+
+DEFAULT_SETTINGS = RelativePoseSettings()
+FOCAL_DEFAULTS = FocalSettings()

@@ -1,0 +1,55 @@
+"""The projection of compiled loops, against that of tensors."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from random_geometry import DEVICES, generator, points_in_view, seeds
+
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project
+from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
+
+
+def compiled_pixel(device: Device, p: np.ndarray) -> tuple[float, float, bool]:
+    parameters = np.array([getattr(device, key) for key in PARAMETERS])
+    return pixel_of(MODELS[device.model].code, *p, parameters)
+
+
+@given(seeds, st.sampled_from(sorted(DEVICES)))
+def test_points_in_view_have_the_same_pixel(seed, name):
+    device = DEVICES[name]
+    p = points_in_view((8,), generator(seed))
+    uv, front = project(Intrinsics.of(device, torch.float64), p)
+    for k in range(8):
+        column, row, in_front = compiled_pixel(device, p[k].numpy())
+        assert in_front and front[k]
+        assert [column, row] == pytest.approx(uv[k].tolist(), abs=1e-9)
+
+
+@given(st.sampled_from(sorted(DEVICES)), st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3))
+def test_a_point_is_in_front_where_the_tensors_say_so(name, x, y, z):
+    device = DEVICES[name]
+    without_lens = Device(device.w, device.h, device.fl_x, device.fl_y, device.cx, device.cy, model=device.model)
+    p = torch.tensor([x, y, z], dtype=torch.float64)
+    if p.norm() < 1e-3 or abs(float(-z - 1e-6 * p.norm())) < 1e-9:
+        return  # at the limit both answers are right
+    _, front = project(Intrinsics.of(without_lens, torch.float64), p)
+    column, row, in_front = compiled_pixel(without_lens, p.numpy())
+    assert bool(in_front) is bool(front)
+    assert bool(in_front) is (z < 0 and -z > 1e-6 * float(p.norm()))
+    assert np.isfinite([column, row]).all()
+
+
+@pytest.mark.parametrize("name", sorted(DEVICES))
+def test_points_behind_are_flagged_and_finite(name):
+    for p in ([0.1, 0.2, 1.0], [0.1, 0.2, 0.0], [3.0, 4.0, 1e-9], [3.0, 4.0, -1e-7]):
+        column, row, in_front = compiled_pixel(DEVICES[name], np.array(p))
+        assert not in_front
+        assert np.isfinite([column, row]).all()
+
+
+def test_every_model_has_a_code_of_its_own():
+    codes = [model.code for model in MODELS.values()]
+    assert len(set(codes)) == len(codes)
+    assert {device.model for device in DEVICES.values()} == MODELS.keys()
