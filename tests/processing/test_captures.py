@@ -41,10 +41,7 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     captures = find_captures(tmp_path, sequences=False)
     assert sorted(captures.faults) == ["f1", "f2", "f4"]
     turned, empty, large = (str(captures.faults[k]) for k in ("f1", "f2", "f4"))
-    assert (
-        "f1.png: is 12 x 16 pixels, most images are 16 x 12" in turned
-        and "held on its side" in turned
-    )
+    assert "f1.png: is 12 x 16 pixels, most images are 16 x 12" in turned and "held on its side" in turned
     assert "f2.png: is empty" in empty
     assert "f4.png: is 32 x 24 pixels" in large and "resized, cropped" in large
     assert all("remedy:" in text for text in (turned, empty, large))
