@@ -18,7 +18,8 @@ from numpy import ndarray
 from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
+from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
+from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.noise import disturb_image
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
@@ -102,14 +103,14 @@ def measure(config: Config, conditions: Conditions, scene: str, resolution: int)
         conditions,
         resolution,
     )
-    assert setup.grid is not None
-    decoder = NetworkDecoder(setup.grid)
+    grid = GridPattern()  # the pattern that sl-synth projects by default
+    decoder = GridImageDecoder(grid)
     frames, failed, periods = [], 0, []
     for index in range(config.frames):
         truth = setup.render(index, 2)
         noise = random_stream(config.seed, Stream.SENSOR, index)
         image = disturb_image(truth.radiance, GAIN, conditions.sensor_noise, noise)
-        periods.append(_period(truth.coords, setup.grid.period))
+        periods.append(_period(truth.coords, grid.period))
         try:
             frames.append(_decode(decoder, image, truth.coords, truth.mask))
         except DecodingError as problem:
@@ -124,7 +125,7 @@ def measure(config: Config, conditions: Conditions, scene: str, resolution: int)
         round(len(error) / sum(frame.lit for frame in frames), 4),
         round(float(np.median(error)), 3),
         round(float(np.quantile(error, 0.9)), 3),
-        round(float(np.mean(error > setup.grid.period / 2)), 5),
+        round(float(np.mean(error > grid.period / 2)), 5),
         round(outside / max(outside + len(error), 1), 5),
         failed,
         round(float(np.mean([frame.seconds for frame in frames])), 2),
@@ -143,7 +144,7 @@ def harder(setup: Setup, conditions: Conditions, resolution: int) -> Setup:
 
 
 def _decode(
-    decoder: NetworkDecoder, image: ndarray, coords: Float32[ndarray, "h w 2"], lit: Bool[ndarray, "h w"]
+    decoder: GridImageDecoder, image: ndarray, coords: Float32[ndarray, "h w 2"], lit: Bool[ndarray, "h w"]
 ) -> Frame:
     start = time.perf_counter()
     decoded = decoder.decode(image)

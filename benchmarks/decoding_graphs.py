@@ -15,7 +15,7 @@ from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.grid.gcn import turned_pattern
 from sl_nerfstudio.decoding.grid.graph import neighbourhoods
-from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
+from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, DamagedGraph, damage_graph
 
@@ -50,15 +50,15 @@ class Row:
 METHODS = ("windows, exact", "windows, one symbol off", "graph network, each node alone", "graph network and consensus")
 
 
-def answers(decoder: NetworkDecoder, graph: DamagedGraph) -> dict[str, np.ndarray]:
+def answers(recogniser: NodeRecogniser, graph: DamagedGraph) -> dict[str, np.ndarray]:
     """(quarter turn, row, column) that each method gives to every node, -1 for none."""
-    pattern = turned_pattern(np.asarray(decoder.pattern.codes))
+    pattern = turned_pattern(recogniser.codes)
     around = neighbourhoods(graph.neighbour)
     places = np.column_stack([pattern.turn, pattern.place]).astype(np.int64)
     places = np.vstack([places, np.full((1, 3), -1)])
     with torch.inference_mode():
-        alone = decoder.judge(torch.from_numpy(graph.score), around).argmax(1).numpy()
-    assignment = decoder.assign(graph.as_grid())
+        alone = recogniser.logits(torch.from_numpy(graph.score), around).argmax(1).numpy()
+    assignment = recogniser.assign(graph.as_grid())
     together = np.column_stack([np.full(len(alone), assignment.turn), assignment.place])
     return dict(
         zip(
@@ -74,16 +74,16 @@ def answers(decoder: NetworkDecoder, graph: DamagedGraph) -> dict[str, np.ndarra
     )
 
 
-def measure(decoder: NetworkDecoder, config: Config, misread: float) -> list[Row]:
+def measure(recogniser: NodeRecogniser, config: Config, misread: float) -> list[Row]:
     """All methods on the same graphs."""
     right, wrong, total = np.zeros(len(METHODS)), np.zeros(len(METHODS)), 0
-    codes = np.asarray(decoder.pattern.codes)
+    codes = recogniser.codes
     for index in range(config.graphs):
         rng = np.random.default_rng([config.seed, round(100 * misread), index])
         graph = damage_graph(rng, codes, Damage(misread, config.missing), index % 4, 0.4)
         truth = np.column_stack([np.full(len(graph.place), graph.turn), graph.place])
         total += len(truth)
-        for k, answer in enumerate(answers(decoder, graph).values()):
+        for k, answer in enumerate(answers(recogniser, graph).values()):
             same = (answer == truth).all(-1)
             right[k] += same.sum()
             wrong[k] += (~same & (answer[:, 1] >= 0)).sum()
@@ -97,8 +97,8 @@ def main() -> None:
     """Print the table and write it to JSON."""
     config = tyro.cli(Config, description=__doc__)
     torch.set_num_threads(2)
-    decoder = NetworkDecoder(GridPattern())
-    rows = [row for misread in config.misread for row in measure(decoder, config, misread)]
+    recogniser = NodeRecogniser(GridPattern())
+    rows = [row for misread in config.misread for row in measure(recogniser, config, misread)]
     print("| misread | missing | method | right | wrong |\n|---|---|---|---|---|")
     for row in rows:
         print(f"| {row.misread:.0%} | {row.missing:.0%} | {row.method} | {row.right:.1%} | {row.wrong:.1%} |")

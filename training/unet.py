@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from sl_nerfstudio.decoding.grid.unet import Reading, UNet
+from sl_nerfstudio.decoding.grid.unet import NetworkOutput, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
 from training.records import cosine_rate, log_row, save_weights
@@ -82,13 +82,13 @@ def stack(captures: list[Capture]) -> Batch:
     )
 
 
-def losses(reading: Reading, batch: Batch) -> dict[str, Tensor]:
+def losses(output: NetworkOutput, batch: Batch) -> dict[str, Tensor]:
     """Mask, phase and symbol; the last two where the pattern falls and is not torn."""
     total = batch.weight.sum().clamp(min=1.0)
-    mask = F.binary_cross_entropy_with_logits(reading.mask, batch.lit, reduction="none")
-    phase = F.smooth_l1_loss(reading.phase, batch.phase, reduction="none", beta=0.2).sum(1)
+    mask = F.binary_cross_entropy_with_logits(output.mask, batch.lit, reduction="none")
+    phase = F.smooth_l1_loss(output.phase, batch.phase, reduction="none", beta=0.2).sum(1)
     near = batch.weight * (1 + _NODE_WEIGHT * batch.node)
-    symbol = F.cross_entropy(reading.symbol, batch.symbol, reduction="none")
+    symbol = F.cross_entropy(output.symbol, batch.symbol, reduction="none")
     return {
         "mask": (mask * (0.2 + 0.8 * batch.certain)).mean(),
         "phase": (phase * batch.weight).sum() / total,
@@ -96,19 +96,19 @@ def losses(reading: Reading, batch: Batch) -> dict[str, Tensor]:
     }
 
 
-def figures(reading: Reading, batch: Batch) -> dict[str, float]:
+def figures(output: NetworkOutput, batch: Batch) -> dict[str, float]:
     """What a person wants to know: symbols misread at nodes, mask wrong (shares), phase error (periods)."""
     with torch.no_grad():
         at_node = (batch.weight * batch.node) > 0
-        right = reading.symbol.argmax(1) == batch.symbol
-        c, s, true_c, true_s = reading.phase[:, 0], reading.phase[:, 1], batch.phase[:, 0], batch.phase[:, 1]
+        right = output.symbol.argmax(1) == batch.symbol
+        c, s, true_c, true_s = output.phase[:, 0], output.phase[:, 1], batch.phase[:, 0], batch.phase[:, 1]
         error = torch.atan2(s * true_c - c * true_s, c * true_c + s * true_s).abs() / (2 * math.pi)
         where = batch.weight > 0
         return {
             "misread": 1 - float(right[at_node].float().mean()),
             "phase_median": float(error[where].median()),
             "phase_90": float(error[where].quantile(0.9)),
-            "mask_wrong": float(((reading.mask > 0) != (batch.lit > 0.5)).float().mean()),
+            "mask_wrong": float(((output.mask > 0) != (batch.lit > 0.5)).float().mean()),
         }
 
 
@@ -145,13 +145,13 @@ def train(config: Config) -> None:
     for step, batch in zip(range(first, config.steps), batches(config, first), strict=True):
         for group in optimizer.param_groups:
             group["lr"] = cosine_rate(config.rate, step, config.steps, 100)
-        reading = network(batch.channels)
-        parts = losses(reading, batch)
+        output = network(batch.channels)
+        parts = losses(output, batch)
         optimizer.zero_grad(set_to_none=True)
         sum(parts.values(), torch.zeros(())).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
         optimizer.step()
-        for key, value in {**{k: float(v.detach()) for k, v in parts.items()}, **figures(reading, batch)}.items():
+        for key, value in {**{k: float(v.detach()) for k, v in parts.items()}, **figures(output, batch)}.items():
             sums[key] = sums.get(key, 0.0) + value
         if (step + 1) % config.log_every == 0:
             row = {key: round(value / config.log_every, 5) for key, value in sums.items()}

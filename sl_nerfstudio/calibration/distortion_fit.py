@@ -1,4 +1,4 @@
-"""Lens models with more terms than a scan holds, reduced to k1, k2, p1, p2 where that makes no difference."""
+"""Lens models with more terms than a scan has, reduced to k1, k2, p1, p2 where the difference is negligible."""
 
 from collections.abc import Sequence
 
@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-MOST_PX = 0.1  # by which the reduced model may depart from the full one, anywhere in the image
-_GRID = 41
+LARGEST_MISS_PX = 0.1  # of the reduced model against the full one, anywhere in the image
+_SAMPLES = 41  # per side of the image
+_ITERATIONS = 50  # of undistortion
 
 
 def reduce_distortion(
@@ -15,7 +16,7 @@ def reduce_distortion(
 ) -> tuple[tuple[float, float, float, float], float]:
     """(k1, k2, p1, p2) nearest to OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), and the largest difference in pixels.
 
-    `matrix` holds focal lengths and principal point, `size` is (w, h). With four coefficients nothing changes.
+    `matrix` holds focal lengths and principal point; `size` is (w, h). Four coefficients stay as they are.
     """
     full = np.zeros(8)
     full[: len(coefficients)] = coefficients
@@ -36,12 +37,12 @@ def reduce_distortion(
 def _normalised_grid(
     full: Float64[ndarray, "8"], matrix: Float64[ndarray, "3 3"], size: tuple[int, int]
 ) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
-    """Undistorted normalised coordinates of places all over the image, by fixed-point iteration."""
-    u, v = np.meshgrid(np.linspace(0, size[0], _GRID), np.linspace(0, size[1], _GRID))
+    """Undistorted normalised coordinates of a grid of pixels, by fixed-point iteration."""
+    u, v = np.meshgrid(np.linspace(0, size[0], _SAMPLES), np.linspace(0, size[1], _SAMPLES))
     xd = (u.reshape(-1) - matrix[0, 2]) / matrix[0, 0]
     yd = (v.reshape(-1) - matrix[1, 2]) / matrix[1, 1]
     x, y = xd, yd
-    for _ in range(50):
+    for _ in range(_ITERATIONS):
         ex, ey = _distort(x, y, full)
         x, y = x - (ex - xd), y - (ey - yd)
     return x, y

@@ -12,36 +12,42 @@ from sl_nerfstudio.errors import UserError
 if TYPE_CHECKING:
     from numpy import ndarray
 
+    from sl_nerfstudio.pattern.layout import PatternLayout
+
+_SUPERSAMPLING = 4  # of pattern.png
+_GRID_FLAGS = ("period", "line_width", "gap")
+
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write pattern.png, to be projected or printed, and pattern.json, by which sl-process decodes it.
+    """Write pattern.png, to project or to print, and pattern.json, which sl-process needs to decode captures.
 
-    Lengths are pattern pixels. For Gray code all images of the sequence are written to sequence/.
+    Lengths are in pattern pixels. For Gray code, all images of the sequence are written to sequence/.
     """
 
     output: Path
     """folder to write; it must be new or empty"""
     kind: Literal["grid", "gray-code"] = "grid"
-    """grid: one static pattern, for devices moved by hand; gray-code: a sequence, for holding still in every place"""
+    """grid: one static pattern, for devices moved by hand; gray-code: a sequence, for devices that stand still while
+    each frame is captured"""
     preset: Literal["800x800", "1280x720", "doe"] = "800x800"
-    """size and period that suit a square projector, a 16:9 projector, or a diffractive element"""
+    """size and period for a square projector, a 16:9 projector, or a diffractive element"""
     width: int | None = None
     """width of the pattern; default: the preset's"""
     height: int | None = None
     """height of the pattern; default: the preset's"""
     period: float | None = None
-    """distance of neighbouring grid lines; default: the preset's"""
+    """distance between neighbouring grid lines; default: the preset's"""
     line_width: float | None = None
     """width of the lines; default: a fifth of the period"""
     gap: float | None = None
     """how far line segments are shifted against each other at a crossing; default: three tenths of the period"""
     seed: int = 0
-    """which of the possible code arrays"""
+    """selects one of the possible code arrays"""
     cell: int = 2
-    """side of the squares that Gray code tells apart"""
+    """side of the squares that Gray code numbers"""
     print_width: float | None = None
-    """width on paper or slide in millimetres, noted in pattern.png for printing programs"""
+    """width on paper or slide in millimetres; it is stored in pattern.png for printing programs"""
 
 
 def main() -> None:
@@ -65,18 +71,14 @@ def _write_grid(arguments: Arguments) -> str:
     import numpy as np
 
     from sl_nerfstudio.pattern.codes import hamming_margin
-    from sl_nerfstudio.pattern.files import encode_grid
     from sl_nerfstudio.pattern.presets import make_grid
-    from sl_nerfstudio.scan.atomic import write_atomic
 
     grid = make_grid(
         arguments.preset, arguments.width, arguments.height, arguments.period, arguments.line_width, arguments.gap,
         arguments.seed,
     )  # fmt: skip
+    _write_layout(arguments, grid)
     codes = np.asarray(grid.codes)
-    image = np.rint(255 * grid.render(4)).astype(np.uint8)
-    write_atomic(arguments.output / "pattern.png", _encode(image, arguments.print_width))
-    write_atomic(arguments.output / "pattern.json", encode_grid(grid))
     return (
         f"wrote a grid of {grid.columns} x {grid.rows} nodes to {arguments.output}: 3 x 3 windows differ in at least "
         f"{hamming_margin(codes, False)} of 9 symbols, in {hamming_margin(codes, True)} where the camera may roll"
@@ -84,43 +86,48 @@ def _write_grid(arguments: Arguments) -> str:
 
 
 def _write_gray_code(arguments: Arguments) -> str:
-    import numpy as np
-
-    from sl_nerfstudio.pattern.files import encode_gray_code
     from sl_nerfstudio.pattern.graycode import GrayCode
     from sl_nerfstudio.pattern.presets import PRESETS
-    from sl_nerfstudio.scan.atomic import write_atomic
 
-    given = [f for f in ("period", "line_width", "gap") if getattr(arguments, f) is not None]
-    if given:
-        raise UserError(f"--{given[0].replace('_', '-')}: Gray code has none; its squares are set by --cell")
+    for field in _GRID_FLAGS:
+        if getattr(arguments, field) is not None:
+            raise UserError(f"--{field.replace('_', '-')}: Gray code has none; set its squares with --cell")
     w, h, _ = PRESETS[arguments.preset]
     try:
         layout = GrayCode(arguments.width or w, arguments.height or h, arguments.cell)
     except ValueError as error:
         raise UserError(f"--width, --height, --cell: {error}") from error
-    write_atomic(
-        arguments.output / "pattern.png",
-        _encode(np.rint(255 * layout.finest()).astype(np.uint8), arguments.print_width),
-    )
+    _write_layout(arguments, layout)
     for index, image in enumerate(layout.sequence()):
-        write_atomic(arguments.output / "sequence" / f"{index:02d}.png", _encode(image, arguments.print_width))
-    write_atomic(arguments.output / "pattern.json", encode_gray_code(layout))
+        _write_image(arguments, f"sequence/{index:02d}.png", image)
     return (
-        f"wrote a Gray-code sequence of {layout.images} images to {arguments.output}: show them in the order of names"
+        f"wrote a Gray-code sequence of {layout.images} images to {arguments.output}: show them in the order of their "
+        "names"
     )
 
 
-def _encode(image: "ndarray", print_width: float | None) -> bytes:
-    """A PNG file that says how wide it is to be printed (millimetres)."""
+def _write_layout(arguments: Arguments, layout: "PatternLayout") -> None:
+    """pattern.png and pattern.json."""
+    import numpy as np
+
+    from sl_nerfstudio.scan.atomic import write_atomic
+
+    _write_image(arguments, "pattern.png", np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8))
+    write_atomic(arguments.output / "pattern.json", layout.encode())
+
+
+def _write_image(arguments: Arguments, name: str, image: "ndarray") -> None:
+    """A PNG file that says how wide to print it."""
     import io
 
     from PIL import Image
 
+    from sl_nerfstudio.scan.atomic import write_atomic
+
     buffer = io.BytesIO()
-    per_inch = None if print_width is None else image.shape[1] / print_width * 25.4
+    per_inch = None if arguments.print_width is None else image.shape[1] / arguments.print_width * 25.4
     Image.fromarray(image).save(buffer, "PNG", **({} if per_inch is None else {"dpi": (per_inch, per_inch)}))
-    return buffer.getvalue()
+    write_atomic(arguments.output / name, buffer.getvalue())
 
 
 if __name__ == "__main__":

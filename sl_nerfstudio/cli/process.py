@@ -25,17 +25,17 @@ def _process() -> None:
     )
     from sl_nerfstudio.processing.process import process
 
-    result = process(config, render_processing_report, tell)
+    result = process(config, render_processing_report, log)
     sys.stdout.write(closing_words(result))
 
 
-def tell(text: str) -> None:
-    """Say how far the work is, at once also where the output is a file."""
+def log(text: str) -> None:
+    """Print a line of progress, at once even if the output is a file."""
     print(text, flush=True)
 
 
 def closing_words(result: "ProcessResult") -> str:
-    """What a person wants to know at the end."""
+    """The summary at the end of the output."""
     from sl_nerfstudio.processing.advice import first_line
 
     output = result.config.output
@@ -44,7 +44,8 @@ def closing_words(result: "ProcessResult") -> str:
     return (
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
         f"report: {output / 'processing.html'}\n"
-        f"decoded frames are kept in {result.config.work_folder} for another run; remove it when you are content\n"
+        f"decoded frames are kept in {result.config.work_folder} for the next run; remove this folder once you "
+        "are happy with the scan\n"
     )
 
 

@@ -1,4 +1,4 @@
-"""What every decoder gives, and what it says where it cannot."""
+"""The result of every decoder, and the error of a capture that cannot be decoded."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ from sl_nerfstudio.errors import UserError
 
 @dataclass(frozen=True)
 class Decoded:
-    """One frame as decoded. Coordinates are projector pixels; the centre of the first pixel is (0.5, 0.5)."""
+    """One decoded frame. Coordinates are projector pixels; the centre of the first pixel is (0.5, 0.5)."""
 
     coords: Float32[ndarray, "h w 2"]  # (x_p, y_p), NaN where not decoded
-    mask: Bool[ndarray, "h w"]  # where the pattern falls on the object; holds every decoded pixel
+    mask: Bool[ndarray, "h w"]  # where the pattern lights the object; True at every decoded pixel
     pattern: Float32[ndarray, "h w"]  # in [0, 1]: captured intensity, locally normalised; 0 outside the mask
 
     @property
@@ -30,12 +30,12 @@ class Decoded:
 
 
 class DecodingError(UserError):
-    """A capture from which no coordinates can be had: problem, likely cause and remedy apart.
+    """A capture that cannot be decoded, with problem, likely cause and remedy.
 
-    A decoder sees pixels, not files: who reads the files says which one it was.
+    A decoder knows images, not files: the caller adds the name of the file.
     """
 
     def __init__(self, problem: str, cause: str, remedy: str) -> None:
-        """All three in plain words; `problem` continues a sentence that starts with a file's or frame's name."""
+        """All three in plain words; `problem` continues a sentence that starts with the name of a file or frame."""
         super().__init__(f"{problem}\n    cause:  {cause}\n    remedy: {remedy}")
         self.problem, self.cause, self.remedy = problem, cause, remedy

@@ -1,59 +1,43 @@
-"""Decoders by name: from the files of a frame to its coordinates."""
+"""The decoders there are, and the choice of one for a pattern."""
 
-import hashlib
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
-from sl_nerfstudio.decoding.decoded import Decoded
+from sl_nerfstudio.decoding.decoder import Decoder
+from sl_nerfstudio.decoding.graycode.decoder import GrayCodeDecoder
+from sl_nerfstudio.decoding.grid.decoder import NetworkDecoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import encode_gray_code, encode_grid
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.pattern.layout import PatternLayout
 
-DecoderName = Literal["network", "graycode"]
-Layout = GridPattern | GrayCode
-_VERSION = {"network": 3, "graycode": 1}  # raised when a decoder comes to other results
+DECODERS: dict[str, type[Decoder[Any]]] = {
+    NetworkDecoder.name: NetworkDecoder,
+    GrayCodeDecoder.name: GrayCodeDecoder,
+}
+"""By name. The first one that reads a kind of pattern is the default for it."""
 
 
-def decoder_for(layout: Layout, asked: DecoderName | None, path: Path) -> DecoderName:
-    """The decoder of a pattern. Raises UserError, naming the pattern's file, if `asked` cannot decode it."""
-    suits: DecoderName = "graycode" if isinstance(layout, GrayCode) else "network"
-    if asked not in (None, suits):
-        kind = "a Gray-code sequence" if suits == "graycode" else "a coded grid"
+def choose_decoder(layout: PatternLayout, name: str | None, path: Path) -> Decoder[Any]:
+    """The decoder called `name`, or by default the first one that reads the pattern.
+
+    Raises UserError if there is no such decoder, or if it cannot decode the pattern in the file `path`.
+    """
+    if name is not None and name not in DECODERS:
         raise UserError(
-            f"{path}: describes {kind}, which --decoder {asked} does not read\n"
-            "    cause:  the pattern file is not the one that was projected, or the decoder is the other one\n"
-            f"    remedy: leave --decoder out, or give the pattern.json of what was projected"
+            f"--decoder {name}: there is no decoder of this name\n    cause:  a typing error\n"
+            f"    remedy: leave --decoder out, or give one of {', '.join(DECODERS)}"
         )
-    return suits
-
-
-def make_decoder(name: DecoderName, layout: Layout) -> Callable[[Sequence[Path]], Decoded]:
-    """A function that reads and decodes the images of one frame. It raises DecodingError or FileError."""
-    if isinstance(layout, GrayCode):
-        return lambda paths: _decode_sequence(paths, layout)
-    from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
-
-    network = NetworkDecoder(layout)
-    return lambda paths: network.decode(read_image(paths[0]))
-
-
-def _decode_sequence(paths: Sequence[Path], layout: GrayCode) -> Decoded:
-    from sl_nerfstudio.decoding.graycode.decode import check_count, decode_gray_code
-
-    check_count(len(paths), layout)  # before they are all read
-    return decode_gray_code([read_image(path) for path in paths], layout)
-
-
-def decoder_key(name: DecoderName, layout: Layout) -> str:
-    """A text that changes whenever the decoder would come to other results."""
-    description = encode_gray_code(layout) if isinstance(layout, GrayCode) else encode_grid(layout)
-    digest = hashlib.sha256(f"{name} {_VERSION[name]}".encode() + description)
-    if name == "network":
-        from sl_nerfstudio.decoding.grid import network_decoder
-
-        for weights in sorted((Path(network_decoder.__file__).parent / "weights").glob("*.safetensors")):
-            digest.update(weights.read_bytes())
-    return digest.hexdigest()
+    fitting = [decoder for decoder in DECODERS.values() if decoder.reads == layout.kind]
+    if not fitting:
+        raise UserError(
+            f"{path}: describes {layout.description}, which no decoder reads\n"
+            "    cause:  the pattern is not meant for sl-process\n"
+            "    remedy: give the pattern.json of a pattern for which there is a decoder"
+        )
+    chosen = fitting[0] if name is None else DECODERS[name]
+    if chosen not in fitting:
+        raise UserError(
+            f"{path}: describes {layout.description}, which --decoder {name} does not read\n"
+            "    cause:  the pattern file is not the one that was projected, or the decoder is the wrong one\n"
+            "    remedy: leave --decoder out, or give the pattern.json of what was projected"
+        )
+    return chosen(layout)

@@ -1,4 +1,4 @@
-"""Coordinate images cut where they are torn; small pieces are wrong decodings."""
+"""Connected regions of a coordinate image: small ones are decoding errors."""
 
 import numpy as np
 from jaxtyping import Float32

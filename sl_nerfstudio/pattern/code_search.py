@@ -1,9 +1,8 @@
-"""Local search for code arrays whose 3x3 windows keep a Hamming distance.
+"""Local search for code arrays whose 3x3 windows keep a minimum Hamming distance.
 
-Two tables count, for each of the 5^9 possible windows, how often it occurs upright and how often when
-the pattern is turned by 90, 180 or 270 degrees; the conflicts of a window are the occurrences in the
-Hamming balls around it. Cells of windows in conflict are re-sampled with the symbol that leaves the
-fewest conflicts (min-conflicts heuristic).
+Two tables count, for each of the 5^9 possible windows, how often it occurs upright and how often in the pattern turned
+by 90, 180 or 270 degrees. The conflicts of a window are the occurrences in the Hamming balls around it. Cells of
+windows with conflicts get the symbol that leaves the fewest conflicts (min-conflicts heuristic).
 """
 
 import numpy as np
@@ -13,12 +12,12 @@ from numpy import ndarray
 from sl_nerfstudio.compiled import compiled
 
 _SYMBOLS, _CELLS = 5, 9
-_MOVES_PER_CELL = 3  # beyond that a margin counts as out of reach
+_MOVES_PER_CELL = 3  # after that a margin counts as unreachable
 _RANDOM_MOVES = 0.1
 
 
 def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_margin: int, seed: int) -> bool:
-    """Change `codes` in place until its 3x3 windows are far enough from each other; False if it fails.
+    """Change `codes` in place until its 3x3 windows are far enough apart; False if that fails.
 
     Any two differ in at least `margin` cells (1 to 3), and each differs in at least `turned_margin` cells
     (0 to 3) from all windows of the pattern turned by 90, 180 or 270 degrees.
@@ -28,7 +27,7 @@ def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_m
 
 @compiled
 def _count(tables: ndarray, codes: ndarray, row: int, column: int, amount: int) -> None:
-    """Enter (or take out) the window at (row, column): upright in one table, its turns in the other."""
+    """Count (or uncount) the window at (row, column): upright in one table, its turned versions in the other."""
     turn = (0, 3, 4, 1, 2)
     a = b = c = d = 0
     for i in range(3):
@@ -63,7 +62,7 @@ def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
 
 @compiled
 def _conflicts(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> int:
-    """Occurrences near the window at (row, column), itself left out."""
+    """Occurrences near the window at (row, column), not counting the window itself."""
     change = np.empty((_CELLS, _SYMBOLS - 1), dtype=np.int64)
     key, power = 0, 1
     for cell in range(_CELLS - 1, -1, -1):
@@ -102,7 +101,7 @@ def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius:
     """Re-sample the one cell of a window that leaves the fewest conflicts in all windows around that cell."""
     best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(_SYMBOLS), 2**30
     start = np.random.randint(_CELLS * _SYMBOLS)
-    if np.random.random() < _RANDOM_MOVES:  # a way out of cycles
+    if np.random.random() < _RANDOM_MOVES:  # escapes from cycles
         _replace(tables, codes, row + best_cell // 3, column + best_cell % 3, best_symbol)
         return
     for step in range(_CELLS * _SYMBOLS):

@@ -1,13 +1,13 @@
-"""Code arrays: a grid of symbols in which every small window tells where it is.
+"""Code arrays: a grid of symbols in which every small window occurs only once.
 
-Symbols (numbers 0 to 4; the method's text counts them from 1):
+Symbols:
 
     0  no gap
     1  gap in the horizontal line, left side higher       2  ... right side higher
     3  gap in the vertical line, upper side further right 4  ... upper side further left
 
-Turning the pattern by 90 degrees exchanges 1 with 3 and 2 with 4; turning it by 180 degrees
-changes no symbol. Both facts let windows be compared under every roll of the camera.
+Turning the pattern by 90 degrees exchanges 1 with 3 and 2 with 4; turning it by 180 degrees changes no symbol. So
+windows can be compared for every roll of the camera, in quarter turns.
 """
 
 import numpy as np
@@ -43,8 +43,8 @@ def windows(codes: Int[ndarray, "rows columns"], size: int = WINDOW) -> Int[ndar
 def hamming_margin(codes: Int[ndarray, "rows columns"], rotations: bool = True, size: int = WINDOW) -> int:
     """Smallest number of cells in which two different windows differ.
 
-    With `rotations`, windows are also compared with all windows (their own included) of the pattern
-    turned by 90, 180 and 270 degrees, as a camera that rolls freely sees them.
+    With `rotations`, windows are also compared with all windows (themselves included) of the pattern turned by 90, 180
+    and 270 degrees, as a camera with unknown roll sees them.
     """
     plain = windows(codes, size)
     most_alike = 0
@@ -61,7 +61,7 @@ def _one_hot(plain: Int[ndarray, "n cells"]) -> Float32[ndarray, "n symbols"]:
 
 
 def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int = WINDOW) -> Int[ndarray, "n cells"]:
-    """Flattened windows turned clockwise, each in its place."""
+    """Flattened windows, each turned clockwise about its own centre."""
     return rotate_codes(plain.reshape(-1, size, size), quarter_turns).reshape(len(plain), size * size)
 
 
@@ -70,9 +70,9 @@ def code_array(
 ) -> Int[ndarray, "rows columns"]:
     """Random symbols whose 3x3 windows differ in `margin` cells, or `turned_margin` when one of the two is turned.
 
-    Starts from a random fill and re-samples cells of windows that are too similar to others. If the
-    margins cannot be had for so large an array, lower ones are tried: `hamming_margin` tells what was
-    reached (3 and 2 for 40 x 40 cells: upright, one misread cell of nine can be put right).
+    Starts from random symbols and re-samples cells of windows that are too similar to others. If an array of this size
+    cannot reach the margins, lower ones are tried; `hamming_margin` measures what was reached (3 and 2 for 40 x 40
+    cells: in an upright window, one misread cell of nine can be corrected).
     """
     while True:
         rng = np.random.default_rng([seed, margin, turned_margin])

@@ -1,29 +1,34 @@
-"""Gray-code stripes: a sequence of patterns after which every pixel knows its cell by itself.
+"""Gray-code stripes: a sequence of patterns from which each camera pixel is decoded without its neighbours.
 
-The projector shows, in this order: white, black, the bits of the column (coarse to fine, each followed by
-its inverse), the bits of the row likewise. Neighbouring cells differ in one bit only.
+The projector shows, in this order: white, black, the bits of the column (coarse to fine, each followed by its
+inverse), then the bits of the row in the same way. Neighbouring cells differ in exactly one bit.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.pattern.layout import PatternLayout
+
 HEAD = 2  # white and black
 
 
 @dataclass(frozen=True)
-class GrayCode:
+class GrayCode(PatternLayout):
     """Description of a Gray-code sequence; cells are squares of `cell` pattern pixels."""
 
+    kind: ClassVar[str] = "gray-code"
+    description: ClassVar[str] = "a Gray-code sequence"
     w: int = 1920
     h: int = 1080
     cell: int = 2
 
     def __post_init__(self) -> None:
-        """Raises ValueError for sizes that make no sequence."""
+        """Raises ValueError for sizes that do not make a sequence."""
         if self.cell < 1 or min(self.w, self.h) < 2 * self.cell:
             raise ValueError(
                 f"a Gray code needs at least 2 x 2 cells of 1 pixel or more, got {self.w} x {self.h} pixels "
@@ -51,12 +56,12 @@ class GrayCode:
         return HEAD + 2 * sum(self.bits)
 
     def bit_images(self, axis: int) -> list[tuple[int, int]]:
-        """Place in the sequence of every bit of an axis (0: column, 1: row) and of its inverse, coarse to fine."""
+        """Index in the sequence of every bit of an axis (0: column, 1: row) and of its inverse, coarse to fine."""
         start = HEAD + (2 * self.bits[0] if axis else 0)
         return [(start + 2 * k, start + 2 * k + 1) for k in range(self.bits[axis])]
 
     def sequence(self) -> Iterator[UInt8[ndarray, "h w"]]:
-        """All patterns in their order, 0 or 255."""
+        """All patterns in the order in which they are shown, 0 or 255."""
         white = np.full((self.h, self.w), 255, dtype=np.uint8)
         yield white
         yield np.zeros_like(white)
@@ -66,10 +71,25 @@ class GrayCode:
                 yield np.where(image, white, np.uint8(0))
                 yield np.where(image, np.uint8(0), white)
 
-    def finest(self) -> Float32[ndarray, "h w"]:
-        """Mean of the finest stripes of both axes, in [0, 1]: one image that shows places in x and in y."""
+    def render(self, supersampling: int = 2) -> Float32[ndarray, "h w"]:
+        """Mean of the finest stripes of both axes, in [0, 1].
+
+        Stripes end where pixels end, so the mean over a pixel is the same for every `supersampling`.
+        """
         x, y = (self._stripes(axis)[-1].astype(np.float32) for axis in (0, 1))
         return (x[None, :] + y[:, None]) / 2
+
+    def fields(self) -> dict[str, Any]:
+        """The side of a cell, and what each image of the sequence shows."""
+        names = ["white", "black"]
+        for axis, bits in zip("xy", self.bits, strict=True):
+            names += [f"{axis} bit {bits - 1 - k}{inverse}" for k in range(bits) for inverse in ("", " inverse")]
+        return {"cell": self.cell, "sequence": names}
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> "GrayCode":
+        """The sequence that a pattern.json describes."""
+        return cls(*(int(document[key]) for key in ("w", "h", "cell")))
 
     def _stripes(self, axis: int) -> list[ndarray]:
         """Whether each pixel along an axis is lit, for every bit, coarse to fine."""
@@ -79,12 +99,12 @@ class GrayCode:
 
 
 def gray(index: Int[ndarray, "*n"]) -> Int[ndarray, "*n"]:
-    """Gray code of cell numbers."""
+    """Gray codes of cell indices."""
     return index ^ (index >> 1)
 
 
 def ungray(code: Int[ndarray, "*n"], bits: int) -> Int[ndarray, "*n"]:
-    """Cell numbers of Gray codes of so many bits."""
+    """Cell indices of Gray codes of `bits` bits."""
     index = code.copy()
     shift = 1
     while shift < bits:

@@ -1,30 +1,35 @@
 """The coded grid: vertical and horizontal line segments with small gaps at the crossings.
 
-Node (i, j) of the grid (row, column) lies at pattern pixel (x0 + j * period, y0 + i * period).
-Between two nodes a segment runs straight from the offset that the first node gives it to the offset
-of the second, so that lines bend a little and nodes stay where the regular grid has them.
+Node (i, j) of the grid (row, column) lies at pattern pixel (x0 + j * period, y0 + i * period). Each node shifts the
+ends of the segments that meet there, and a segment runs straight from one shifted end to the other. So the lines bend
+a little, but the nodes stay on the regular grid.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int8
 from numpy import ndarray
 
-from sl_nerfstudio.pattern.codes import code_array
+from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margin
+from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 
-# offset, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right)
+# Offsets, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right).
 _OFFSETS = np.array(
     [[0, 0, 0, 0], [-1, 1, 0, 0], [1, -1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]],
     dtype=np.float64,
 )
+_LENGTHS = ("period", "line_width", "gap", "dark")
 
 
 @dataclass(frozen=True, eq=False)
-class GridPattern:
+class GridPattern(PatternLayout):
     """Description of a coded grid; lengths in pattern pixels."""
 
+    kind: ClassVar[str] = "grid"
+    description: ClassVar[str] = "a coded grid"
     w: int = 800
     h: int = 800
     period: float = 20.0
@@ -32,7 +37,7 @@ class GridPattern:
     gap: float = 6.0
     dark: float = 0.0  # intensity between the lines; the lines have 1
     seed: int = 0
-    codes: Int8[ndarray, "rows columns"] | None = None  # None: made from the seed
+    codes: Int8[ndarray, "rows columns"] | None = None  # None: generated from the seed
 
     def __post_init__(self) -> None:
         """Check the lengths and fill in the codes. Raises ValueError for a grid that cannot be drawn."""
@@ -61,13 +66,18 @@ class GridPattern:
 
     @property
     def x0(self) -> float:
-        """x of the leftmost nodes; the grid lies centred in the pattern."""
+        """x of the leftmost nodes; the grid is centred in the pattern."""
         return (self.w - (self.columns - 1) * self.period) / 2
 
     @property
     def y0(self) -> float:
-        """y of the uppermost nodes."""
+        """y of the topmost nodes."""
         return (self.h - (self.rows - 1) * self.period) / 2
+
+    @property
+    def lattice(self) -> Lattice:
+        """The nodes of the grid."""
+        return Lattice(self.period, self.x0, self.y0, self.rows, self.columns)
 
     def nodes(self) -> Float[ndarray, "rows columns 2"]:
         """Pattern pixel (x, y) of every node."""
@@ -76,7 +86,7 @@ class GridPattern:
         return np.stack(np.meshgrid(x, y), -1)
 
     def node_index(self, uv: Float[ndarray, "*n 2"]) -> Int[ndarray, "*n 2"]:
-        """Nearest node (i, j) of pattern pixels (x, y), inside the array."""
+        """Nearest node (i, j) of pattern pixels (x, y); always one inside the array."""
         j = np.rint((uv[..., 0] - self.x0) / self.period)
         i = np.rint((uv[..., 1] - self.y0) / self.period)
         return np.stack([np.clip(i, 0, self.rows - 1), np.clip(j, 0, self.columns - 1)], -1).astype(np.int64)
@@ -93,7 +103,7 @@ class GridPattern:
         return self.dark + (1 - self.dark) * light
 
     def render(self, supersampling: int = 2) -> Float32[ndarray, "h w"]:
-        """The pattern as an image in [0, 1], each pixel the mean of `supersampling`^2 places."""
+        """The pattern as an image in [0, 1]; each pixel is the mean of `supersampling`^2 samples."""
         step = (np.arange(supersampling) + 0.5) / supersampling
         image = np.zeros((self.h, self.w))
         for dy in step:
@@ -102,11 +112,33 @@ class GridPattern:
                 image += self.intensity(uv)
         return (image / supersampling**2).astype(np.float32)
 
+    def fields(self) -> dict[str, Any]:
+        """Lengths, codes, and what the codes can correct."""
+        codes = np.asarray(self.codes)
+        return {
+            **{key: getattr(self, key) for key in (*_LENGTHS, "seed", "x0", "y0", "rows", "columns")},
+            "symbols": list(SYMBOL_NAMES),
+            "window": WINDOW,
+            "hamming_margin": hamming_margin(codes, rotations=False),
+            "hamming_margin_turned": hamming_margin(codes, rotations=True),
+            "codes": codes.tolist(),
+        }
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> "GridPattern":
+        """The grid that a pattern.json describes."""
+        numbers = {key: float(document[key]) for key in _LENGTHS}
+        w, h, seed = (int(document[key]) for key in ("w", "h", "seed"))
+        codes = np.array(document["codes"], dtype=np.int64)
+        if codes.min(initial=0) < 0 or codes.max(initial=0) >= SYMBOLS:
+            raise ValueError(f"codes must be 0 to {SYMBOLS - 1}")
+        return cls(w=w, h=h, seed=seed, codes=codes.astype(np.int8), **numbers)
+
     @cached_property
     def _line_offsets(self) -> tuple[Float[ndarray, "rows s 2"], Float[ndarray, "r columns 2"]]:
         """Offsets at both ends of each segment: segment k of a line runs from node k - 1 to node k.
 
-        At the rim, where one of the nodes is missing, a segment keeps the offset of the other.
+        At the border of the pattern, where one of the two nodes does not exist, both ends have the other's offset.
         """
         left, right, above, below = np.moveaxis(_OFFSETS[self.codes] * self.gap / 2, -1, 0)
         start = np.concatenate([left[:, :1], right], 1)
@@ -119,7 +151,7 @@ class GridPattern:
 def _along(
     offsets: Float[ndarray, "lines segments 2"], across: Float[ndarray, "*n"], along: Float[ndarray, "*n"]
 ) -> Float[ndarray, "*n"]:
-    """Offset of the nearest line at a place; both places counted in periods from the first node."""
+    """Offset of the nearest line at a point; `across` and `along` count periods from the first node."""
     line = np.clip(np.rint(across), 0, offsets.shape[0] - 1).astype(np.int64)
     segment = np.clip(np.floor(along) + 1, 0, offsets.shape[1] - 1).astype(np.int64)
     t = np.clip(along - (segment - 1), 0.0, 1.0)

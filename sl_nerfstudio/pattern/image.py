@@ -1,4 +1,4 @@
-"""Any image as a pattern: bilinear look-up."""
+"""Any image as a pattern: bilinear interpolation."""
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -8,7 +8,7 @@ from numpy import ndarray
 def sample_bilinear(image: Float32[ndarray, "h w"], uv: Float[ndarray, "*n 2"]) -> Float32[ndarray, "*n"]:
     """Value at pixel coordinates (x, y) whose first pixel centre is (0.5, 0.5).
 
-    Beyond the outermost pixel centres the rim's value is kept; NaN coordinates give NaN.
+    Beyond the outermost pixel centres the value at the border continues; NaN coordinates give NaN.
     """
     h, w = image.shape
     place = uv.astype(np.float32) - np.float32(0.5)

@@ -7,11 +7,15 @@ from sl_nerfstudio.pattern.grid import GridPattern
 
 Preset = Literal["800x800", "1280x720", "doe"]
 
-# size and period in pattern pixels; lines and gaps keep their share of the period, which decoders are made for
+# Size and period in pattern pixels. Lines and gaps keep their share of the period: the networks were trained on it.
 PRESETS: dict[str, tuple[int, int, float]] = {
     "800x800": (800, 800, 20.0),
-    "1280x720": (1280, 720, 20.0),  # a projector: about 11 periods across a fifth of the picture's width
-    "doe": (800, 800, 25.0),  # an element's single orders blur: wider lines, and the fewer nodes the surer
+    "1280x720": (1280, 720, 20.0),  # a 16:9 projector: about 11 periods across a fifth of the image's width
+    "doe": (
+        800,
+        800,
+        25.0,
+    ),  # a diffractive element blurs: wider lines, and fewer nodes
 }
 LINE_SHARE, GAP_SHARE = 0.2, 0.3  # of the period
 

@@ -1,4 +1,4 @@
-"""Which photographs make up which frame."""
+"""The photographs of each frame."""
 
 import re
 from collections import Counter
@@ -14,7 +14,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One frame: one photograph, or those of a whole sequence in the order in which it was projected."""
+    """One frame: one photograph, or the photographs of a sequence in the order of projection."""
 
     name: str
     images: tuple[Path, ...]
@@ -22,29 +22,29 @@ class CapturedFrame:
 
 @dataclass(frozen=True)
 class Captures:
-    """All frames, and those among them that cannot be used as they are."""
+    """All frames, and the faults of those that cannot be used."""
 
-    frames: tuple[CapturedFrame, ...]  # in the order of their names, numbers counted as numbers
+    frames: tuple[CapturedFrame, ...]  # sorted by name, with numbers sorted as numbers
     size: tuple[int, int]  # (w, h) of the images
-    faults: dict[str, FileError]  # by name of the frame
+    faults: dict[str, FileError]  # by the frame's name
 
 
 def find_captures(root: Path, sequences: bool) -> Captures:
-    """Frames below a folder: one image each, or, with `sequences`, one sub-folder of images each.
+    """Frames in a folder: one image each or, with `sequences`, one sub-folder of images each.
 
-    The size of most images is taken to be right; images that are of another one, or cannot be read, are faults of their
-    frames. Raises FileError if there are fewer than two frames.
+    The most frequent image size is taken to be right. Images of another size, and images that cannot be read, are
+    faults of their frames. Raises FileError if there are fewer than two frames.
     """
     if not root.is_dir():
-        raise FileError(root, "is no folder", "a slip in --images", "give the folder that holds the captures")
+        raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
     frames = _folders(root) if sequences else _single_images(root)
     if len(frames) < 2:
         what = "folders with images" if sequences else "images"
         other = _single_images(root) if sequences else _folders(root)
         cause = (
-            "the captures are of the other kind: one image a frame for a coded grid, one folder a frame for Gray code"
+            "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
             if len(other) > 1
-            else "a slip in --images, or images of another format"
+            else "a typing error in --images, or images of another format"
         )
         raise FileError(
             root, f"holds {len(frames)} {what}; a scan needs at least 2 frames", cause,
@@ -83,10 +83,10 @@ def _other_size(path: Path, size: tuple[int, int], usual: tuple[int, int]) -> Fi
     return FileError(
         path,
         f"is {size[0]} x {size[1]} pixels, most images are {usual[0]} x {usual[1]}",
-        "the camera was turned on its side and the picture turned back"
+        "the camera was held on its side and the image rotated afterwards"
         if turned
         else "resized, cropped, or taken by another camera or with another setting",
-        "give all images as the camera took them; intrinsics hold for one size only",
+        "give all images as the camera took them; intrinsics are valid for one size only",
     )
 
 
@@ -105,6 +105,6 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> list[tuple[int, int | str]]:
-    """Order of names in which image 10 comes after image 9."""
+    """Sorting key with which image 10 comes after image 9."""
     parts = re.split(r"(\d+)", path.name)
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts if part]

@@ -1,4 +1,4 @@
-"""What `sl-process` is asked for; the docstrings of the fields are its help text."""
+"""The flags of `sl-process`; the docstrings of the fields are their help text."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,39 +9,40 @@ from sl_nerfstudio.errors import UserError
 
 @dataclass(frozen=True)
 class ProcessConfig:
-    """Make a scan folder from photographs. Every length in it is relative unless one is known."""
+    """Make a scan folder from photographs. Without a known length, its unit is arbitrary."""
 
     images: Path
-    """folder of the captures: one image a frame, or for Gray code one sub-folder of images a frame"""
+    """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame"""
     pattern: Path
-    """pattern.json of the pattern that was projected, as sl-pattern or sl-synth wrote it"""
+    """pattern.json of the projected pattern, as written by sl-pattern or sl-synth"""
     intrinsics: Path
-    """camera, and projector unless it has a file of its own: .json, OpenCV .yml .xml, COLMAP cameras.txt"""
+    """file of the camera, and of the projector unless that has a file itself: .json, OpenCV .yml .xml, COLMAP
+    cameras.txt"""
     output: Path
     """scan folder to write; it must be new or empty"""
     projector_intrinsics: Path | None = None
-    """file of the projector, where --intrinsics describes the camera alone"""
+    """file of the projector, if --intrinsics describes only the camera"""
     projector_model: Literal["OPENCV", "DOE"] | None = None
-    """the projector's model, where its file does not say it; default: what the file says, else OPENCV"""
+    """model of the projector, if its file does not state it; default: what the file states, otherwise OPENCV"""
     procam_step: int = 1
-    """graycode_step that procam-calibration was run with, if the intrinsics are from there"""
-    decoder: Literal["network", "graycode"] | None = None
-    """how captures are decoded; default: as the pattern needs it"""
+    """graycode_step with which procam-calibration was run, if the intrinsics come from it"""
+    decoder: str | None = None
+    """decoder of the captures: network for a coded grid, graycode for Gray code; default: the one for the pattern"""
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
-    50 mm" with pixels x, y; without it the scan's unit is arbitrary"""
+    50 mm" with pixels x, y; without it, the unit of the scan is arbitrary"""
     unordered: bool = False
-    """the frames were not taken one beside the other: every pair is tried"""
+    """the frames were not captured in order around the object: try every pair"""
     poses: Path | None = None
-    """transforms.json with rough camera poses to start from (within 20 degrees); the scan takes over axes and unit"""
+    """transforms.json with rough camera poses to start from (within 20 degrees); the scan gets their axes and unit"""
     refine_projector_focal: bool = False
-    """the projector's focal length is only roughly known: find it from all frames"""
+    """the focal length of the projector is only roughly known: estimate it from all frames"""
     jobs: int | None = None
-    """processes that decode frames side by side; default: one for each core"""
+    """number of processes that decode frames; default: one for each core"""
     work: Path | None = None
-    """where decoded frames are kept for the next run; default: OUTPUT.work"""
+    """folder in which decoded frames are kept for the next run; default: OUTPUT.work"""
     seed: int = 0
-    """of everything random: same captures and flags, same scan"""
+    """seed of all random choices: the same captures and flags give the same scan"""
 
     def check(self) -> None:
         """Raise UserError naming the flag if a value makes no sense."""
@@ -56,5 +57,5 @@ class ProcessConfig:
 
     @property
     def work_folder(self) -> Path:
-        """Where decoded frames are kept."""
+        """The folder in which decoded frames are kept."""
         return self.work or self.output.with_name(self.output.name + ".work")

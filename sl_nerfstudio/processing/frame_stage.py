@@ -1,106 +1,58 @@
-"""The part of the work that every frame needs by itself: decoding, auto-calibration, triangulation."""
+"""The frame stage: every capture decoded and calibrated by itself, in several processes."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
-from sl_nerfstudio.decoding.decoders import DecoderName, Layout, decoder_key, make_decoder
+import numpy as np
+
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.store import DecodedStore
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.processing.captures import CapturedFrame, Captures
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.store import Manifest
+from sl_nerfstudio.progress import track
 
 
-@dataclass(frozen=True)
-class FrameJob:
-    """All that decoding and calibrating frames needs to know, the same for every frame."""
-
-    work: Path
-    decoder: DecoderName
-    layout: Layout
-    camera: Device
-    projector: Device
-    seed: int
-
-
-@dataclass(frozen=True)
-class FrameOutcome:
-    """What came of one frame."""
-
-    frame: CapturedFrame
-    key: str  # of the decoded frame in the store; "" if it could not even be read
-    resumed: bool  # it had been decoded before
-    decode_rate: float  # decoded pixels of those in the mask
-    mask_share: float  # of the image
-    cloud: FrameCloud | None  # None: left out
-    stage: str = ""  # at which the frame failed: "reading", "decoding", "calibrating"
-    reason: str = ""  # problem, cause and remedy, with the file they are about
-
-    @property
-    def name(self) -> str:
-        """The frame's name."""
-        return self.frame.name
+def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
+    """Results of all frames, in the order of the captures; the manifest in the work folder is kept up to date."""
+    found: dict[str, FrameStageResult] = {
+        frame.name: FrameStageResult(frame, stage="reading", reason=str(captures.faults[frame.name]))
+        for frame in captures.frames
+        if frame.name in captures.faults
+    }
+    todo = [frame for frame in captures.frames if frame.name not in found]
+    settings = {"decoder": job.decoder.name, "pattern": str(config.pattern), "images": str(config.images)}
+    manifest = Manifest(job.work, settings)
+    jobs = config.jobs or cores()
+    for result in track(run_frames(job, todo, jobs), "decoding and calibrating", len(todo)):
+        found[result.name] = result
+        done = "decoded before" if result.resumed else "decoded"
+        status = f"failed in {result.stage}" if result.stage else done
+        manifest.note(result.name, result.key, status, result.reason)
+    return [found[frame.name] for frame in captures.frames]
 
 
-class FrameWorker:
-    """Takes frames one after the other; the decoder is made when the first one needs it."""
-
-    def __init__(self, job: FrameJob) -> None:
-        self._job = job
-        self._store = DecodedStore(job.work, decoder_key(job.decoder, job.layout))
-        self._decode: Callable[[Sequence[Path]], Decoded] | None = None
-
-    def __call__(self, frame: CapturedFrame) -> FrameOutcome:
-        """Decode (or load) and calibrate a frame; what the user can mend becomes part of the outcome."""
-        try:
-            key = self._store.key(frame)
-            decoded = self._store.load(frame, key)
-            resumed = decoded is not None
-            if decoded is None:
-                decoded = self._store.save(frame, key, self._decoded(frame))
-        except FileError as error:
-            return FrameOutcome(frame, "", False, 0.0, 0.0, None, "reading", str(error))
-        except DecodingError as error:
-            return FrameOutcome(frame, "", False, 0.0, 0.0, None, "decoding", _about(frame, error))
-        share = float(decoded.mask.mean())
-        try:
-            cloud = self._calibrated(frame, decoded)
-        except RelativePoseError as error:
-            return FrameOutcome(frame, key, resumed, decoded.rate, share, None, "calibrating", _about(frame, error))
-        return FrameOutcome(frame, key, resumed, decoded.rate, share, cloud)
-
-    def load(self, outcome: FrameOutcome) -> Decoded:
-        """The decoded maps of a frame that this worker or another has kept."""
-        decoded = self._store.load(outcome.frame, outcome.key)
-        if decoded is None:
-            raise UserError(
-                f"{self._job.work}: the decoded frame {outcome.name} has gone\n"
-                "    cause:  files were removed while sl-process was running\n    remedy: start again"
-            )
-        return decoded
-
-    def _decoded(self, frame: CapturedFrame) -> Decoded:
-        if self._decode is None:
-            self._decode = make_decoder(self._job.decoder, self._job.layout)
-        return self._decode(frame.images)
-
-    def _calibrated(self, frame: CapturedFrame, decoded: Decoded) -> FrameCloud:
-        job = self._job
-        pose = estimate_relative_pose(*correspondences_of(decoded.coords), job.camera, job.projector, job.seed)
-        return frame_cloud(frame.name, decoded.coords, job.camera, job.projector, pose)
+def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:
+    """One line: how many frames can be used, and how good they are."""
+    resumed = sum(result.resumed for result in results)
+    again = f" ({resumed} had been decoded before)" if resumed else ""
+    clouds = clouds_of(results)
+    begin = f"decoded and calibrated {len(clouds)} of {len(results)} frames{again}"
+    if not clouds:
+        return begin
+    rate = float(np.median([result.decode_rate for result in results if result.cloud is not None]))
+    epipolar = float(np.median([cloud.pose.residual_px for cloud in clouds]))
+    return f"{begin}: {rate:.0%} of the pattern, epipolar residual {epipolar:.2f} px (medians)"
 
 
-def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Iterator[FrameOutcome]:
-    """Outcomes in the order in which they are ready, from `jobs` processes (1: this one)."""
+def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Iterator[FrameStageResult]:
+    """Results in the order in which they are ready, from `jobs` processes (1: this one).
+
+    Raises UserError if a process was killed.
+    """
     if jobs == 1 or len(frames) < 2:
         yield from map(FrameWorker(job), frames)
         return
@@ -110,15 +62,15 @@ def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Ite
             yield future.result()
     except BrokenProcessPool as error:
         raise UserError(
-            f"a process that decoded frames was ended from outside\n    cause:  {jobs} of them need more memory than "
-            "there is\n    remedy: give a smaller number with --jobs; frames decoded so far are kept"
+            f"a process that decoded frames was killed\n    cause:  {jobs} processes need more memory than there is\n"
+            "    remedy: give a smaller number with --jobs; frames decoded so far are kept"
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def cores() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -133,13 +85,7 @@ def _start_worker(job: FrameJob) -> None:
     _worker = FrameWorker(job)
 
 
-def _work(frame: CapturedFrame) -> FrameOutcome:
+def _work(frame: CapturedFrame) -> FrameStageResult:
     if _worker is None:
         raise RuntimeError("a worker process was not set up")
     return _worker(frame)
-
-
-def _about(frame: CapturedFrame, error: UserError) -> str:
-    """The error with the file it is about: the image, or the folder of a sequence."""
-    place = frame.images[0] if len(frame.images) == 1 else frame.images[0].parent
-    return f"{place}: {error}"

@@ -1,4 +1,4 @@
-"""Rough camera poses from a transforms.json, as a start of registration."""
+"""Rough camera poses from a transforms.json, from which registration starts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,22 +24,29 @@ class GivenPoses:
     T_world_camera: Float64[ndarray, "n 4 4"]
     units: str  # "arbitrary" where the file does not say
 
+    @property
+    def known(self) -> Bool[ndarray, "n"]:
+        """Frames that have a pose."""
+        return np.isfinite(self.T_world_camera).all((1, 2))
+
     def chosen(self, frames: Sequence[bool]) -> "GivenPoses":
-        """Those of some frames."""
+        """The poses of some of the frames."""
         return GivenPoses(self.T_world_camera[np.array(frames, dtype=bool)], self.units)
 
 
 def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
-    """`transform_matrix` of every frame of the file whose image is named as one of the captures.
+    """`transform_matrix` of every frame in the file whose image has the name of a capture.
 
-    Raises FileError if the file is faulty or fits fewer than two frames.
+    Raises FileError if the file is faulty or has poses for fewer than two captures.
     """
     document = read_document(path)
     faults = Faults()
     document_faults(document, path.name, faults)
     records = document.get("frames")
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise FileError(path, "frames: is missing or is no list", "no transforms.json", "give one with frames")
+        raise FileError(
+            path, "frames: is missing or is not a list", "the file is no transforms.json", "give one with frames"
+        )
     T = np.full((len(names), 4, 4), np.nan)
     for index, record in enumerate(records):
         name = frame_label(record, index)
@@ -49,24 +56,30 @@ def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
     if faults.found:
         fault = faults.found[0]
         raise FileError(path, f"{fault.frame}: {fault.field} {fault.problem}", fault.cause, fault.remedy)
-    if np.isfinite(T).all((1, 2)).sum() < 2:
-        raise FileError(
-            path, "has poses for fewer than two of the captures", "its images have other names than the captures",
-            "frames are matched by the image's name without folder and ending: rename the one or the other",
-        )  # fmt: skip
     units = document.get("units", "arbitrary")
     if units not in UNITS:
         raise FileError(path, f"units is {units!r}", "an unknown unit", f"give one of {', '.join(UNITS)}")
-    return GivenPoses(T, units)
+    given = GivenPoses(T, units)
+    if given.known.sum() < 2:
+        raise FileError(
+            path,
+            "has poses for fewer than two of the captures",
+            "its images have other names than the captures",
+            "frames are matched by the image's name without folder and ending: rename the images in the file",
+        )
+    return given
 
 
 def align_to(
     given: GivenPoses, T_world_camera: Float64[ndarray, "n 4 4"], registered: Bool[ndarray, "n"]
 ) -> Similarity:
-    """The similarity that moves found camera poses onto the given ones, in least squares."""
-    both = registered & np.isfinite(given.T_world_camera).all((1, 2))
+    """The similarity that maps the registered camera poses onto the given ones, in least squares.
+
+    At least two frames must have both, at different places.
+    """
+    both = registered & given.known
     found, wanted = T_world_camera[both], given.T_world_camera[both]
-    # A point ahead of each camera counts like its place: two cameras alone leave a turn about their line open.
+    # Points on the axes of each camera count, too: the positions of two cameras leave a turn about their line open.
     return fit_similarity(_points(found, _spread(found)), _points(wanted, _spread(wanted)))
 
 

@@ -8,12 +8,12 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.images import as_grey
 
-_SIDE = 170
+_SIDE = 170  # longest side of a picture, pixels
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What was captured and what was decoded from it, RGB in [0, 1]; None where there is nothing to show."""
+    """A capture and its decoded coordinates, RGB in [0, 1]; None where there is nothing to show."""
 
     image: Float32[ndarray, "h w 3"] | None
     coords: Float32[ndarray, "h w 3"] | None
@@ -24,7 +24,7 @@ def make_preview(
     coords: Float32[ndarray, "_h _w 2"] | None,
     size: tuple[int, int],
 ) -> Preview:
-    """Thinned pictures. `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded."""
+    """Reduced pictures. `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded."""
     picture = colours = None
     if image is not None:
         step = _step(image.shape)

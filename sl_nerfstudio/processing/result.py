@@ -1,4 +1,4 @@
-"""What `sl-process` found, for the report and for programs."""
+"""The result of `sl-process`, for the report and for programs."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,18 +8,18 @@ from sl_nerfstudio.processing.config import ProcessConfig
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One frame: its figures, and why it was left out if it was. Figures that do not exist are None."""
+    """The figures of one frame, and why it was left out if it was. Figures that do not exist are None."""
 
     name: str
     in_scan: bool
-    stage: str  # at which it failed: reading, decoding, calibrating, registering; "" if it did not
+    stage: str  # in which it failed: reading, decoding, calibrating, registering; "" if it did not
     reason: str  # problem, cause and remedy
     decode_rate: float | None = None
     mask_share: float | None = None
     epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
     sigma_rotation_deg: float | None = None
     sigma_direction_deg: float | None = None
-    fitness: float | None = None  # share of the judged points that agree with the frames they overlap
+    fitness: float | None = None  # share of the points seen by other frames, too, that agree with them
     baseline: float | None = None  # camera to projector, in the scan's unit
     degeneracies: tuple[str, ...] = ()
 
@@ -46,7 +46,7 @@ class ProcessResult:
     frames: tuple[FrameRecord, ...]
     edges: tuple[EdgeRecord, ...]
     remarks: tuple[str, ...]
-    recapture: tuple[str, ...]  # what to take again or in addition, and why
+    recapture: tuple[str, ...]  # what to capture again or in addition, and why
     joint_px: tuple[float, float] | None  # cross-frame residual before and after the joint adjustment
     versions: dict[str, str]
 

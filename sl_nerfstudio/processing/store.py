@@ -1,4 +1,4 @@
-"""Decoded frames kept between runs: a frame is decoded again only if its images, pattern or decoder changed."""
+"""Decoded frames that are kept between runs: only changed images, patterns or decoders need decoding again."""
 
 import hashlib
 import json
@@ -20,21 +20,21 @@ MANIFEST = "manifest.json"
 
 
 class DecodedStore:
-    """A folder of decoded frames; the name of each file says what it was decoded from."""
+    """A folder of decoded frames; the name of each file contains a digest of what it was decoded from."""
 
     def __init__(self, root: Path, decoder_key: str) -> None:
         self.root = root
         self._decoder_key = decoder_key
 
     def key(self, frame: CapturedFrame) -> str:
-        """Digest of the images' contents and of what decodes them. Raises FileError if one cannot be read."""
+        """Digest of the images' contents and of the decoder. Raises FileError if an image cannot be read."""
         digest = hashlib.sha256(self._decoder_key.encode())
         for path in frame.images:
             digest.update(hashlib.sha256(read_bytes(path)).digest())
         return digest.hexdigest()[:_KEY_LENGTH]
 
     def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
-        """A frame decoded before; None if it was not, or if the file is damaged."""
+        """A frame that was decoded before; None if there is none, or if its file is damaged."""
         path = self._path(frame, key)
         try:
             with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as stored:
@@ -46,7 +46,7 @@ class DecodedStore:
         return Decoded(coords, mask, pattern.astype(np.float32) / np.float32(65535))
 
     def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
-        """Keep a frame; gives it as `load` will, so that a resumed run comes to the same result."""
+        """Store a frame, and return it as `load` will, so that a resumed run gives the same result."""
         buffer = BytesIO()
         pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
         np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern)
@@ -58,7 +58,7 @@ class DecodedStore:
 
 
 class Manifest:
-    """What was done with each frame, in words, beside the decoded frames; written after every frame."""
+    """What happened to each frame, in words, in the folder of the decoded frames; written after every frame."""
 
     def __init__(self, root: Path, settings: dict[str, Any]) -> None:
         self._path = root / MANIFEST
@@ -66,12 +66,12 @@ class Manifest:
         self._frames = self._known()
 
     def note(self, frame: str, key: str, status: str, reason: str = "") -> None:
-        """Note what came of a frame."""
+        """Note what happened to a frame."""
         self._frames[frame] = {"key": key, "status": status, **({"reason": reason} if reason else {})}
         write_atomic(self._path, encode_json({"settings": self._settings, "frames": self._frames}))
 
     def _known(self) -> dict[str, Any]:
-        """What an earlier run noted; nothing if it noted nothing that can be read."""
+        """The notes of an earlier run; none if there are none that can be read."""
         try:
             frames = json.loads(self._path.read_text(encoding="utf-8"))["frames"]
         except (OSError, ValueError, KeyError, TypeError):

@@ -1,7 +1,8 @@
-"""From what the stages left to what the report shows."""
+"""From the results of the stages to what the report shows."""
 
 import importlib.metadata
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,79 +10,99 @@ from sl_nerfstudio import __version__
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_stage import FrameOutcome
+from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
+from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.result import Registration
-from sl_nerfstudio.scan.types import Scale
+
+_ALONE = "too few other frames could be used"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a frame is not in the scan."""
+
+    stage: str  # reading, decoding, calibrating, registering
+    reason: str  # problem, cause and remedy
+
+
+def left_out(result: FrameStageResult, registration: Registration | None) -> Failure | None:
+    """Why a frame cannot be in the scan; None if it was registered. `registration` is None where it was not reached."""
+    if result.cloud is None:
+        return Failure(result.stage, result.reason)
+    if registration is None:
+        return Failure("registering", _ALONE)
+    if registration.registered[registration.names.index(result.name)]:
+        return None
+    exclusion = next(e for e in registration.exclusions if e.frame == result.name)
+    return Failure("registering", exclusion_sentence(exclusion))
 
 
 def summarise(
     config: ProcessConfig,
     decoder: str,
-    outcomes: Sequence[FrameOutcome],
+    results: Sequence[FrameStageResult],
     registration: Registration | None,
-    joint: AdjustedFrames | None,
-    units: str,
-    scale: Scale,
+    poses: ScanPoses | None,
 ) -> ProcessResult:
-    """The result of a run; without `joint` no frame is in a scan."""
-    row = {name: k for k, name in enumerate(registration.names)} if registration is not None else {}
-    frames = tuple(_record(o, registration, joint, row.get(o.name)) for o in outcomes)
+    """The result of a run; without `poses` no frame is in a scan."""
+    frames = tuple(_record(result, registration, poses) for result in results)
     edges = () if registration is None else registration.edges
     records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
+    adjusted = None if poses is None else poses.adjusted
     return ProcessResult(
         config=config,
         decoder=decoder,
-        units=units,
-        scale_source=scale.source if scale.known else "",
+        units="arbitrary" if poses is None else poses.units,
+        scale_source=poses.scale.source if poses is not None and poses.scale.known else "",
         frames=frames,
         edges=records,
-        remarks=_remarks(outcomes, registration, joint),
+        remarks=_remarks(results, registration, adjusted),
         recapture=what_to_recapture(frames, records, not config.unordered),
-        joint_px=None if joint is None else _both_known(joint.median_before_px, joint.median_after_px),
+        joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 
 
 def _remarks(
-    outcomes: Sequence[FrameOutcome], registration: Registration | None, joint: AdjustedFrames | None
+    results: Sequence[FrameStageResult], registration: Registration | None, adjusted: AdjustedFrames | None
 ) -> tuple[str, ...]:
     """What remains uncertain."""
-    placed = () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
-    clouds = [o.cloud for o in outcomes if o.cloud is not None]
-    if joint is None or not clouds:
-        return placed
-    wrong = contradiction(joint.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
-    return (wrong, *placed) if wrong else placed
+    remarks = () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
+    clouds = clouds_of(results)
+    if adjusted is None or not clouds:
+        return remarks
+    wrong = contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+    return (wrong, *remarks) if wrong else remarks
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:
-    """None where no point of one frame was seen by another: there is nothing to compare."""
+    """None where no point of one frame was seen by another: then there is nothing to compare."""
     return (float(before), float(after)) if np.isfinite([before, after]).all() else None
 
 
-def _record(
-    outcome: FrameOutcome, registration: Registration | None, joint: AdjustedFrames | None, k: int | None
-) -> FrameRecord:
-    cloud = outcome.cloud
-    known = outcome.stage not in ("reading", "decoding")
-    rate, share = (outcome.decode_rate, outcome.mask_share) if known else (None, None)
+def _record(result: FrameStageResult, registration: Registration | None, poses: ScanPoses | None) -> FrameRecord:
+    """What is known of one frame."""
+    decoded = result.stage not in ("reading", "decoding")
+    rate, share = (result.decode_rate, result.mask_share) if decoded else (None, None)
+    failure, cloud = left_out(result, registration), result.cloud
     if cloud is None:
-        return FrameRecord(outcome.name, False, outcome.stage, outcome.reason, rate, share)
-    pose = cloud.pose
-    placed = registration is not None and k is not None and bool(registration.registered[k])
-    reason = "" if placed else _exclusion(outcome.name, registration)
+        return FrameRecord(result.name, False, result.stage, result.reason, rate, share)
+    if failure is None and poses is None:
+        failure = Failure("registering", _ALONE)
     baseline = fitness = None
-    if placed and joint is not None and registration is not None and k is not None:
-        baseline = float(joint.poses.baseline[k])
+    if failure is None and poses is not None and registration is not None:
+        k = registration.names.index(result.name)
+        baseline = float(poses.adjusted.poses.baseline[k])
         fitness = float(np.nan_to_num(registration.fitness[k]))
+    pose = cloud.pose
     return FrameRecord(
-        name=outcome.name,
-        in_scan=placed and joint is not None,
-        stage="" if placed else "registering",
-        reason=reason,
+        name=result.name,
+        in_scan=failure is None,
+        stage="" if failure is None else failure.stage,
+        reason="" if failure is None else failure.reason,
         decode_rate=rate,
         mask_share=share,
         epipolar_px=float(pose.residual_px),
@@ -91,10 +112,3 @@ def _record(
         baseline=baseline,
         degeneracies=tuple(map(degeneracy_sentence, pose.degeneracies)),
     )
-
-
-def _exclusion(name: str, registration: Registration | None) -> str:
-    """Why a frame with a relative pose is not in the scan."""
-    if registration is None:
-        return "too few other frames could be used"
-    return next(exclusion_sentence(e) for e in registration.exclusions if e.frame == name)

@@ -1,4 +1,4 @@
-"""The scan folder of the frames that were placed, with the report on all of them."""
+"""The scan folder of the registered frames, with the report on all frames."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -7,76 +7,66 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
-from sl_nerfstudio.decoding.decoders import Layout
-from sl_nerfstudio.pattern.files import encode_gray_code, encode_grid
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.processing.frame_stage import FrameJob, FrameOutcome, FrameWorker
+from sl_nerfstudio.processing.failures import REPORT
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.preview import Preview, make_preview
 from sl_nerfstudio.processing.result import ProcessResult
+from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import read_image
-from sl_nerfstudio.scan.types import Scale
 from sl_nerfstudio.scan.writing import ScanWriter, encode_json
+
+_SUPERSAMPLING = 4  # of pattern.png
 
 
 def write_scan(
     root: Path,
     job: FrameJob,
-    outcomes: Sequence[FrameOutcome],
-    clouds: Sequence[FrameCloud],
-    joint: AdjustedFrames,
-    units: str,
-    scale: Scale,
+    results: Sequence[FrameStageResult],
+    poses: ScanPoses,
     result: ProcessResult,
     make_report: Callable[[ProcessResult, Sequence[Preview]], str],
 ) -> None:
-    """Write all frames that `joint` has poses of. The folder is new, and complete or not there at all."""
-    layout = job.layout
-    picture = layout.finest() if isinstance(layout, GrayCode) else layout.render(4)
-    row = {cloud.name: k for k, cloud in enumerate(clouds)}
+    """Write all frames that are in the scan by `result`. The folder is new, and complete or not there at all."""
+    layout = job.decoder.layout
+    row = {cloud.name: k for k, cloud in enumerate(clouds_of(results))}
     worker = FrameWorker(job)
     size = (job.projector.w, job.projector.h)
     previews: list[Preview] = []
     with ScanWriter(
         root,
-        units=units,
-        scale=scale,
+        units=poses.units,
+        scale=poses.scale,
         projector=job.projector,
-        pattern=np.rint(255 * picture).astype(np.uint8),
+        pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
         camera=job.camera,
     ) as writer:
-        for outcome, record in zip(track(outcomes, "writing"), result.frames, strict=True):
-            image = _image(outcome)
-            cloud = outcome.cloud
+        for frame, record in zip(track(results, "writing"), result.frames, strict=True):
+            image = _image(frame)
+            cloud = frame.cloud
             previews.append(make_preview(image, None if cloud is None else cloud.coords, size))
             if not record.in_scan or cloud is None or image is None:
                 continue
-            decoded, k = worker.load(outcome), row[outcome.name]
+            decoded, k = worker.load(frame), row[frame.name]
             writer.add_frame(
-                outcome.name,
+                frame.name,
                 image=image,
                 coords=cloud.coords,
                 mask=decoded.mask,
                 pattern=np.rint(255 * decoded.pattern).astype(np.uint8),
-                T_world_camera=joint.poses.T_world_camera[k],
-                T_world_projector=joint.poses.T_world_projector[k],
-                pose_sigma=joint.sigma[k],
+                T_world_camera=poses.adjusted.poses.T_world_camera[k],
+                T_world_projector=poses.adjusted.poses.T_world_projector[k],
+                pose_sigma=poses.adjusted.sigma[k],
             )
-        writer.add_file("pattern.json", _description(layout))
+        writer.add_file("pattern.json", layout.encode())
         writer.add_file("processing.json", encode_json(result.document()))
-        writer.add_file("processing.html", make_report(result, previews).encode())
+        writer.add_file(REPORT, make_report(result, previews).encode())
 
 
-def _image(outcome: FrameOutcome) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
-    """The capture (of a Gray-code sequence its first image, in full light); None if it cannot be read."""
+def _image(frame: FrameStageResult) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
+    """The capture (of a sequence its first image, in full light); None if it cannot be read."""
     try:
-        return read_image(outcome.frame.images[0])
+        return read_image(frame.frame.images[0])
     except FileError:
         return None
-
-
-def _description(layout: Layout) -> bytes:
-    return encode_gray_code(layout) if isinstance(layout, GrayCode) else encode_grid(layout)

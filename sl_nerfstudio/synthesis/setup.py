@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.pattern.files import read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
@@ -48,7 +49,7 @@ class Setup:
     caster: Caster
     devices: Pair
     pattern: Float32[ndarray, "h w"]
-    grid: GridPattern | None  # None: the pattern is a plain image
+    layout: PatternLayout | None  # None: the pattern is a plain image
     cells: Cells
     appearance: Appearance
     truth: Poses
@@ -71,7 +72,7 @@ class Setup:
 def make_setup(config: SynthConfig) -> Setup:
     """Scene, devices, paths and their errors, as the configuration says. Raises UserError for bad files."""
     scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
-    pattern, grid = _make_pattern(config)
+    pattern, layout = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
     options = DeviceOptions(
         config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
@@ -87,8 +88,8 @@ def make_setup(config: SynthConfig) -> Setup:
         caster=caster,
         devices=devices,
         pattern=pattern,
-        grid=grid,
-        cells=make_cells(pattern, grid),
+        layout=layout,
+        cells=make_cells(pattern, None if layout is None else layout.lattice),
         appearance=make_appearance(scene, DISTANCE * scene.size, random_stream(config.seed, Stream.TEXTURE)),
         truth=truth,
         start=start,
@@ -96,16 +97,16 @@ def make_setup(config: SynthConfig) -> Setup:
     )
 
 
-def make_cells(pattern: Float32[ndarray, "h w"], grid: GridPattern | None) -> Cells:
-    """The grid's cells; a plain image counts as 40 cells along its longer side."""
+def make_cells(pattern: Float32[ndarray, "h w"], lattice: Lattice | None) -> Cells:
+    """The cells around the nodes; a pattern without nodes counts as 40 cells along its longer side."""
     h, w = pattern.shape
-    if grid is not None:
-        return Cells(grid.period, grid.x0, grid.y0, grid.rows, grid.columns, w, h)
+    if lattice is not None:
+        return Cells(lattice.period, lattice.x0, lattice.y0, lattice.rows, lattice.columns, w, h)
     period = max(w, h) / 40
     return Cells(period, period / 2, period / 2, max(1, round(h / period)), max(1, round(w / period)), w, h)
 
 
-def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], GridPattern | None]:
+def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], PatternLayout | None]:
     if config.pattern is not None:
         return read_pattern(config.pattern)
     grid = GridPattern()

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.pattern.files import encode_grid
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
@@ -156,8 +155,8 @@ def _add(writer: ScanWriter, frame: SyntheticFrame, poses: TwoPoses, truth: TwoP
 
 def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, mesh: str) -> None:
     """The pattern's description and the true surface."""
-    if setup.grid is not None:
-        writer.add_file("pattern.json", encode_grid(setup.grid))
+    if setup.layout is not None:
+        writer.add_file("pattern.json", setup.layout.encode())
     vertices = world_from_scene(config, setup.scene).points(setup.scene.vertices)
     writer.add_file(mesh, encode_ply(vertices, setup.scene.faces))
 
@@ -171,8 +170,8 @@ def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
             write_atomic(output / "images" / f"{frame.name}.png", encode_png(frame.image))
         _add_files(truth, exact, setup, "mesh.ply")
     write_atomic(output / "pattern.png", encode_png(_to_8_bit(setup.pattern)))
-    if setup.grid is not None:
-        write_atomic(output / "pattern.json", encode_grid(setup.grid))
+    if setup.layout is not None:
+        write_atomic(output / "pattern.json", setup.layout.encode())
     intrinsics = {
         "units": config.units,
         **device_fields(setup.devices.camera, "camera_model"),

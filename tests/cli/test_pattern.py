@@ -8,7 +8,7 @@ from PIL import Image
 
 from sl_nerfstudio.cli.pattern import main
 from sl_nerfstudio.pattern.codes import hamming_margin
-from sl_nerfstudio.pattern.files import read_grid, read_layout
+from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.presets import PRESETS
 from sl_nerfstudio.scan.images import read_image
@@ -23,7 +23,7 @@ def _run(monkeypatch, *flags):
 def test_presets(monkeypatch, tmp_path, capsys, preset):
     out = tmp_path / "müster"
     _run(monkeypatch, "--output", out, "--preset", preset)
-    grid = read_grid(out / "pattern.json")
+    grid = read_layout(out / "pattern.json")
     assert (grid.w, grid.h, grid.period) == PRESETS[preset]
     codes = np.asarray(grid.codes)
     assert hamming_margin(codes, rotations=False) == 3 and hamming_margin(codes, rotations=True) == 2
@@ -40,7 +40,7 @@ def test_flags_override_the_preset(monkeypatch, tmp_path):
         monkeypatch, "--output", out, "--width", 320, "--height", 200, "--period", 16, "--line-width", 3, "--gap", 5,
         "--seed", 4, "--print-width", 80,
     )  # fmt: skip
-    grid = read_grid(out / "pattern.json")
+    grid = read_layout(out / "pattern.json")
     assert (grid.w, grid.h, grid.period, grid.line_width, grid.gap, grid.seed) == (320, 200, 16, 3, 5, 4)
     with Image.open(out / "pattern.png") as image:
         assert image.info["dpi"][0] == pytest.approx(320 / 80 * 25.4, rel=1e-3)
@@ -66,7 +66,7 @@ def test_gray_code(monkeypatch, tmp_path, capsys):
         (["--width", "100000"], "too large: give at most 200 nodes a side"),
         (["--seed", "-1"], "--seed -1: seeds are at least 0"),
         (["--print-width", "0"], "--print-width 0: give a width in millimetres above 0"),
-        (["--kind", "gray-code", "--gap", "3"], "--gap: Gray code has none"),
+        (["--kind", "gray-code", "--gap", "3"], "--gap: Gray code has none; set its squares with --cell"),
         (["--kind", "gray-code", "--cell", "0"], "at least 2 x 2 cells"),
     ],
 )

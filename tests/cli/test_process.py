@@ -102,7 +102,7 @@ def test_frames_that_cannot_be_used_are_left_out_by_name(monkeypatch, copy, tmp_
     assert [f.name for f in read_scan(out).frames] == ["pose 1", "pose 2"]
     assert read_scan(out).units == "arbitrary" and not read_scan(out).scale.known
     page = (out / "processing.html").read_text()
-    assert "take this frame again, so that stripes are seen" in page and "2 were left out" in page
+    assert "capture this frame again, with stripes visible" in page and "2 were left out" in page
     document = json.loads((out / "processing.json").read_text())
     assert [f["in_scan"] for f in document["frames"]] == [False, True, True, False]
     manifest = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
@@ -165,6 +165,7 @@ def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_fo
         (["--pattern", "nowhere.json"], "nowhere.json: cannot be read as a pattern description"),
         (["--intrinsics", "nowhere.json"], "nowhere.json: is missing"),
         (["--decoder", "network"], "describes a Gray-code sequence, which --decoder network does not read"),
+        (["--decoder", "netwrok"], "--decoder netwrok: there is no decoder of this name"),
         (["--known-length", "85 mm"], 'known length "85 mm" is not understood'),
         (["--known-length", "baseline of frame 9 = 85 mm"], "--known-length: there is no frame 9"),
         (["--jobs", "0"], "--jobs 0: give at least 1"),
@@ -177,19 +178,18 @@ def test_bad_flags(monkeypatch, captures, tmp_path, capsys, flags, message):
 
 
 def test_wrong_pattern_and_wrong_intrinsics(monkeypatch, captures, tmp_path, capsys):
-    from sl_nerfstudio.pattern.files import encode_gray_code, encode_grid
     from sl_nerfstudio.pattern.graycode import GrayCode
     from sl_nerfstudio.pattern.grid import GridPattern
 
     other = tmp_path / "other.json"
     rest = [*captures.flags[:2], *captures.flags[4:], "--output", tmp_path / "s", "--jobs", "1"]
-    other.write_bytes(encode_gray_code(GrayCode(800, 800, 8)))
+    other.write_bytes(GrayCode(800, 800, 8).encode())
     said = _fails(monkeypatch, capsys, *rest, "--pattern", other)
     assert "holds 34 images, the sequence of the pattern has 30" in said and "another sequence" in said
-    other.write_bytes(encode_grid(GridPattern()))
+    other.write_bytes(GridPattern().encode())
     said = _fails(monkeypatch, capsys, *rest, "--pattern", other)
-    assert "holds 0 images; a scan needs at least 2 frames" in said and "of the other kind" in said
-    other.write_bytes(encode_gray_code(GrayCode(1280, 720, 4)))
+    assert "holds 0 images; a scan needs at least 2 frames" in said and "do not suit the pattern" in said
+    other.write_bytes(GrayCode(1280, 720, 4).encode())
     said = _fails(monkeypatch, capsys, *rest, "--pattern", other)
     assert "projector was calibrated at 800 x 800, but the images are 1280 x 720" in said
     intrinsics = json.loads((captures.root / "intrinsics.json").read_text())

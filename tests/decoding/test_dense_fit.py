@@ -1,10 +1,11 @@
-"""Sharpening coordinates on images whose coordinates are known."""
+"""Coordinates refined on images whose coordinates are known."""
 
 import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.dense_fit import draw_sharpnesses, fit_densely
+from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
+from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
 from sl_nerfstudio.pattern.grid import GridPattern
 
 GRID = GridPattern(w=400, h=400, codes=np.random.default_rng(3).integers(0, 5, (20, 20)).astype(np.int8))
@@ -30,7 +31,7 @@ def photograph(coords, blur, noise, rng):
 @pytest.mark.parametrize(
     "pixels, blur, noise, bound", [(10, 0.6, 0.01, 0.10), (20, 1.0, 0.01, 0.05), (12, 1.6, 0.05, 0.4)]
 )
-def test_errors_of_the_network_are_taken_out(pixels, blur, noise, bound):
+def test_errors_of_the_network_are_removed(pixels, blur, noise, bound):
     rng = np.random.default_rng(0)
     truth = surface(pixels)
     image = photograph(truth, blur, noise, rng)
@@ -42,8 +43,8 @@ def test_errors_of_the_network_are_taken_out(pixels, blur, noise, bound):
     assert np.median(agreement) > (0.9 if noise < 0.02 else 0.6)
 
 
-def test_a_dark_photograph_is_sharpened_as_a_bright_one():
-    """Lit to one side by twice as much as to the other, and exposed by a fifth of the light."""
+def test_a_dark_photograph_gives_the_same_as_a_bright_one():
+    """Lit twice as much on one side as on the other, and exposed with a fifth of the light."""
     truth = surface(14)
     image = photograph(truth, 0.8, 0.002, np.random.default_rng(0))
     grids = draw_sharpnesses(GRID.render(), 20.0)

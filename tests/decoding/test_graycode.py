@@ -42,7 +42,7 @@ def test_mask_and_pattern_image(decoded):
     inside = decoded.decoded & LIT
     from sl_nerfstudio.pattern.image import sample_bilinear
 
-    expected = sample_bilinear(LAYOUT.finest(), COORDS)[inside]
+    expected = sample_bilinear(LAYOUT.render(), COORDS)[inside]
     assert np.corrcoef(expected, decoded.pattern[inside])[0, 1] > 0.9
 
 

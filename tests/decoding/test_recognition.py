@@ -1,4 +1,4 @@
-"""Which node is which: the graph network, window matching, and pieces that hang together."""
+"""Which node is which: the graph network, window matching, and consensus among neighbours."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from benchmarks.baselines.window_matching import match_windows
 from sl_nerfstudio.decoding.grid.consensus import agree
 from sl_nerfstudio.decoding.grid.gcn import one_hot, turned_pattern
 from sl_nerfstudio.decoding.grid.graph import OFFSETS, GridGraph, neighbourhoods
-from sl_nerfstudio.decoding.grid.network_decoder import NetworkDecoder
+from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
 from sl_nerfstudio.pattern.codes import code_array, rotate_codes
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, damage_graph
@@ -17,8 +17,8 @@ CODES = code_array(20, 24, seed=5)
 
 
 @pytest.fixture(scope="module")
-def decoder():
-    return NetworkDecoder(GridPattern(w=480, h=400, codes=CODES))
+def recogniser():
+    return NodeRecogniser(GridPattern(w=480, h=400, codes=CODES))
 
 
 def graphs(damage, count=6):
@@ -49,10 +49,10 @@ def test_turned_pattern_lists_every_node_of_every_turn():
         (Damage(0.2, 0.1, torn=True), 0.06),
     ],
 )
-def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(decoder, damage, most_wrong):
+def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(recogniser, damage, most_wrong):
     right = wrong = total = 0
     for graph in graphs(damage):
-        assignment = decoder.assign(graph.as_grid())
+        assignment = recogniser.assign(graph.as_grid())
         assert assignment.turn == graph.turn
         same = (assignment.place == graph.place).all(-1)
         right, total = right + same.sum(), total + len(same)
@@ -60,13 +60,13 @@ def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(decoder, d
     assert right > 0.93 * total and wrong <= most_wrong * total
 
 
-def test_the_graph_network_beats_window_matching_on_damaged_graphs(decoder):
+def test_the_graph_network_beats_window_matching_on_damaged_graphs(recogniser):
     pattern = turned_pattern(CODES)
     for misread in (0.1, 0.2, 0.3):
         network = windows = total = 0
         for graph in graphs(Damage(misread, 0.2)):
             around = neighbourhoods(graph.neighbour)
-            judged = decoder.judge(torch.from_numpy(graph.score), around).argmax(1).numpy()
+            judged = recogniser.logits(torch.from_numpy(graph.score), around).argmax(1).numpy()
             true = (pattern.turn == graph.turn) & (pattern.place[:, None] == graph.place).all(-1).T  # node, candidate
             rows = np.arange(len(graph.place))
             network += true[rows, judged].sum()
@@ -76,7 +76,7 @@ def test_the_graph_network_beats_window_matching_on_damaged_graphs(decoder):
         assert network > windows + 0.1 * total
 
 
-def test_window_matching_mends_one_symbol_and_is_sure_without_damage():
+def test_window_matching_corrects_one_symbol_and_is_certain_without_damage():
     pattern = turned_pattern(CODES)
     rng = np.random.default_rng(0)
     graph = damage_graph(rng, CODES, Damage(0, 0, 0), 1, 1.0)
@@ -91,7 +91,7 @@ def test_window_matching_mends_one_symbol_and_is_sure_without_damage():
         assert (pattern.turn[matched[matched >= 0]] == 1).all()
 
 
-def test_small_pieces_that_fit_several_places_are_given_up():
+def test_small_pieces_that_fit_several_places_are_dropped():
     codes = np.tile(np.arange(4, dtype=np.int8).reshape(2, 2), (6, 6))  # the same windows everywhere
     index = np.arange(9).reshape(3, 3)
     neighbour = np.full((9, 4), -1, dtype=np.int32)
@@ -100,10 +100,10 @@ def test_small_pieces_that_fit_several_places_are_given_up():
     score = np.eye(5, dtype=np.float32)[codes[4:7, 4:7].reshape(-1)]
     belief = np.full((9, 12, 12), -8, dtype=np.float32)
     for k in range(9):
-        belief[k, 4 + k // 3, 4 + k % 3] = 0  # every node is sure of itself, and all agree
+        belief[k, 4 + k // 3, 4 + k % 3] = 0  # every node is certain, and all agree
     graph = GridGraph(np.zeros((9, 2), np.float32), neighbour, score)
     assert not agree(belief, graph, codes, 0).known.any()
     unique = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
-    sure = GridGraph(graph.place, neighbour, np.eye(5, dtype=np.float32)[unique[4:7, 4:7].reshape(-1)])
-    settled = agree(belief, sure, unique, 0)
+    certain = GridGraph(graph.place, neighbour, np.eye(5, dtype=np.float32)[unique[4:7, 4:7].reshape(-1)])
+    settled = agree(belief, certain, unique, 0)
     assert settled.known.all() and (settled.place[0] == (4, 4)).all()

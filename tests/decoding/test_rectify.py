@@ -1,11 +1,11 @@
-"""Finding scale and roll of the grid, and the view made by them."""
+"""Period and roll of the grid, and the image rectified by them."""
 
 import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.channels import VIEW_PERIOD, network_channels
-from sl_nerfstudio.decoding.grid.rectify import GridLook, guess_looks, rectify
+from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD, network_channels
+from sl_nerfstudio.decoding.grid.rectify import GridAppearance, guess_appearances, rectify
 from sl_nerfstudio.decoding.grid.unet import MULTIPLE
 from sl_nerfstudio.pattern.grid import GridPattern
 
@@ -23,39 +23,39 @@ def capture(pixels_a_period, roll_deg, size=300):
 @pytest.mark.parametrize("pixels", [8, 12, 20, 30])
 @pytest.mark.parametrize("roll", [0, 20, -33, 70])
 def test_period_and_roll_are_found(pixels, roll):
-    look = guess_looks(capture(pixels, roll))[0]
-    off = (np.degrees(look.roll) - roll + 45) % 90 - 45  # quarter turns are not told apart here
+    found = guess_appearances(capture(pixels, roll))[0]
+    off = (np.degrees(found.roll) - roll + 45) % 90 - 45  # up to quarter turns
     assert abs(off) < 4
-    assert abs(np.log(look.period / pixels)) < 0.12
-    assert abs(look.roll) <= np.pi / 4
+    assert abs(np.log(found.period / pixels)) < 0.12
+    assert abs(found.roll) <= np.pi / 4
 
 
-def test_a_blank_image_has_no_look():
-    assert guess_looks(np.full((200, 300), 0.3, np.float32)) == []
+def test_a_blank_image_has_no_grid():
+    assert guess_appearances(np.full((200, 300), 0.3, np.float32)) == []
 
 
 @pytest.mark.parametrize("shape", [(90, 130), (40, 500), (128, 128)])
-def test_small_images_are_looked_at_too(shape):
-    assert guess_looks(capture(12, 0, 500)[: shape[0], : shape[1]])
+def test_small_images_are_searched_too(shape):
+    assert guess_appearances(capture(12, 0, 500)[: shape[0], : shape[1]])
 
 
-def test_the_view_shows_what_its_map_says():
+def test_the_rectified_image_agrees_with_its_map():
     image = np.zeros((200, 260), np.float32)
     image[150, 70] = 1
     soft = cv2.GaussianBlur(image, (0, 0), 3)
-    for look in (GridLook(10.0, 0.3), GridLook(28.0, -0.6), GridLook(14.0, 0.0)):
-        view = rectify(soft, look)
-        assert view.image.shape[0] % MULTIPLE == 0 and view.image.shape[1] % MULTIPLE == 0
-        y, x = np.mgrid[: view.image.shape[0], : view.image.shape[1]] + 0.5
-        found = np.array([(view.image * x).sum(), (view.image * y).sum()]) / view.image.sum()
-        assert np.allclose(found, view.from_image @ (70.5, 150.5, 1), atol=0.1)
-        assert np.isclose(np.sqrt(np.linalg.det(view.from_image[:, :2])), VIEW_PERIOD / look.period)
+    for appearance in (GridAppearance(10.0, 0.3), GridAppearance(28.0, -0.6), GridAppearance(14.0, 0.0)):
+        rectified = rectify(soft, appearance)
+        assert rectified.image.shape[0] % MULTIPLE == 0 and rectified.image.shape[1] % MULTIPLE == 0
+        y, x = np.mgrid[: rectified.image.shape[0], : rectified.image.shape[1]] + 0.5
+        found = np.array([(rectified.image * x).sum(), (rectified.image * y).sum()]) / rectified.image.sum()
+        assert np.allclose(found, rectified.from_image @ (70.5, 150.5, 1), atol=0.1)
+        assert np.isclose(np.sqrt(np.linalg.det(rectified.from_image[:, :2])), RECTIFIED_PERIOD / appearance.period)
 
 
-def test_the_view_of_a_turned_grid_is_upright():
-    view = rectify(capture(20, 30), GridLook(20.0, np.radians(30)))
-    look = guess_looks(view.image)[0]
-    assert abs(np.degrees(look.roll)) < 4 and abs(look.period / VIEW_PERIOD - 1) < 0.1
+def test_a_turned_grid_is_upright_afterwards():
+    rectified = rectify(capture(20, 30), GridAppearance(20.0, np.radians(30)))
+    found = guess_appearances(rectified.image)[0]
+    assert abs(np.degrees(found.roll)) < 4 and abs(found.period / RECTIFIED_PERIOD - 1) < 0.1
 
 
 def test_channels_do_not_change_with_exposure():

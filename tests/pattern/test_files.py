@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import encode_grid, read_grid, read_pattern
+from sl_nerfstudio.pattern.files import LAYOUTS, read_layout, read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import encode_png
+from tests.pattern.ramps import Ramps
 
 
 @pytest.fixture
@@ -19,14 +20,34 @@ def grid():
 @pytest.fixture
 def path(grid, tmp_path):
     path = tmp_path / "pattern.json"
-    path.write_bytes(encode_grid(grid))
+    path.write_bytes(grid.encode())
     return path
 
 
 def test_a_grid_comes_back(grid, path):
-    back = read_grid(path)
+    back = read_layout(path)
     assert np.array_equal(back.codes, grid.codes)
     assert np.array_equal(back.render(), grid.render())
+
+
+def test_every_row_of_the_codes_is_one_line(grid, path):
+    """The format is fixed: decoded frames are found again by a digest of this text."""
+    text = path.read_text()
+    document = json.loads(text)
+    codes = document.pop("codes")
+    rows = ",\n  ".join("[" + ",".join(map(str, row)) + "]" for row in codes)
+    assert text == json.dumps(document, indent=1)[:-2] + f',\n "codes": [\n  {rows}\n ]\n}}\n'
+    assert list(document)[:5] == ["sl_pattern", "kind", "image", "w", "h"]
+    assert codes == np.asarray(grid.codes).tolist()
+
+
+def test_a_new_kind_of_pattern_is_one_entry(monkeypatch, tmp_path):
+    monkeypatch.setitem(LAYOUTS, "ramps", Ramps)
+    path = tmp_path / "pattern.json"
+    path.write_bytes(Ramps(40, 30).encode())
+    assert read_layout(path) == Ramps(40, 30)
+    image, layout = read_pattern(path)
+    assert layout == Ramps(40, 30) and layout.lattice is None and image.shape == (30, 40)
 
 
 def test_the_margins_are_stated(path):
@@ -39,15 +60,16 @@ def test_the_margins_are_stated(path):
 def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path):
     picture, described = tmp_path / "pattern.png", read_pattern(path)
     picture.write_bytes(encode_png(np.rint(255 * grid.render()).astype(np.uint8)))
-    image, no_grid = read_pattern(picture)
-    assert no_grid is None and described[1] is not None
+    image, no_layout = read_pattern(picture)
+    assert no_layout is None and described[1].kind == "grid"
     np.testing.assert_allclose(image, described[0], atol=0.5 / 255 + 1e-6)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "dots"}, '"kind" is neither "grid" nor "gray-code"'),
+        ({"kind": "dots"}, 'this describes no pattern: "kind" must be one of "grid", "gray-code"'),
+        ({"kind": ["grid"]}, "this describes no pattern"),
         ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
         ({"period": None}, "contradicts itself"),
         ({"codes": [[0, 1], [2]]}, "contradicts itself"),
@@ -58,7 +80,7 @@ def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path
 def test_faulty_descriptions(path, change, message):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(UserError, match=message) as caught:
-        read_grid(path)
+        read_layout(path)
     assert str(path) in str(caught.value)
 
 
@@ -67,7 +89,7 @@ def test_a_missing_field(path):
     del document["line_width"]
     path.write_text(json.dumps(document))
     with pytest.raises(UserError, match="line_width is missing; write the file again"):
-        read_grid(path)
+        read_layout(path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "nonsense"])

@@ -1,10 +1,11 @@
 """Gray code: neighbours differ in one bit, and the sequence shows the bits."""
 
+import json
+
 import numpy as np
 import pytest
 
-from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import encode_gray_code, read_grid, read_layout, read_pattern
+from sl_nerfstudio.pattern.files import read_layout, read_pattern
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
 
 
@@ -27,7 +28,10 @@ def test_the_sequence_spells_the_cell_of_every_pixel(layout):
         cell = np.arange(size) // layout.cell
         expected = np.broadcast_to(cell if axis == 0 else cell[:, None], code.shape)
         assert np.array_equal(ungray(code, layout.bits[axis]), expected)
-    assert layout.finest().shape == (layout.h, layout.w)
+    picture = layout.render()
+    assert picture.shape == (layout.h, layout.w) and np.array_equal(picture, layout.render(4))
+    finest = [images[layout.bit_images(axis)[-1][0]] / 255 for axis in (0, 1)]
+    np.testing.assert_allclose(picture, (finest[0] + finest[1]) / 2)
 
 
 def test_full_hd_in_cells_of_two_pixels_is_42_images():
@@ -37,12 +41,18 @@ def test_full_hd_in_cells_of_two_pixels_is_42_images():
 
 def test_the_description_comes_back(tmp_path):
     path = tmp_path / "pattern.json"
-    path.write_bytes(encode_gray_code(GrayCode(1280, 720, 4)))
+    path.write_bytes(GrayCode(1280, 720, 4).encode())
     assert read_layout(path) == GrayCode(1280, 720, 4)
-    image, grid = read_pattern(path)
-    assert grid is None and np.array_equal(image, GrayCode(1280, 720, 4).finest())
-    with pytest.raises(UserError, match="describes a Gray-code sequence, where a coded grid is needed"):
-        read_grid(path)
+    image, layout = read_pattern(path)
+    assert layout == GrayCode(1280, 720, 4) and np.array_equal(image, layout.render())
+    assert layout.lattice is None
+
+
+def test_the_sequence_is_listed_in_the_description():
+    document = json.loads(GrayCode(8, 4, 2).encode())
+    assert document["sequence"] == [
+        "white", "black", "x bit 1", "x bit 1 inverse", "x bit 0", "x bit 0 inverse", "y bit 0", "y bit 0 inverse",
+    ]  # fmt: skip
 
 
 def test_sizes_that_make_no_sequence():

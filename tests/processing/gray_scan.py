@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.pattern.files import encode_gray_code
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.image import sample_bilinear
 from sl_nerfstudio.scan.images import encode_png
@@ -51,7 +50,7 @@ def make_gray_scan(root: Path, frames=4, resolution=160, noise=0.006, **config) 
             path = root / "images" / f"pose {k}" / f"{number}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_png(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)))
-    (root / "pattern.json").write_bytes(encode_gray_code(LAYOUT))
+    (root / "pattern.json").write_bytes(LAYOUT.encode())
     document = {
         "camera": device_fields(setup.devices.camera, "model"),
         "projector": device_fields(setup.devices.projector, "model"),

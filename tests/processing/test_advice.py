@@ -1,4 +1,4 @@
-"""What is to be taken again is said, with the reason."""
+"""What to capture again, with the reason."""
 
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
@@ -25,16 +25,16 @@ def test_every_reason_is_named():
         _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
     ]
     said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)
-    assert said[0] == "b: take it again; it was left out (b.png: is black)"
-    assert said[1].startswith("between c and d: add a view")
+    assert said[0] == "b: capture it again; it was left out (b.png: is black)"
+    assert said[1].startswith("between c and d: add a frame; the two share too little of the surface")
     text = "\n".join(said)
     assert "a: only 30% of the pattern was decoded" in text
-    assert "c: all points lie in one plane" in text and "c: the pattern fills 1.0% of the image" in text
-    assert "d: 40% of its points agree" in text
+    assert "c: all points lie in one plane" in text and "c: the pattern fills only 1.0% of the image" in text
+    assert "d: only 40% of its points agree" in text
 
 
-def test_unordered_frames_that_hang_by_one_other():
+def test_unordered_frames_with_a_single_connection():
     frames = [_frame(n) for n in "abcd"]
     edges = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a"), _edge("c", "d")]
     said = what_to_recapture(frames, edges, ordered=False)
-    assert said == ("near d: add a view; only one other frame overlaps it",)
+    assert said == ("near d: add a frame; only one other frame overlaps it",)

@@ -1,4 +1,4 @@
-"""Captures are found in their order, and those that do not belong are named."""
+"""Captures are found in their order, and faulty ones are named."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     captures = find_captures(tmp_path, sequences=False)
     assert sorted(captures.faults) == ["f1", "f2", "f4"]
     turned, empty, large = (str(captures.faults[k]) for k in ("f1", "f2", "f4"))
-    assert "f1.png: is 12 x 16 pixels, most images are 16 x 12" in turned and "turned on its side" in turned
+    assert "f1.png: is 12 x 16 pixels, most images are 16 x 12" in turned and "held on its side" in turned
     assert "f2.png: is empty" in empty
     assert "f4.png: is 32 x 24 pixels" in large and "resized, cropped" in large
     assert all("remedy:" in text for text in (turned, empty, large))
@@ -51,8 +51,12 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
-        (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*the other kind: one image a frame for a coded grid"),
-        (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*the other kind"),
+        (
+            False,
+            ["x/1.png", "y/1.png"],
+            "holds 0 images.*\n.*do not suit the pattern: a coded grid needs",
+        ),
+        (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
     ],
 )

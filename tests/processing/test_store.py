@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.decoded import Decoded
-from sl_nerfstudio.decoding.decoders import decoder_key
+from sl_nerfstudio.decoding.decoders import DECODERS
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
@@ -62,10 +62,10 @@ def test_damaged_files_count_as_not_decoded(tmp_path, frame, decoded):
 
 def test_patterns_have_keys_of_their_own():
     keys = {
-        decoder_key("graycode", GrayCode(32, 24, 2)),
-        decoder_key("graycode", GrayCode(32, 24, 4)),
-        decoder_key("network", GridPattern(w=160, h=120)),
-        decoder_key("network", GridPattern(w=160, h=120, seed=1)),
+        DECODERS["graycode"](GrayCode(32, 24, 2)).key,
+        DECODERS["graycode"](GrayCode(32, 24, 4)).key,
+        DECODERS["network"](GridPattern(w=160, h=120)).key,
+        DECODERS["network"](GridPattern(w=160, h=120, seed=1)).key,
     }
     assert len(keys) == 4
 

@@ -1,8 +1,8 @@
 """Decoding of Gray-code sequences with inverse images.
 
-A bit is read by comparing an image with its inverse; what light of the scene itself (interreflection, scattering)
-does to it is judged as in Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light" (2007),
-from the direct and the global light of the finest stripes (Nayar et al. 2006).
+A bit is read by comparing an image with its inverse. Indirect light (interreflection, scattering) can make a bit
+uncertain; this is judged as in Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light"
+(2007), from the direct and the global light of the finest stripes (Nayar et al. 2006).
 """
 
 from collections.abc import Sequence
@@ -19,12 +19,16 @@ from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
 from sl_nerfstudio.scan.images import as_grey
 
 Image = UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]
-_FINEST = 4  # bits of each axis whose stripes tell direct from global light; the finest alone may be out of focus
-_LEAST_DIRECT = 0.02  # of full scale: with less light no bit can be told from noise
-_UNCERTAIN = 0.08  # of the direct light: an image and its inverse nearer to each other than this tell nothing
+# Pixels that count as lit.
+_FINEST = 4  # bits of each axis that separate direct from global light; the finest alone may be out of focus
+_LEAST_DIRECT = 0.02  # of full scale: with less light, bits are lost in the noise
 _LEAST_SIGNAL = 4.0  # times the noise
+# Bits that count as certain.
+_UNCERTAIN = 0.08  # of the direct light: the smallest difference of an image and its inverse that decides a bit
+# Captures that are refused.
 _LEAST_LIT = 0.002  # of the image: with less, the pattern counts as not seen
-_LEAST_DECODED = 0.02  # of what is lit
+_LEAST_DECODED = 0.02  # of the lit pixels
+# Regions that are kept.
 _LARGEST_STEP = 3.0  # cells between neighbouring pixels of one surface
 _LEAST_REGION = 60  # pixels
 
@@ -34,7 +38,7 @@ class Light:
     """Direct and global light of every pixel, of full scale."""
 
     direct: Float32[ndarray, "h w"]
-    ambient: Float32[ndarray, "h w"]  # global light: of the whole scene, not of the pixel's own ray
+    ambient: Float32[ndarray, "h w"]  # global light: from the whole scene, not from the pixel's own ray
     signal: Float32[ndarray, "h w"]  # mean difference of the images from their inverse
     noise: float  # standard deviation of an image
 
@@ -45,11 +49,11 @@ class Light:
 
 
 def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
-    """Coordinates of every pixel from the photographs of one sequence, in the order they were projected.
+    """Coordinates of every pixel from the photographs of one sequence, in the order of projection.
 
-    Grey or RGB, 8 or 16 bit, all of one size. Coordinates are refined below the size of a cell by the places where the
-    difference of an image and its inverse changes sign. Raises DecodingError if the sequence is not complete or of
-    several sizes, or if nothing can be read from it.
+    Grey or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
+    the difference of an image and its inverse changes sign. Raises DecodingError if the sequence is incomplete, if its
+    images have several sizes, or if nothing can be decoded.
     """
     _check_sequence(images, layout)
     light = separate(images, layout)
@@ -75,7 +79,7 @@ def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
 
 
 def separate(images: Sequence[Image], layout: GrayCode) -> Light:
-    """Light of every pixel; direct and global from the finest stripes, whose dark and bright halves are equal."""
+    """Light of every pixel: direct and global light from the finest stripes, half of which are dark."""
     pairs = [layout.bit_images(axis) for axis in (0, 1)]
     highest = signal = np.zeros(images[0].shape[:2], dtype=np.float32)
     lowest = np.full_like(highest, np.inf)
@@ -86,7 +90,7 @@ def separate(images: Sequence[Image], layout: GrayCode) -> Light:
             p, q = as_grey(images[direct]), as_grey(images[inverse])
             signal = signal + np.abs(p - q)
             if k == 0:
-                sums.append(p + q)  # the same light by two pairs of images: what differs is noise
+                sums.append(p + q)  # the same light in two pairs of images: the difference is noise
             if k >= fine:
                 highest = np.maximum(highest, np.maximum(p, q))
                 lowest = np.minimum(lowest, np.minimum(p, q))
@@ -96,7 +100,7 @@ def separate(images: Sequence[Image], layout: GrayCode) -> Light:
 
 
 def check_count(count: int, layout: GrayCode) -> None:
-    """Raise DecodingError unless `count` images are one for each pattern of the sequence."""
+    """Raise DecodingError unless there is one image for each pattern of the sequence."""
     if count != layout.images:
         raise DecodingError(
             f"holds {count} images, the sequence of the pattern has {layout.images}",
@@ -112,7 +116,7 @@ def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
     if len(sizes) > 1:
         raise DecodingError(
             f"holds images of several sizes ({', '.join(sizes)})",
-            "pictures of another camera or resolution lie between those of the sequence",
+            "the folder holds images of another camera or resolution, too",
             "keep one folder for each frame, with nothing but its own images",
         )
 
@@ -128,7 +132,7 @@ def _check_light(images: Sequence[Image], light: Light) -> None:
         {"black": "the exposure was far too short, the lens covered, or the projector off",
          "white": "the exposure was far too long",
          "not changing": "the projector was off, or its light missed what the camera sees"}[what],
-        "take this frame again, so that stripes are seen on the object in every image but white and black",
+        "capture this frame again, with stripes visible on the object in every image except white and black",
     )  # fmt: skip
 
 
@@ -137,31 +141,31 @@ def _read_cells(images: Sequence[Image], layout: GrayCode, axis: int, light: Lig
     places = layout.bit_images(axis)
     bits = len(places)
     code = np.zeros(light.lit.shape, dtype=np.int32)
-    doubtful = np.zeros_like(code)
+    uncertain = np.zeros_like(code)
     differences = np.empty((bits, *code.shape), dtype=np.int16)
     for k, (direct, inverse) in enumerate(places):
         p, q = as_grey(images[direct]), as_grey(images[inverse])
         difference = p - q
         value = np.int32(1 << (bits - 1 - k))
         code += value * (difference > 0)
-        doubtful += value * _doubtful(p, q, light)
+        uncertain += value * _uncertain(p, q, light)
         differences[k] = np.rint(difference * 32767)
     cell = ungray(code, bits)
     level = np.full(code.shape, -1, dtype=np.int8)
     for coarser in reversed(range(LEVELS)):
-        # A bit in doubt does no harm where the cell ends and its neighbour differs in just that bit.
+        # An uncertain bit is harmless at the border of two cells that differ in just that bit.
         c = cell >> coarser
         harmless = ((code >> coarser) ^ gray(c - 1)) | ((code >> coarser) ^ gray(c + 1))
-        level[(doubtful >> coarser) & ~harmless == 0] = coarser
+        level[(uncertain >> coarser) & ~harmless == 0] = coarser
     level[~light.lit | (cell >= (layout.columns, layout.rows)[axis])] = -1
     return Cells(cell, level, differences)
 
 
-def _doubtful(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Light) -> Bool[ndarray, "h w"]:
-    """Where a bit cannot be told from image `p` and inverse `q`.
+def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Light) -> Bool[ndarray, "h w"]:
+    """Where image `p` and its inverse `q` do not decide a bit.
 
-    Their difference is the direct light plus a share of the global light between -1 and 1 (or minus the first): its
-    sign is certain if it is larger than global light could make it with the wrong sign.
+    Their difference is plus or minus the direct light, plus a share of the global light between -1 and 1. Its sign is
+    certain if it is larger than what global light alone could cause with the wrong sign.
     """
     difference = np.abs(p - q)
     noise = 2 * np.sqrt(2) * light.noise
@@ -169,7 +173,7 @@ def _doubtful(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Lig
 
 
 def _stripe_image(images: Sequence[Image], layout: GrayCode, axis: int, light: Light) -> Float32[ndarray, "h w"]:
-    """The finest stripes of an axis in [0, 1], free of albedo and shading."""
+    """The finest stripes of an axis in [0, 1], with albedo and shading removed."""
     direct, inverse = layout.bit_images(axis)[-1]
     difference = as_grey(images[direct]) - as_grey(images[inverse])
     return np.clip(0.5 + difference / (2 * np.maximum(light.direct, _LEAST_DIRECT)), 0, 1).astype(np.float32)

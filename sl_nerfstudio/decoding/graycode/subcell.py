@@ -1,8 +1,8 @@
 """Coordinates finer than the cells of a Gray code.
 
-Between two neighbouring cells exactly one bit changes, and the difference of its image and its inverse is zero right on
-the border, whatever albedo and shading: borders are found to a fraction of a camera pixel. A plane through the borders
-around a pixel gives its coordinate.
+Between two neighbouring cells exactly one bit changes, and the difference of its image and its inverse is zero exactly
+on the border, whatever albedo and shading are. So borders are found to a fraction of a camera pixel, and a plane
+through the borders around a pixel gives its coordinate.
 """
 
 from dataclasses import dataclass
@@ -14,27 +14,28 @@ from numpy import ndarray
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.geometry.plane_fit import solve_plane
 
+LEVELS = 3  # a pixel is used if fewer of its finest bits than this are uncertain
+# The plane through the borders around a pixel.
 _LEAST_BORDERS = 4
 _SMALLEST_WINDOW, _LARGEST_WINDOW = 2, 10  # pixels to each side
-_INLIER = 0.5  # cells
-_MISREAD = 1.0  # cells: a pixel whose own cell ends farther than this from the plane was misread
-LEVELS = 3  # a pixel is used if at most this number minus one of its finest bits are in doubt
+_INLIER = 0.5  # cells from the plane
+_MISREAD = 1.0  # cells: a pixel whose own cell is farther than this from the plane was misread
 
 
 @dataclass(frozen=True)
 class Cells:
-    """What was read of every pixel along one axis."""
+    """The cells of all pixels along one axis."""
 
-    cell: Int32[ndarray, "h w"]  # number of the cell; its last bits mean nothing where `level` is above 0
-    level: Int8[ndarray, "h w"]  # how many of the finest bits are in doubt; -1: the cell is not known
+    cell: Int32[ndarray, "h w"]  # index of the cell; its last `level` bits are uncertain
+    level: Int8[ndarray, "h w"]  # number of the finest bits that are uncertain; -1: the cell is unknown
     difference: Int16[ndarray, "bits h w"]  # image minus inverse of every bit, coarse to fine
 
 
 def subcell_coordinates(cells: Cells, count: int) -> Float32[ndarray, "h w"]:
-    """Coordinate of every pixel in cells, of which there are `count`; NaN where it cannot be told.
+    """Coordinate of every pixel in cells, of which there are `count`; NaN where it is unknown.
 
-    The first cell reaches from 0 to 1. Where stripes are out of focus, the borders of coarser bits serve. Where
-    borders are too few, the centres of the cells around a pixel stand in for them.
+    The first cell extends from 0 to 1. Where stripes are out of focus, the borders of coarser bits are used. Where
+    there are too few borders, the mean of the cells around a pixel is used instead.
     """
     right, down = _borders(cells.cell, cells.level, cells.difference)
     pixels, borders = int((cells.level >= 0).sum()), int((right >= 0).sum() + (down >= 0).sum())
@@ -47,7 +48,7 @@ def subcell_coordinates(cells: Cells, count: int) -> Float32[ndarray, "h w"]:
 
 @compiled
 def _borders(cell: ndarray, level: ndarray, difference: ndarray) -> tuple[ndarray, ndarray]:
-    """Where, between a pixel's centre (0) and that of its right or lower neighbour (1), a border lies; -1: nowhere."""
+    """Position of a border between a pixel's centre (0) and that of its right or lower neighbour (1); -1: none."""
     bits, h, w = difference.shape
     right = np.full((h, w), np.float32(-1))
     down = np.full((h, w), np.float32(-1))
@@ -89,7 +90,7 @@ def _fit(cell: ndarray, level: ndarray, right: ndarray, down: ndarray, half: int
             block = 1 << level[y, x]
             own = ((cell[y, x] >> level[y, x]) + 0.5) * block
             found, value, sx, sy = _plane(cell, level, right, down, y, x, half, reach, (own, 0.0, 0.0), np.inf)
-            if found:  # once more, without what lies off the first plane
+            if found:  # once more, without borders far from the first plane
                 found, value, sx, sy = _plane(cell, level, right, down, y, x, half, reach, (value, sx, sy), _INLIER)
             if not found:
                 if block > 1:
@@ -101,9 +102,9 @@ def _fit(cell: ndarray, level: ndarray, right: ndarray, down: ndarray, half: int
 
 @compiled
 def _plane(cell, level, right, down, y, x, half, reach, near, tolerance):
-    """The plane through the borders around a pixel: whether there is one, its value there, its slopes in x and y.
+    """The plane through the borders around a pixel: whether it exists, its value at the pixel, its slopes in x and y.
 
-    Borders farther than `tolerance` from the plane `near` (value and slopes) are left out.
+    Borders farther than `tolerance` from the plane `near` (value and slopes) are ignored.
     """
     h, w = cell.shape
     centre, ox, oy = near
@@ -142,7 +143,7 @@ def _plane(cell, level, right, down, y, x, half, reach, near, tolerance):
 
 @compiled
 def _mean_cell(cell, level, y, x, half, reach):
-    """Mean of the cells' centres in a window that lies evenly about the pixel."""
+    """Mean of the cells' centres in a window that is symmetric about the pixel."""
     h, w = cell.shape
     total = count = 0.0
     own = cell[y, x]

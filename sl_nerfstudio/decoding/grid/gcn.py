@@ -1,8 +1,8 @@
 """The graph network that recognises a node by the symbols around it.
 
-Nodes of a capture and nodes of the pattern go through the same network; a node's place is that node of the pattern,
-in one of the four quarter turns, whose feature is most alike. So one set of weights serves every pattern. Geometry
-of camera and projector plays no part.
+Nodes of a capture and nodes of the pattern go through the same network. A node of the capture is the node of the
+pattern, in one of its four quarter turns, with the most similar feature. So one set of weights serves every pattern,
+and the geometry of camera and projector is not needed.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _HIDDEN = 96
 class GraphNetwork(nn.Module):
     """Two graph convolutions with one weight matrix for each place of a 5 x 5 neighbourhood.
 
-    Walks along edges say which node has which place. Two rounds gather the symbols of up to 9 x 9 nodes.
+    Walks along edges find the node at each place. Two rounds gather the symbols of up to 9 x 9 nodes.
     """
 
     def __init__(self) -> None:
@@ -42,14 +42,14 @@ class GraphNetwork(nn.Module):
         return nn.functional.normalize(out, dim=1)
 
     def logits(self, node: Float[Tensor, "n features"], candidate: Float[Tensor, "m features"]) -> Float[Tensor, "n m"]:
-        """How much each node looks like each candidate."""
+        """How similar each node is to each candidate."""
         return self.log_scale.exp() * node @ candidate.T
 
 
 def _gather(values: Float[Tensor, "n c"], around: Int64[Tensor, "n 25"]) -> Float[Tensor, "n k"]:
-    """Values of the nodes around each node, zero where there is none."""
+    """Values of the nodes around each node; zero where there is none."""
     padded = torch.cat([values, values.new_zeros(1, values.shape[1])])
-    return padded[around].flatten(1)  # -1 is the last, the zero
+    return padded[around].flatten(1)  # -1 is the last row, which is zero
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class TurnedPattern:
 
 
 def turned_pattern(codes: Int8[ndarray, "rows columns"]) -> TurnedPattern:
-    """The complete graphs of a code array and of its turns."""
+    """The complete graphs of a code array and of its quarter turns."""
     symbols, arounds, turns, places = [], [], [], []
     first = 0
     for turn in range(4):
@@ -83,5 +83,5 @@ def turned_pattern(codes: Int8[ndarray, "rows columns"]) -> TurnedPattern:
 
 
 def one_hot(symbol: Int8[ndarray, "m"]) -> Float[Tensor, "m 5"]:
-    """Symbols that are known for certain, as scores."""
+    """Symbols that are certain, as scores."""
     return nn.functional.one_hot(torch.from_numpy(symbol.astype(np.int64)), SYMBOLS).float()

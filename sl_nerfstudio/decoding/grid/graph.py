@@ -1,7 +1,7 @@
 """The grid graph of a capture: crossings of lines, and which of them are neighbours along a line.
 
-Directions are those of the view that the network reads (right, down, left, up), which the pattern itself may have
-turned by any number of quarter turns.
+Directions (right, down, left, up) are those of the rectified image, in which the pattern may be turned by any number of
+quarter turns.
 """
 
 from dataclasses import dataclass
@@ -18,19 +18,25 @@ STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
 REACH = 2
 OFFSETS = tuple((i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1))
 """(row, column) of the places around a node that `neighbourhoods` looks up."""
-_LEAST_CREST = 0.9  # of cos + cos; 2 at a perfect crossing
-_TOLERANCE = 0.3  # periods by which a neighbour may lie off its expected place
-_SAMPLES = 7  # places between two nodes where the phase is followed
+# Nodes.
+_LEAST_CREST = 0.9  # of cos + cos, which is 2 at a perfect crossing
+_LEAST_MASK = 0.5  # probability that the pattern is there
+_LARGEST_SHIFT = 1.5  # of a node from the place where the crest is highest, places
+# Edges.
+_TOLERANCE = 0.3  # periods by which a neighbour may be off its expected place
+_SAMPLES = 7  # places between two nodes at which the phase is followed
+_LEAST_MASK_BETWEEN = 0.3  # probability that the pattern is there, at all of them
+_INTERRUPTED = 9.0  # periods: stands for a phase that cannot be followed
 
 
 @dataclass(frozen=True)
 class PhaseMaps:
-    """Mask and phases of a view at places one unit apart; phases in periods, 0 at the nodes."""
+    """Mask, phases and symbols of a rectified image at places one unit apart; phases in periods, 0 at the nodes."""
 
     mask: Float32[ndarray, "h w"]  # probability
     vector: Float32[ndarray, "4 h w"]  # cosine and sine in x, then in y
     symbol: Float32[ndarray, "5 h w"]  # logits
-    gradient: Float32[ndarray, "2 2 h w"]  # periods a unit: of the phase in x and y, along x and y
+    gradient: Float32[ndarray, "2 2 h w"]  # of the phases in x and y, along x and y; periods per unit
 
 
 @dataclass(frozen=True)
@@ -45,23 +51,23 @@ class GridGraph:
 def phase_maps(
     mask: Float32[ndarray, "h w"], vector: Float32[ndarray, "4 h w"], symbol: Float32[ndarray, "5 h w"]
 ) -> PhaseMaps:
-    """Add the phases' gradients, smoothed over 3 x 3 places, to what the network read."""
+    """The network's output with the gradients of the phases, smoothed over 3 x 3 places."""
     gradient = np.empty((2, 2, *mask.shape), dtype=np.float32)
     for axis in range(2):
         wave = (vector[2 * axis] + 1j * vector[2 * axis + 1]) * mask
         for along in range(2):
-            # the mean turn from one place to the next: unlike differences of sines it is right for short periods too
+            # The mean turn from one place to the next; unlike differences of sines it is right for short periods, too.
             turn = np.zeros_like(wave)
             ahead, here = ((..., slice(1, None)), (..., slice(None, -1))) if along == 0 else (slice(1, None), slice(-1))
             turn[here] = wave[ahead] * np.conj(wave[here])
-            # four differences along the axis: from two places before to two behind
+            # Four differences along the axis: from two places before to two places after.
             mean = uniform_filter1d(uniform_filter1d(turn, 4, axis=1 - along), 3, axis=along)
             gradient[axis, along] = np.angle(mean) / (2 * np.pi)
     return PhaseMaps(mask, vector, symbol, gradient)
 
 
 def build_graph(maps: PhaseMaps) -> GridGraph:
-    """Find the crossings and join neighbours whose phases run on from one to the other."""
+    """Find the crossings, and join neighbours if the phases advance by one period from one to the other."""
     place, jacobian = _find_nodes(maps)
     neighbour = np.full((len(place), 4), -1, dtype=np.int32)
     if len(place) > 1:
@@ -76,7 +82,7 @@ def _find_nodes(maps: PhaseMaps) -> tuple[Float32[ndarray, "n 2"], Float32[ndarr
     crest = (maps.vector[0] + maps.vector[2]) * maps.mask
     order = np.arange(crest.size, dtype=np.float32).reshape(crest.shape)
     crest = (crest - 1e-5 * order / crest.size).astype(np.float32)  # no ties
-    peak = (crest == maximum_filter(crest, 3)) & (crest > _LEAST_CREST) & (maps.mask > 0.5)
+    peak = (crest == maximum_filter(crest, 3)) & (crest > _LEAST_CREST) & (maps.mask > _LEAST_MASK)
     row, column = np.nonzero(peak)
     jacobian = np.moveaxis(maps.gradient[:, :, row, column], -1, 0)
     vector = maps.vector[:, row, column]
@@ -84,7 +90,7 @@ def _find_nodes(maps: PhaseMaps) -> tuple[Float32[ndarray, "n 2"], Float32[ndarr
     sound = np.abs(np.linalg.det(jacobian)) > 1e-3
     jacobian, phase, row, column = jacobian[sound], phase[sound], row[sound], column[sound]
     shift = -np.linalg.solve(jacobian, phase[..., None])[..., 0]
-    place = (np.stack([column, row], -1) + np.clip(shift, -1.5, 1.5)).astype(np.float32)
+    place = (np.stack([column, row], -1) + np.clip(shift, -_LARGEST_SHIFT, _LARGEST_SHIFT)).astype(np.float32)
     kept = _without_twins(place, jacobian, crest[row, column])
     return place[kept], jacobian[kept]
 
@@ -92,7 +98,7 @@ def _find_nodes(maps: PhaseMaps) -> tuple[Float32[ndarray, "n 2"], Float32[ndarr
 def _without_twins(
     place: Float32[ndarray, "n 2"], jacobian: Float32[ndarray, "n 2 2"], crest: Float32[ndarray, "n"]
 ) -> Bool[ndarray, "n"]:
-    """Of peaks less than half a period apart only the highest."""
+    """Of peaks less than half a period apart, only the highest."""
     kept = np.ones(len(place), dtype=bool)
     if len(place) < 2:
         return kept
@@ -113,7 +119,7 @@ def _join(
     neighbour: Int32[ndarray, "n 4"],
     direction: int,
 ) -> None:
-    """Enter the neighbours of one direction, and themselves as their neighbours' neighbours."""
+    """Fill in the neighbours in one direction, and the nodes themselves as neighbours in the opposite direction."""
     step = np.array(STEPS[direction][::-1], dtype=np.float32)  # (x, y)
     expected = place + np.linalg.solve(jacobian, np.broadcast_to(step[:, None], (len(place), 2, 1)))[..., 0]
     choices = min(3, len(place))
@@ -126,9 +132,9 @@ def _join(
     back = np.abs(np.einsum("nij,nj->ni", jacobian[target], move) - step).max(-1)
     near = (np.minimum(forth, back) < _TOLERANCE) & (np.maximum(forth, back) < 2 * _TOLERANCE) & (source != target)
     source, target, cost = source[near], target[near], (forth + back)[near]
-    astray = np.abs(_phase_along(maps, place[source], place[target]) - step).max(-1)
-    good = astray < _TOLERANCE
-    order = np.argsort((cost + astray)[good], kind="stable")
+    error = np.abs(_phase_along(maps, place[source], place[target]) - step).max(-1)
+    good = error < _TOLERANCE
+    order = np.argsort((cost + error)[good], kind="stable")
     opposite = (direction + 2) % 4
     for a, b in zip(source[good][order], target[good][order], strict=True):
         if neighbour[a, direction] < 0 and neighbour[b, opposite] < 0:
@@ -138,7 +144,7 @@ def _join(
 def _phase_along(
     maps: PhaseMaps, start: Float32[ndarray, "n 2"], end: Float32[ndarray, "n 2"]
 ) -> Float32[ndarray, "n 2"]:
-    """Periods that the phases advance from one place to the other; 9 where the pattern is not seen all the way."""
+    """Periods by which the phases advance from one place to the other; `_INTERRUPTED` where the pattern is not seen."""
     h, w = maps.mask.shape
     t = np.linspace(0, 1, _SAMPLES, dtype=np.float32)
     way = start[:, None] + t[:, None] * (end - start)[:, None]
@@ -149,15 +155,15 @@ def _phase_along(
     for axis in range(2):
         c, s = vector[2 * axis], vector[2 * axis + 1]
         turn = np.arctan2(s[:, 1:] * c[:, :-1] - c[:, 1:] * s[:, :-1], c[:, 1:] * c[:, :-1] + s[:, 1:] * s[:, :-1])
-        # rounding to whole places leaves the phases at both ends off zero
+        # Rounding to whole places leaves the phases at both ends different from zero.
         ends = np.arctan2(s[:, [0, -1]], c[:, [0, -1]])
         out[:, axis] = (turn.sum(-1) + ends[:, 0] - ends[:, 1]) / (2 * np.pi)
-    out[(maps.mask[row, column] < 0.3).any(-1)] = 9
+    out[(maps.mask[row, column] < _LEAST_MASK_BETWEEN).any(-1)] = _INTERRUPTED
     return out
 
 
 def _symbol_scores(maps: PhaseMaps, place: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n 5"]:
-    """Probabilities from the logits over 3 x 3 places around each node."""
+    """Probabilities from the mean logits of 3 x 3 places around each node."""
     h, w = maps.mask.shape
     logits = uniform_filter1d(uniform_filter1d(maps.symbol, 3, axis=1), 3, axis=2)
     column = np.clip(np.rint(place[:, 0]).astype(int), 0, w - 1)
@@ -168,9 +174,9 @@ def _symbol_scores(maps: PhaseMaps, place: Float32[ndarray, "n 2"]) -> Float32[n
 
 
 def neighbourhoods(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n 25"]:
-    """The node at each of `OFFSETS` from every node, by walks along edges; -1 where none leads or walks disagree."""
+    """The node at each of `OFFSETS` from every node, by walks along edges; -1 where none arrives or walks disagree."""
     n = len(neighbour)
-    padded = np.vstack([neighbour, np.full((1, 4), -1, dtype=np.int32)])  # a step from nowhere leads nowhere
+    padded = np.vstack([neighbour, np.full((1, 4), -1, dtype=np.int32)])  # steps from a missing node arrive nowhere
     table = {(0, 0): np.arange(n, dtype=np.int32)}
     nowhere = np.full(n, -1, dtype=np.int32)
     for offset in sorted(OFFSETS, key=lambda o: abs(o[0]) + abs(o[1])):
@@ -182,7 +188,7 @@ def neighbourhoods(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n 25"]:
             if before in table and abs(before[0]) + abs(before[1]) < abs(offset[0]) + abs(offset[1]):
                 arrived = _agree(arrived, padded[table[before], direction])
         table[offset] = arrived
-    for offset in OFFSETS:  # around missing nodes: from beyond
+    for offset in OFFSETS:  # walks around missing nodes
         for direction, (di, dj) in enumerate(STEPS):
             before = (offset[0] - di, offset[1] - dj)
             if before in table:
@@ -192,6 +198,6 @@ def neighbourhoods(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n 25"]:
 
 
 def _agree(a: Int32[ndarray, "n"], b: Int32[ndarray, "n"]) -> Int32[ndarray, "n"]:
-    """The node of either walk; -2 (nowhere, for good) where they lead to different ones."""
+    """The node at which either walk arrives; -2, which stays, where they arrive at different ones."""
     out = np.where(a == -1, b, a)
     return np.where((a != b) & (a >= 0) & (b >= 0), -2, out).astype(np.int32)

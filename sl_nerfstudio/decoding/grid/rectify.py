@@ -1,7 +1,7 @@
-"""Captures brought to the size and roll that the network was trained on.
+"""Captures turned and scaled to the roll and period that the network was trained on.
 
-The grid of a capture shows as peaks in the local power spectrum. From them come its period and its roll, up to
-quarter turns, which the symbols settle later.
+The grid of a capture appears as peaks in the local power spectrum. They give its period and its roll up to quarter
+turns; the symbols decide between the quarter turns later.
 """
 
 from dataclasses import dataclass
@@ -11,61 +11,68 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.grid.channels import VIEW_PERIOD
+from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD
 from sl_nerfstudio.decoding.grid.unet import MULTIPLE
 
-_TILE = 128
-_STEP = 64
-_PERIODS = (5.5, 40.0)  # pixels
-_ANGLES, _RADII = 90, 72
-_LARGEST_SIDE = 3000  # of a view, pixels
+# Local power spectra.
+_TILE = 128  # side of a tile, pixels
+_STEP = 64  # between two tiles
+_WEAKEST = 1e-3  # contrast of a tile, relative to the brightest pixel, below which it is ignored
+# Their polar form.
+_PERIODS = (5.5, 40.0)  # pixels: the shortest and the longest that are searched
+_ANGLES, _RADII = 90, 72  # samples: angles over half a turn, periods on a logarithmic scale
+# The peaks.
+_LEAST_PEAK = 0.2  # of the highest one
+_PEAK_RADII, _PEAK_ANGLES = 9, 8  # samples around a peak that count as the same one
+_LARGEST_SIDE = 3000  # of a rectified image, pixels
 
 
 @dataclass(frozen=True)
-class GridLook:
-    """How the grid appears in an image: pixels a period, and its roll in radian, within a quarter turn."""
+class GridAppearance:
+    """How the grid appears in an image."""
 
-    period: float
-    roll: float  # clockwise, of the lines that are nearest to horizontal
+    period: float  # pixels
+    roll: float  # radian, clockwise, of the lines that are closest to horizontal; within an eighth of a turn
 
 
 @dataclass(frozen=True)
 class RectifiedImage:
-    """An image turned and scaled; `from_image` maps image pixels (x, y, 1) to view pixels, centres at .5."""
+    """An image turned and scaled; `from_image` maps pixels (x, y, 1) of the original to its own, centres at .5."""
 
     image: Float32[ndarray, "h w"]
     from_image: Float64[ndarray, "2 3"]
 
 
-def guess_looks(image: Float32[ndarray, "h w"], count: int = 3) -> list[GridLook]:
+def guess_appearances(image: Float32[ndarray, "h w"], count: int = 3) -> list[GridAppearance]:
     """The most probable appearances of the grid, best first; none for an image without contrast."""
     power = _local_power(image)
     if power is None:
         return []
     polar = _polar(power)  # radii, angles over half a turn
     half = _ANGLES // 2
-    # both families of lines must be there
+    # Both families of lines must be present.
     both = np.sqrt(polar[:, :half] * polar[:, half:]) + 0.1 * (polar[:, :half] + polar[:, half:])
     both = cv2.GaussianBlur(np.hstack([both[:, -8:], both, both[:, :8]]), (0, 0), 2.0)[:, 8:-8]
-    looks: list[GridLook] = []
+    found: list[GridAppearance] = []
     left = both.copy()
     for _ in range(count):
         r, a = np.unravel_index(int(left.argmax()), left.shape)
-        if left[r, a] <= 0.2 * both.max():
+        if left[r, a] <= _LEAST_PEAK * both.max():
             break
         angle = a * np.pi / _ANGLES
-        looks.append(GridLook(float(1 / _frequencies()[r]), float(angle if angle <= np.pi / 4 else angle - np.pi / 2)))
+        roll = float(angle if angle <= np.pi / 4 else angle - np.pi / 2)
+        found.append(GridAppearance(float(1 / _frequencies()[r]), roll))
         far = np.abs(np.arange(half) - a)
-        left[max(r - 9, 0) : r + 10, np.minimum(far, half - far) < 8] = 0
-    return looks
+        left[max(r - _PEAK_RADII, 0) : r + _PEAK_RADII + 1, np.minimum(far, half - far) < _PEAK_ANGLES] = 0
+    return found
 
 
-def rectify(image: Float32[ndarray, "h w"], look: GridLook) -> RectifiedImage:
-    """The image turned upright and scaled until a period measures `VIEW_PERIOD` pixels."""
+def rectify(image: Float32[ndarray, "h w"], appearance: GridAppearance) -> RectifiedImage:
+    """The image turned upright and scaled until a period measures `RECTIFIED_PERIOD` pixels."""
     h, w = image.shape
-    c, s = np.cos(-look.roll), np.sin(-look.roll)
+    c, s = np.cos(-appearance.roll), np.sin(-appearance.roll)
     reach = max(abs(w * c) + abs(h * s), abs(w * s) + abs(h * c))
-    scale = min(VIEW_PERIOD / look.period, _LARGEST_SIDE / reach)
+    scale = min(RECTIFIED_PERIOD / appearance.period, _LARGEST_SIDE / reach)
     linear = scale * np.array([[c, -s], [s, c]])
     corners = linear @ np.array([[0, w, 0, w], [0, 0, h, h]], dtype=np.float64)
     low, size = corners.min(1), np.ceil((corners.max(1) - corners.min(1)) / MULTIPLE).astype(int) * MULTIPLE
@@ -78,18 +85,18 @@ def rectify(image: Float32[ndarray, "h w"], look: GridLook) -> RectifiedImage:
 
 
 def integer_centres(affine: Float64[ndarray, "2 3"]) -> Float64[ndarray, "2 3"]:
-    """The same map for pixel coordinates whose first centre is 0, as OpenCV has them."""
+    """The same map for pixel coordinates whose first centre is 0, as in OpenCV."""
     out = affine.copy()
     out[:, 2] += affine[:, :2] @ np.array([0.5, 0.5]) - 0.5
     return out
 
 
 def _local_power(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "t t"] | None:
-    """Mean power spectrum of overlapping tiles, each weighed by its contrast, not by its brightness."""
+    """Mean power spectrum of overlapping tiles, each weighted by its contrast, not by its brightness."""
     h, w = image.shape
     padded = cv2.copyMakeBorder(image, 0, max(_TILE - h, 0), 0, max(_TILE - w, 0), cv2.BORDER_REFLECT_101)
     window = np.outer(np.hanning(_TILE), np.hanning(_TILE)).astype(np.float32)
-    noise = 1e-3 * max(float(padded.max()), 1e-6)
+    noise = _WEAKEST * max(float(padded.max()), 1e-6)
     total, weights = np.zeros((_TILE, _TILE), dtype=np.float32), 0.0
     for top in range(0, padded.shape[0] - _TILE + 1, _STEP):
         for left in range(0, padded.shape[1] - _TILE + 1, _STEP):
@@ -111,7 +118,7 @@ def _frequencies() -> Float64[ndarray, "radii"]:
 
 
 def _polar(power: Float32[ndarray, "t t"]) -> Float32[ndarray, "radii angles"]:
-    """Power by frequency and by the angle of the lines' normal over half a turn; peaks stand on a flat ground."""
+    """Power by frequency and by the angle of the lines' normal over half a turn; the background is flattened."""
     radius = _frequencies()[:, None] * _TILE
     angle = np.arange(_ANGLES) * np.pi / _ANGLES
     x, y = radius * np.cos(angle) + _TILE // 2, radius * np.sin(angle) + _TILE // 2

@@ -1,6 +1,6 @@
 """The trained networks that come with the package."""
 
-from importlib.resources import as_file, files
+from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
@@ -8,21 +8,27 @@ from safetensors.torch import load_file
 from sl_nerfstudio.decoding.grid.gcn import GraphNetwork
 from sl_nerfstudio.decoding.grid.unet import UNet
 
+_WEIGHTS = Path(__file__).parent / "weights"
+
 
 def load_unet() -> UNet:
-    """The U-Net as shipped, ready to read."""
+    """The trained U-Net, in evaluation mode."""
     network = UNet()
     network.load_state_dict(_weights("unet"))
     return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def load_graph_network() -> GraphNetwork:
-    """The graph network as shipped."""
+    """The trained graph network, in evaluation mode."""
     network = GraphNetwork()
     network.load_state_dict(_weights("gcn"))
     return network.eval()
 
 
+def weight_files() -> list[Path]:
+    """All files of weights, sorted by name."""
+    return sorted(_WEIGHTS.glob("*.safetensors"))
+
+
 def _weights(name: str) -> dict[str, torch.Tensor]:
-    with as_file(files("sl_nerfstudio.decoding.grid") / "weights" / f"{name}.safetensors") as path:
-        return load_file(path)
+    return load_file(_WEIGHTS / f"{name}.safetensors")

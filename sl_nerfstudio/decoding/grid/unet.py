@@ -1,4 +1,4 @@
-"""The U-Net that reads a captured image: where the pattern is, the phase in its grid, and the symbols."""
+"""The U-Net: where in a rectified image the pattern is, the phases of its grid, and the symbols."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,10 +18,10 @@ MULTIPLE = STRIDE * 2 ** (len(_WIDTHS) - 1)
 """Width and height of the image must be multiples of this."""
 
 
-class Reading(NamedTuple):
-    """What the network sees, at half the resolution of its input; places lie where four pixels meet."""
+class NetworkOutput(NamedTuple):
+    """What the network predicts, at half the resolution of its input; places lie where four pixels meet."""
 
-    mask: Float[Tensor, "b h w"]  # logit of: the pattern falls here
+    mask: Float[Tensor, "b h w"]  # logit: the pattern is here
     phase: Float[Tensor, "b 4 h w"]  # cosine and sine of the phase in x, then in y; both 0 where unknown
     symbol: Float[Tensor, "b 5 h w"]  # logits of the symbol of the nearest node
 
@@ -36,8 +36,8 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(_Pair(deep + own, own) for own, deep in pairwise(widths))
         self.head = nn.Conv2d(widths[0], 1 + 4 + SYMBOLS, 1)
 
-    def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> Reading:
-        """Read images whose sides are multiples of `MULTIPLE`."""
+    def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> NetworkOutput:
+        """Predict for images whose sides are multiples of `MULTIPLE`."""
         x = F.pixel_unshuffle(channels, STRIDE)
         kept: list[Tensor] = []
         for level, block in enumerate(self.down):
@@ -47,7 +47,7 @@ class UNet(nn.Module):
             larger = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = self.up[level](torch.cat([larger, kept[level]], 1))
         out = self.head(x)
-        return Reading(out[:, 0], out[:, 1:5], out[:, 5:])
+        return NetworkOutput(out[:, 0], out[:, 1:5], out[:, 5:])
 
 
 class _Pair(nn.Sequential):

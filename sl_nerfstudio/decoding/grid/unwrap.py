@@ -1,7 +1,7 @@
-"""From nodes with a place and phases everywhere to coordinates everywhere.
+"""Phase unwrapping: from nodes whose place is known to coordinates of all pixels.
 
-Each pixel's coordinate is a whole number plus its phase. The whole number spreads from the nodes over pixels whose
-phases run on smoothly.
+The coordinate of a pixel is a whole number plus its phase. The whole number spreads from the nodes over neighbouring
+pixels as long as the phase changes smoothly.
 """
 
 import numpy as np
@@ -20,9 +20,9 @@ def spread(
     pixel: Int32[ndarray, "n 2"],
     place: Int32[ndarray, "n 2"],
 ) -> Float32[ndarray, "h w 2"]:
-    """Coordinates (x, y) in periods, NaN where no node reaches.
+    """Coordinates (x, y) in periods; NaN where no node reaches.
 
-    `phase` is within half a period of zero, `pixel` (row, column) shows the node at `place` (row, column).
+    `phase` is from -0.5 to 0.5 periods; `pixel` (row, column) shows the node at `place` (row, column) of the pattern.
     """
     coords = np.full(phase.shape, np.nan, dtype=np.float32)
     _spread(phase, seen, pixel, place, coords, np.float32(_LARGEST_STEP), np.float32(_FARTHEST))
@@ -39,7 +39,7 @@ def _spread(
     largest_step: float,
     farthest: float,
 ) -> None:
-    """Breadth first: every pixel is reached from the node that is fewest pixels away."""
+    """Breadth first: every pixel is reached from the nearest node, counted in pixels."""
     h, w = seen.shape
     queue = np.empty((h * w, 3), dtype=np.int32)
     end = 0

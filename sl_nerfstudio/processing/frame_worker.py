@@ -1,0 +1,101 @@
+"""One frame by itself: decoding, the relative pose of the projector, triangulation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.decoder import Decoder
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.processing.store import DecodedStore
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+from sl_nerfstudio.scan.file_error import FileError
+
+
+@dataclass(frozen=True)
+class FrameJob:
+    """What decoding and calibrating a frame needs, the same for every frame."""
+
+    work: Path  # folder of the decoded frames
+    decoder: Decoder[Any]
+    camera: Device
+    projector: Device
+    seed: int
+
+
+@dataclass(frozen=True)
+class FrameStageResult:
+    """What the frame stage made of one frame."""
+
+    frame: CapturedFrame
+    key: str = ""  # of the decoded frame in the store; "" if it was not decoded
+    resumed: bool = False  # it had been decoded by an earlier run
+    decode_rate: float = 0.0  # decoded pixels of those in the mask
+    mask_share: float = 0.0  # of the image
+    cloud: FrameCloud | None = None  # None: the frame is left out
+    stage: str = ""  # in which the frame failed: "reading", "decoding", "calibrating"; "" if it did not
+    reason: str = ""  # problem, cause and remedy, with the file they are about
+
+    @property
+    def name(self) -> str:
+        """The frame's name."""
+        return self.frame.name
+
+
+def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
+    """The clouds of all frames that are not left out."""
+    return [result.cloud for result in results if result.cloud is not None]
+
+
+class FrameWorker:
+    """Decodes and calibrates frames one after the other."""
+
+    def __init__(self, job: FrameJob) -> None:
+        self._job = job
+        self._store = DecodedStore(job.work, job.decoder.key)
+
+    def __call__(self, frame: CapturedFrame) -> FrameStageResult:
+        """Decode (or load) and calibrate a frame. A frame that fails is left out, with its reason."""
+        try:
+            key = self._store.key(frame)
+            decoded = self._store.load(frame, key)
+            resumed = decoded is not None
+            if decoded is None:
+                decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
+        except FileError as error:
+            return FrameStageResult(frame, stage="reading", reason=str(error))
+        except DecodingError as error:
+            return FrameStageResult(frame, stage="decoding", reason=_with_file(frame, error))
+        share = float(decoded.mask.mean())
+        return self.calibrate(FrameStageResult(frame, key, resumed, decoded.rate, share), decoded)
+
+    def calibrate(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
+        """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
+        job, coords = self._job, decoded.coords
+        try:
+            pose = estimate_relative_pose(*correspondences_of(coords), job.camera, job.projector, job.seed)
+            cloud = frame_cloud(result.name, coords, job.camera, job.projector, pose)
+        except RelativePoseError as error:
+            return replace(result, cloud=None, stage="calibrating", reason=_with_file(result.frame, error))
+        return replace(result, cloud=cloud)
+
+    def load(self, result: FrameStageResult) -> Decoded:
+        """The decoded maps of a frame, whichever worker stored them. Raises UserError if they were removed."""
+        decoded = self._store.load(result.frame, result.key)
+        if decoded is None:
+            raise UserError(
+                f"{self._job.work}: the decoded frame {result.name} is missing\n"
+                "    cause:  files were removed while sl-process was running\n    remedy: start again"
+            )
+        return decoded
+
+
+def _with_file(frame: CapturedFrame, error: UserError) -> str:
+    """The error with the file it is about: the image, or the folder of a sequence."""
+    path = frame.images[0] if len(frame.images) == 1 else frame.images[0].parent
+    return f"{path}: {error}"

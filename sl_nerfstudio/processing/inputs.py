@@ -1,0 +1,63 @@
+"""The files and flags of a run, read and checked before the long work starts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from sl_nerfstudio.calibration.device_files import read_device_file
+from sl_nerfstudio.decoding.decoders import choose_decoder
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.files import read_layout
+from sl_nerfstudio.processing.captures import Captures, find_captures
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.frame_worker import FrameJob
+from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
+from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length
+from sl_nerfstudio.scan.atomic import require_empty
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything that the stages start from."""
+
+    job: FrameJob
+    captures: Captures
+    given: GivenPoses | None  # in the order of the captures
+    known: KnownLength | None  # its frames by name
+
+
+def read_inputs(config: ProcessConfig) -> Inputs:
+    """Read what the flags name. Raises UserError for flags and files that are wrong."""
+    config.check()
+    require_empty(config.output)
+    known = parse_known_length(config.known_length) if config.known_length else None
+    layout = read_layout(config.pattern)
+    decoder = choose_decoder(layout, config.decoder, config.pattern)
+    captures = find_captures(config.images, decoder.sequence)
+    names = [frame.name for frame in captures.frames]
+    camera = read_device_file(config.intrinsics, "camera", captures.size, procam_step=config.procam_step)
+    projector = read_device_file(
+        config.projector_intrinsics or config.intrinsics,
+        "projector",
+        (layout.w, layout.h),
+        config.projector_model,
+        config.procam_step,
+    )
+    return Inputs(
+        FrameJob(config.work_folder, decoder, camera, projector, config.seed),
+        captures,
+        None if config.poses is None else read_given_poses(config.poses, names),
+        None if known is None else frames_by_name(known, names),
+    )
+
+
+def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:
+    """The known length with its frames by name; numbers count the captures from 0."""
+    found = []
+    for frame in known.frames:
+        if frame not in names and not (frame.isdecimal() and int(frame) < len(names)):
+            raise UserError(
+                f"--known-length: there is no frame {frame}\n    cause:  a typing error, or a number counted from 1\n"
+                f"    remedy: give a number from 0 to {len(names) - 1}, or the name of an image without its ending"
+            )
+        found.append(frame if frame in names else names[int(frame)])
+    return replace(known, frames=tuple(found))

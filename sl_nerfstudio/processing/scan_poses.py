@@ -1,0 +1,72 @@
+"""The axes and the unit of the scan: those of given poses, of a known length, or arbitrary ones."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames, adjust_registered
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.given_poses import GivenPoses, align_to
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.known_length import KnownLength, scale_to
+from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.scan.types import Scale
+
+
+@dataclass(frozen=True)
+class ScanPoses:
+    """Poses of all frames in the axes and the unit of the scan."""
+
+    adjusted: AdjustedFrames
+    units: str
+    scale: Scale
+
+
+def find_scan_poses(
+    clouds: Sequence[FrameCloud], registration: Registration, known: KnownLength | None, given: GivenPoses | None
+) -> ScanPoses:
+    """Adjust all registered frames together, then bring them to the axes and the unit that are known.
+
+    A known length overrules the unit of given poses. Raises UserError if it is in a frame that cannot be used.
+    """
+    if known is not None:
+        _require_frames(known, clouds)
+    poses = ScanPoses(adjust_registered(clouds, registration), "arbitrary", Scale(False))
+    if given is not None:
+        poses = _in_given_axes(poses, registration, given)
+    if known is not None:
+        poses = _with_known_length(poses, clouds, registration, known)
+    return poses
+
+
+def _in_given_axes(poses: ScanPoses, registration: Registration, given: GivenPoses) -> ScanPoses:
+    """The poses moved, turned and scaled onto the given ones."""
+    S_given_found = align_to(given, poses.adjusted.poses.T_world_camera, registration.registered)
+    scale = poses.scale if given.units == "arbitrary" else Scale(True, "given camera poses")
+    return ScanPoses(poses.adjusted.mapped(S_given_found), given.units, scale)
+
+
+def _with_known_length(
+    poses: ScanPoses, clouds: Sequence[FrameCloud], registration: Registration, known: KnownLength
+) -> ScanPoses:
+    """The poses scaled until the length is the true one."""
+    adjusted = poses.adjusted
+    devices = adjusted.poses
+    factor = scale_to(known, known.unit, clouds, devices.T_world_camera, devices.T_world_projector)
+    return ScanPoses(adjusted.scaled(factor), known.unit, Scale(True, _describe_source(known, clouds, registration)))
+
+
+def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
+    lost = set(known.frames) - {cloud.name for cloud in clouds}
+    if lost:
+        raise UserError(
+            f"--known-length: {sorted(lost)[0]} could not be used, so no length in it can be measured\n"
+            "    cause:  it could not be decoded or calibrated\n    remedy: give a length in another frame"
+        )
+
+
+def _describe_source(known: KnownLength, clouds: Sequence[FrameCloud], registration: Registration) -> str:
+    """The known length in words; a baseline by the frame's number among those in the scan."""
+    if known.pixels:
+        return known.source
+    index = [cloud.name for cloud in clouds].index(known.frames[0])
+    return f"baseline of frame {int(registration.registered[:index].sum())} ({known.frames[0]})"
