@@ -1,15 +1,13 @@
 """Machine code for loops that numpy cannot express; kept on disk, so that it is made once."""
 
 import inspect
-import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-# Read by OpenMP when numba first starts its threads: idle ones sleep. By default they spin at the end of every parallel
-# loop, and beside other busy processes a loop then takes many times its share of the machine.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 import numba
+
+from sl_nerfstudio.threads import parallel, split, threads
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -17,6 +15,16 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return numba.njit(cache=True)(inspect.unwrap(function))
 
 
-def compiled_parallel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same, with `numba.prange` over all threads."""
-    return numba.njit(parallel=True, cache=True)(inspect.unwrap(function))
+def compiled_range(function: Callable[..., None]) -> Callable[..., None]:
+    """A loop over a range, compiled, run in pieces on all threads.
+
+    `function(first, last, *arguments)` does the iterations first to last - 1, which must not depend on each other. The
+    result is called with the number of iterations in place of the range. Unlike an OpenMP team (numba's `prange`), idle
+    threads sleep: a team spins at the end of every loop, and beside other busy processes takes many times its share.
+    """
+    loop = numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+
+    def run(count: int, *arguments: Any) -> None:
+        parallel([partial(loop, first, last, *arguments) for first, last in split(count, threads(), 1)])
+
+    return run

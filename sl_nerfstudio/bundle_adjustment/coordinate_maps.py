@@ -9,14 +9,13 @@ adjustment would turn that offset into wrong poses.)
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
-from sl_nerfstudio.compiled import compiled, compiled_parallel
+from sl_nerfstudio.compiled import compiled, compiled_range
 
 
 @dataclass(frozen=True)
@@ -89,6 +88,7 @@ class CoordinateMaps:
         n = len(frame)
         fit, roughness = np.zeros((n, 3, 2)), np.full(n, np.inf)
         _fit_paraboloids(
+            n,
             self.values.numpy(),
             self.offsets.numpy(),
             self.widths.numpy(),
@@ -119,11 +119,11 @@ class CoordinateMaps:
         return torch.where(inside[:, None], found, torch.full_like(found, float("nan")))
 
 
-@compiled_parallel
-def _fit_paraboloids(values, offsets, widths, heights, frame, uv, limits, fit, roughness):
+@compiled_range
+def _fit_paraboloids(first, last, values, offsets, widths, heights, frame, uv, limits, fit, roughness):
     """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
     half_window, least_pixels, least_pivot = limits
-    for k in numba.prange(len(frame)):
+    for k in range(first, last):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]
         w, h = widths[f], heights[f]
         if not (px >= 0 and py >= 0 and px < w and py < h):

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Observations
-from sl_nerfstudio.compiled import compiled_parallel
+from sl_nerfstudio.compiled import compiled_range
+from sl_nerfstudio.threads import threads
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def normal_equations(
         g.index_add_(0, cols.reshape(-1), (wJ[:, 0] * r[:, :1] + wJ[:, 1] * r[:, 1:]).reshape(-1))
         coupling = wJ[:, 0] * J_depth[:, :1] + wJ[:, 1] * J_depth[:, 1:]
         depth_by_rest.index_add_(0, (anchor[:, None] * size + cols).reshape(-1), coupling.reshape(-1))
-        partial = np.zeros((torch.get_num_threads(), size, size))
-        _accumulate(J.numpy(), w.numpy(), cols.numpy(), partial)
+        partial = np.zeros((threads(), size, size))
+        _accumulate(len(partial), J.numpy(), w.numpy(), cols.numpy(), partial)
         H += torch.from_numpy(partial.sum(0))
     H = torch.tril(H) + torch.tril(H, -1).T
     H_depth = H_depth.index_add(0, rows, cross_weight * (linear.cross_depth**2).sum(-1))
@@ -61,12 +61,12 @@ def normal_equations(
     return NormalEquations(H - V.T @ scaled, g - scaled.T @ g_depth, V, H_depth, g_depth)
 
 
-@compiled_parallel
-def _accumulate(J, weight, columns, partial):
-    """Lower triangle of `sum_n w_n J_n^T J_n`, one partial sum for each thread."""
-    threads, rows, width = partial.shape[0], J.shape[0], J.shape[2]
-    for t in numba.prange(threads):
-        for n in range(t * rows // threads, (t + 1) * rows // threads):
+@compiled_range
+def _accumulate(first, last, J, weight, columns, partial):
+    """Lower triangle of `sum_n w_n J_n^T J_n`, in partial sums that threads make by themselves."""
+    parts, rows, width = partial.shape[0], J.shape[0], J.shape[2]
+    for t in range(first, last):
+        for n in range(t * rows // parts, (t + 1) * rows // parts):
             w = weight[n]
             if w > 0:
                 for a in range(width):

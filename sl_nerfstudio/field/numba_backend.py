@@ -16,7 +16,7 @@ from sl_nerfstudio.field.kernels.grid import POINTS, Grid, scatter_level
 from sl_nerfstudio.field.kernels.mlp import Network, Scratch, Weights, make_scratch
 from sl_nerfstudio.field.kernels.pack import pack_grid, pack_network, unpack_gradients, zero_gradients
 from sl_nerfstudio.field.kernels.simd import FEATURES
-from sl_nerfstudio.field.kernels.threads import parallel, split
+from sl_nerfstudio.threads import parallel, split
 
 _BATCH = 16384  # points whose feature gradients wait (in cache) between the MLP and the table
 

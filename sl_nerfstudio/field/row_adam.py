@@ -17,8 +17,8 @@ from torch.autograd.graph import increment_version
 from torch.optim import Optimizer
 
 from sl_nerfstudio.field.kernels.rows import LIST, adam
-from sl_nerfstudio.field.kernels.threads import parallel, split
 from sl_nerfstudio.field.table_gradient import TableGradient
+from sl_nerfstudio.threads import parallel, split
 
 
 class RowAdam(Optimizer):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.graph import get_gradient_edge
 
 from sl_nerfstudio.field.kernels.rows import LIST, clear
-from sl_nerfstudio.field.kernels.threads import parallel, split
+from sl_nerfstudio.threads import parallel, split
 
 
 class Wanted(Enum):

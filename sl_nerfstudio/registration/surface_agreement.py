@@ -10,12 +10,11 @@ c: `p <- c + exp(l) exp(w) (p - c) + v`.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled, compiled_parallel
+from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.models import pixel_of
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -86,7 +85,7 @@ def agreement(
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
         _sums(
-            mover.points, mover.normals, scale, R, t, bool(reverse),
+            len(scale), mover.points, mover.normals, scale, R, t, bool(reverse),
             m.point, m.normal, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
             settings.least_facing_cosine, settings.kernel_cutoff, H, g, counts[reverse],
         )  # fmt: skip
@@ -107,15 +106,15 @@ def agreement_at(
     return agreement(source, target, Hypotheses.of(S_target_source), tolerance, tolerance, settings.agreement)
 
 
-@compiled_parallel
+@compiled_range
 def _sums(
-    points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances, least_facing,
-    cutoff, H, g, counts
+    first, last, points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances,
+    least_facing, cutoff, H, g, counts
 ):  # fmt: skip
     """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
     h, w = valid.shape
     tau, width, hidden = tolerances[0], tolerances[1], tolerances[2]
-    for k in numba.prange(len(scale)):
+    for k in range(first, last):
         s = scale[k]
         J = np.zeros(7)
         for n in range(len(points)):

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled_parallel
+from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.geometry.devices import PARAMETERS, Device
 from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.plane_fit import solve_plane
@@ -62,7 +61,12 @@ def build_surface_map(cloud: FrameCloud, settings: SurfaceMapSettings = DEFAULT_
     inverse_depth = np.where(weight > 0, mean, np.nan).reshape(camera.h, camera.w)
     fitted = np.full((camera.h, camera.w, 3), np.nan)
     _fit_inverse_depth(
-        inverse_depth.astype(np.float32), settings.half_window, settings.fewest_pixels, settings.largest_relief, fitted
+        camera.h,
+        inverse_depth.astype(np.float32),
+        settings.half_window,
+        settings.fewest_pixels,
+        settings.largest_relief,
+        fitted,
     )
     uv = np.stack(np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5), -1).reshape(-1, 2)
     ray = directions(camera, uv).reshape(camera.h, camera.w, 3)
@@ -100,11 +104,11 @@ def _normals(
     return n / np.linalg.norm(n, axis=-1, keepdims=True).clip(1e-300)
 
 
-@compiled_parallel
-def _fit_inverse_depth(q, half_window, fewest, largest_relief, fitted):
+@compiled_range
+def _fit_inverse_depth(first, last, q, half_window, fewest, largest_relief, fitted):
     """Planes `q = c + u du + v dv` in windows around every pixel with a value; NaN at edges and where too sparse."""
     h, w = q.shape
-    for row in numba.prange(h):
+    for row in range(first, last):
         for column in range(w):
             if not np.isfinite(q[row, column]):
                 continue

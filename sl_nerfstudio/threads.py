@@ -1,4 +1,4 @@
-"""Run independent pieces of work in parallel, on as many threads as torch uses.
+"""Independent pieces of work in parallel, on as many threads as torch uses.
 
 The pieces are numba kernels that release the GIL. Idle threads sleep: unlike an OpenMP team they do not spin beside
 torch's own. Callers may be several threads (training, viewer) at once.
@@ -6,28 +6,54 @@ torch's own. Callers may be several threads (training, viewer) at once.
 
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 
 import torch
+
+_ours: int | None = None  # threads of our own loops while torch has one
+
+
+def threads() -> int:
+    """Number of threads that take part."""
+    return torch.get_num_threads() if _ours is None else _ours
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch's own operations on one thread, our loops on all, for work made of many small operations.
+
+    Those gain nothing from an OpenMP team, and its threads spin between them: beside other busy processes the work then
+    takes ten times as long and more.
+    """
+    global _ours
+    before, count = _ours, torch.get_num_threads()
+    _ours = threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+        _ours = before
 
 
 @lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
     """The process's threads; a forked child makes its own."""
-    return ThreadPoolExecutor(max_workers=max((os.cpu_count() or 2) - 1, 1), thread_name_prefix="sl-field")
+    return ThreadPoolExecutor(max_workers=max((os.cpu_count() or 2) - 1, 1), thread_name_prefix="sl-threads")
 
 
 def parallel(tasks: Sequence[Callable[[], object]]) -> None:
-    """Run all tasks, each once, in any order, on up to `torch.get_num_threads()` threads; raises what a task raises."""
+    """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises."""
     queue = itertools.count()
 
     def work() -> None:
         while (i := next(queue)) < len(tasks):
             tasks[i]()
 
-    others = min(torch.get_num_threads(), len(tasks)) - 1
+    others = min(threads(), len(tasks)) - 1
     futures = [_pool(os.getpid()).submit(work) for _ in range(others)]
     try:
         work()
