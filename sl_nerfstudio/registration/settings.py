@@ -228,5 +228,5 @@ class RegistrationSettings:
 
 
 FRAME_CLOUD_DEFAULTS = FrameCloudSettings()
-DEFAULT_SETTINGS = RegistrationSettings()
+REGISTRATION_DEFAULTS = RegistrationSettings()
 KNOWN_LENGTH_DEFAULTS = KnownLengthSettings()
