@@ -49,7 +49,7 @@ def register_pair(
     coarse = sides(settings.coarse_points)
     for width in settings.coarse_widths:
         found = _improved(coarse, found, width, log_scale, settings)
-    best = _ranked(coarse, found, 2 * settings.tolerance, settings)
+    best = _ranked(coarse, found, settings.coarse_tolerance_factor * settings.tolerance, settings)
     found = found[_distinct(found, best, settings.fine_starts, target, settings)]
     fine = sides(settings.fine_points)
     for width in settings.fine_widths:
