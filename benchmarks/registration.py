@@ -36,8 +36,8 @@ FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 43}
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Errors of the relative poses of the frames."""
+class RelativePoseErrors:
+    """Errors of the frames' relative poses."""
 
     rotation_deg_median: float
     rotation_deg_max: float
@@ -51,7 +51,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Poses:
-    """Errors of the registered frames after one similarity; positions in mean camera distances."""
+    """Errors of the frames' poses after one similarity; positions in mean camera distances."""
 
     registered: int
     rotation_deg_median: float
@@ -69,7 +69,7 @@ class Row:
     scan: str
     projector: str
     frames: int
-    calibration: Calibration
+    relative_pose: RelativePoseErrors
     registration: Poses
     joint: Poses
     not_registered: dict[str, str]
@@ -84,8 +84,8 @@ def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
     return truth.T_world_camera, truth.T_world_projector
 
 
-def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Calibration]:
-    """Calibrate all frames, one by one."""
+def relative_poses(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], RelativePoseErrors]:
+    """All frames, one by one."""
     from scipy.spatial.transform import Rotation
 
     from sl_nerfstudio.relative_pose.sampson import direction_basis
@@ -110,7 +110,7 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
             )
         )
     rotation, direction, sigma_rotation, sigma_direction, distance = np.array(rows).T
-    return clouds, Calibration(
+    return clouds, RelativePoseErrors(
         float(np.median(rotation)),
         float(rotation.max()),
         float(np.median(direction)),
@@ -122,8 +122,22 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
     )
 
 
-def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray], seconds: float) -> Poses:
-    """Errors of registered frames after one similarity, fitted to the cameras and the points they look at.
+@dataclass(frozen=True)
+class FrameErrors:
+    """Errors of registered frames after one common similarity."""
+
+    rotation_deg: ndarray
+    position: ndarray  # in mean distances of the cameras from their centre
+    scale: ndarray  # fraction
+
+    @property
+    def right(self) -> ndarray:
+        """Frames within 2 degrees and 3 %."""
+        return (self.rotation_deg < 2) & (self.scale < 0.03)
+
+
+def frame_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray]) -> FrameErrors:
+    """Errors of registered frames after one similarity that fits cameras and the places they look at.
 
     `truth` holds the true poses of cameras and projectors.
     """
@@ -139,23 +153,25 @@ def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndar
         np.concatenate([T[:, :3, 3], T[:, :3, 3] - unit * ahead * T[:, :3, 2]])
         for T, unit in ((found, 1 / ratio), (true, 1.0))
     ]
-    S = fit_similarity(ends[0], ends[1])
-    found = S.poses(found)
+    found = fit_similarity(ends[0], ends[1]).poses(found)
     turn = np.degrees(Rotation.from_matrix(np.swapaxes(true[:, :3, :3], 1, 2) @ found[:, :3, :3]).magnitude())
     shift = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1) / ahead
-    scale = np.abs(length * ratio / true_baseline - 1)
-    right = (turn < 2) & (scale < 0.03)
+    return FrameErrors(turn, shift, np.abs(length * ratio / true_baseline - 1))
+
+
+def summary_of(errors: FrameErrors, seconds: float) -> Poses:
+    """Medians and largest values."""
     return Poses(
-        int(known.sum()), float(np.median(turn)), float(turn.max()), float(shift.max()), float(scale.max()),
-        int(right.sum()), seconds,
+        len(errors.scale), float(np.median(errors.rotation_deg)), float(errors.rotation_deg.max()),
+        float(errors.position.max()), float(errors.scale.max()), int(errors.right.sum()), seconds,
     )  # fmt: skip
 
 
 def measure(root: Path, sequence: bool = True) -> Row:
-    """Calibrate, register and adjust one scan."""
+    """Estimate relative poses, register, adjust."""
     scan = read_scan(root)
     camera, projector = truth_of(scan)
-    clouds, calibration = calibrate(scan, np.linalg.inv(camera) @ projector)
+    clouds, relative = relative_poses(scan, np.linalg.inv(camera) @ projector)
     start = time.process_time()
     found = register(clouds, sequence)
     middle = time.process_time()
@@ -165,20 +181,20 @@ def measure(root: Path, sequence: bool = True) -> Row:
         root.name,
         scan.projector.model,
         len(clouds),
-        calibration,
-        pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
-        pose_errors(joint.poses.T_world_camera, joint.poses.baseline, (camera, projector), end - middle),
+        relative,
+        summary_of(frame_errors(found.T_world_camera, found.baseline, (camera, projector)), middle - start),
+        summary_of(frame_errors(joint.poses.T_world_camera, joint.poses.baseline, (camera, projector)), end - middle),
         {e.frame: exclusion_sentence(e) for e in found.exclusions},
         tuple(map(uncertainty_sentence, found.uncertainties)),
     )
 
 
 def text_of(row: Row) -> str:
-    """The figures of one scan in a few lines."""
-    c = row.calibration
+    """A few lines."""
+    c = row.relative_pose
     lines = [
         f"{row.scan} ({row.frames} frames, {row.projector})",
-        f"  calibration   rotation {c.rotation_deg_median:.3f} deg (max {c.rotation_deg_max:.3f}), direction "
+        f"  relative pose rotation {c.rotation_deg_median:.3f} deg (max {c.rotation_deg_max:.3f}), direction "
         f"{c.direction_deg_median:.3f} deg (max {c.direction_deg_max:.3f}); within 1 sigma "
         f"{c.rotation_within_sigma:.0%} and {c.direction_within_sigma:.0%}, squared error over "
         f"covariance {c.mahalanobis:.2f}; {c.seconds_a_frame:.2f} s per frame",

@@ -21,7 +21,7 @@ _DEGENERACIES: dict[DegeneracyKind, str] = {
     "camera",
     "planar": "all points lie in one plane to within {:.2g} px, and a plane does not determine the pose; show parts at "
     "other depths in this view",
-    "epipole in view": "one device stands in the other's view of the object, and depth cannot be measured around that "
+    "epipole in view": "one device is in the other's view of the object, and depth cannot be measured around that "
     "place; move the projector to the side",
     "ambiguous": "a second pose explains the coordinates nearly as well; show parts at other depths in this view",
     "many outliers": "{:.0%} of the coordinates contradict the rest; check the pattern file and the light",

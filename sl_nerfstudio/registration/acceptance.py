@@ -67,7 +67,7 @@ def _largest_component(edges: Sequence[PairMatch], n: int) -> Bool[ndarray, "n"]
 
 
 def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph) -> float:
-    """Of a frame's points that other frames can judge, the share that agrees, as placed."""
+    """Of a frame's points that other frames can judge, the share that agrees."""
     S, settings = solution.S_world_camera[k], graph.settings.pair
     if S is None or not connected[k]:
         return 0.0

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import Pivots
 from sl_nerfstudio.registration.pair_match import PairMatch
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, PoseGraphSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PoseGraphSettings
 
 
 def cycle_consistency(
     edges: Sequence[PairMatch],
     pivots: Pivots,
     weight: Float64[ndarray, "edges"],
-    settings: PoseGraphSettings = DEFAULT_SETTINGS.pose_graph,
+    settings: PoseGraphSettings = REGISTRATION_DEFAULTS.pose_graph,
 ) -> Float64[ndarray, "edges"]:
     """For every edge the number of triangles it closes less those it fails to close.
 

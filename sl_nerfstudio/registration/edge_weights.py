@@ -7,27 +7,27 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.registration.pair_match import PairMatch
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, EdgeSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, EdgeSettings
 
 
-def is_accepted(match: PairMatch, settings: EdgeSettings = DEFAULT_SETTINGS.edge) -> bool:
+def is_accepted(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> bool:
     """Whether a pair overlaps and agrees well enough to be an edge."""
     return match.fitness > settings.least_fitness and match.overlap > settings.least_overlap
 
 
-def quality(match: PairMatch, settings: EdgeSettings = DEFAULT_SETTINGS.edge) -> float:
+def quality(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> float:
     """Between 0 and 1: which of two results for a pair is better, and which pair of a frame."""
     clear = match.second_best_ratio < settings.ambiguous_ratio
     return match.overlap * match.fitness**2 * (1.0 if clear else settings.ambiguous_weight)
 
 
-def is_ambiguous(match: PairMatch, settings: EdgeSettings = DEFAULT_SETTINGS.edge) -> bool:
+def is_ambiguous(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> bool:
     """Whether a clearly different similarity fits nearly as well."""
     return match.second_best_ratio > settings.ambiguous_ratio
 
 
 def edge_weights(
-    edges: Sequence[PairMatch], settings: EdgeSettings = DEFAULT_SETTINGS.edge
+    edges: Sequence[PairMatch], settings: EdgeSettings = REGISTRATION_DEFAULTS.edge
 ) -> Float64[ndarray, "edges"]:
     """Weight of each pair: smaller where its surfaces agree less than those of the scan's good pairs do.
 

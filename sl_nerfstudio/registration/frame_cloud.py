@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.triangulation import triangulate
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, FRAME_CLOUD_DEFAULTS, FrameCloudSettings
+from sl_nerfstudio.registration.settings import FRAME_CLOUD_DEFAULTS, REGISTRATION_DEFAULTS, FrameCloudSettings
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, ray_pairs
 from sl_nerfstudio.relative_pose.sampson import moved
@@ -129,7 +129,7 @@ def camera_depth(
 
 
 def reliable_points(
-    cloud: FrameCloud, largest_ratio: float = DEFAULT_SETTINGS.surface_map.largest_sigma_ratio
+    cloud: FrameCloud, largest_ratio: float = REGISTRATION_DEFAULTS.surface_map.largest_sigma_ratio
 ) -> Bool[ndarray, "n"]:
     """Points whose uncertainty is not far above the frame's median: those next to an epipole are left out."""
     sigma = cloud.sigma

@@ -49,7 +49,7 @@ def match_from(
     H = found.H[k] * D[:, None] * D / target_radius**2
     rms = max(float(np.sqrt(found.squares[k])) / target_radius, settings.least_rms)
     count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
-    information = H * (settings.independent_points / count / rms**2) + 1e-3 * np.eye(7)
+    information = H * (settings.independent_points / count / rms**2) + settings.least_information * np.eye(7)
     sigma = np.sqrt(1 / np.linalg.eigvalsh(_rotation_information(information))[0])
     return PairMatch(
         *pair,

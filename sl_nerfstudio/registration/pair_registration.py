@@ -11,7 +11,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pair_match import PairMatch, match_from
 from sl_nerfstudio.registration.rotation_search import around_guess, without_guess
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, PairSettings, Search
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PairSettings, Search
 from sl_nerfstudio.registration.surface_agreement import Side, agreement
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
@@ -24,7 +24,7 @@ def register_pair(
     search: Search,
     rng: np.random.Generator,
     guess: Similarity | None = None,
-    settings: PairSettings = DEFAULT_SETTINGS.pair,
+    settings: PairSettings = REGISTRATION_DEFAULTS.pair,
 ) -> PairMatch | None:
     """Frame `pair[0]` onto frame `pair[1]`; None where no similarity makes anything agree.
 
@@ -49,7 +49,7 @@ def register_pair(
     coarse = sides(settings.coarse_points)
     for width in settings.coarse_widths:
         found = _improved(coarse, found, width, log_scale, settings)
-    best = _ranked(coarse, found, 2 * settings.tolerance, settings)
+    best = _ranked(coarse, found, settings.coarse_tolerance_factor * settings.tolerance, settings)
     found = found[_distinct(found, best, settings.fine_starts, target, settings)]
     fine = sides(settings.fine_points)
     for width in settings.fine_widths:

@@ -14,7 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots, adjoint, chi_square, exp_at, node_at, residual
 from sl_nerfstudio.registration.pair_match import PairMatch
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, PoseGraphSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PoseGraphSettings
 from sl_nerfstudio.registration.spanning_tree import best_tree
 
 
@@ -33,7 +33,7 @@ def optimise_pose_graph(
     root: int,
     strength: Float64[ndarray, "edges"],
     weight: Float64[ndarray, "edges"],
-    settings: PoseGraphSettings = DEFAULT_SETTINGS.pose_graph,
+    settings: PoseGraphSettings = REGISTRATION_DEFAULTS.pose_graph,
 ) -> PoseGraphSolution:
     """The spanning tree from `root` that most edges agree with, then all edges together, robustly.
 

@@ -16,7 +16,7 @@ from sl_nerfstudio.registration.acceptance import accept_frames
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, RegistrationSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
@@ -27,7 +27,7 @@ def register(
     seed: int = 0,
     start: Float64[ndarray, "n 4 4"] | None = None,
     progress: Callable[[str], None] | None = None,
-    settings: RegistrationSettings = DEFAULT_SETTINGS,
+    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
     """Camera poses of all frames in one world.
 

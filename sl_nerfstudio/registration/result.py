@@ -20,10 +20,10 @@ class Edge:
 
 @dataclass(frozen=True)
 class SurfaceDisagrees:
-    """A frame was left out because its surface, as placed, does not agree with that of the other frames."""
+    """A frame was left out because its surface does not agree with that of the other frames."""
 
     frame: str
-    fitness: float  # share of its points, of those that others can judge, that agree
+    fitness: float  # of its points that other frames can judge, the share that agrees
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Registration:
     T_world_camera: Float64[ndarray, "n 4 4"]  # NaN where not registered
     baseline: Float64[ndarray, "n"]  # camera to projector; geometric mean 1 over the registered frames; NaN elsewhere
     registered: Bool[ndarray, "n"]
-    fitness: Float64[ndarray, "n"]  # of each frame with those it overlaps, as placed; NaN where not registered
+    fitness: Float64[ndarray, "n"]  # share of each frame's judged points that agree; NaN where not registered
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
     uncertainties: tuple[Uncertainty, ...]

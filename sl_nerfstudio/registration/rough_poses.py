@@ -7,14 +7,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, StartSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, StartSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 
 def starting_similarities(
     T_world_camera: Float64[ndarray, "n 4 4"],
     maps: Sequence[SurfaceMap],
-    settings: StartSettings = DEFAULT_SETTINGS.start,
+    settings: StartSettings = REGISTRATION_DEFAULTS.start,
 ) -> list[Similarity | None]:
     """`S_world_camera` of frames with known camera poses; None where a pose holds NaN.
 

@@ -77,6 +77,8 @@ class PairSettings:
     """radii within which a point agrees with a surface: errors of the relative pose bend surfaces by about this much"""
     search_tolerance: float = 0.15
     """the same while starts are compared"""
+    coarse_tolerance_factor: float = 2.0
+    """tolerance times this while the results of the first refinement are compared"""
     search_points: int = 200
     """points of each frame by which starts are compared"""
     coarse_points: int = 400
@@ -101,6 +103,8 @@ class PairSettings:
     """bound of the logarithm of the scale"""
     independent_points: float = 40.0
     """points of a pair that count as independent: errors of a surface are shared by neighbouring points"""
+    least_information: float = 1e-3
+    """information on each unknown that is assumed at least, in inverse squares of radians and radii"""
     least_rms: float = 0.015
     """radii: no pair is assumed to fit better, because errors of the relative pose bend the surfaces"""
     same_rotation_deg: float = 6.0
@@ -228,5 +232,5 @@ class RegistrationSettings:
 
 
 FRAME_CLOUD_DEFAULTS = FrameCloudSettings()
-DEFAULT_SETTINGS = RegistrationSettings()
+REGISTRATION_DEFAULTS = RegistrationSettings()
 KNOWN_LENGTH_DEFAULTS = KnownLengthSettings()

@@ -19,7 +19,7 @@ from sl_nerfstudio.geometry.devices.models import pixel_of
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.hypotheses import Hypotheses
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, AgreementSettings, PairSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 _kernel_weight = compiled(geman_mcclure_weight)
@@ -71,7 +71,7 @@ def agreement(
     hypotheses: Hypotheses,
     tolerance: float,
     width: float,
-    settings: AgreementSettings = DEFAULT_SETTINGS.pair.agreement,
+    settings: AgreementSettings = REGISTRATION_DEFAULTS.pair.agreement,
 ) -> Agreement:
     """Both ways, for k similarities `p_target = scale R p_source + t`.
 

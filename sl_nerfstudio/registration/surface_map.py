@@ -11,7 +11,7 @@ from sl_nerfstudio.geometry.devices import PARAMETERS, Device
 from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.plane_fit import solve_plane
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, reliable_points
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, SurfaceMapSettings
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, SurfaceMapSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
 
@@ -45,7 +45,9 @@ class SurfaceMap:
         return self.point.reshape(-1, 3)[chosen], self.normal.reshape(-1, 3)[chosen]
 
 
-def build_surface_map(cloud: FrameCloud, settings: SurfaceMapSettings = DEFAULT_SETTINGS.surface_map) -> SurfaceMap:
+def build_surface_map(
+    cloud: FrameCloud, settings: SurfaceMapSettings = REGISTRATION_DEFAULTS.surface_map
+) -> SurfaceMap:
     """Average a cloud on a lattice of camera pixels and fit planes to windows of inverse depth.
 
     The inverse depth of a plane is linear in the pixel, so steep parts are not biased by the averaging.

@@ -10,7 +10,7 @@ from numpy import ndarray
 from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
 from sl_nerfstudio.relative_pose.relief import plane_relief, rotation_relief
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, DegeneracyLimits
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, DegeneracyLimits
 
 DegeneracyKind = Literal[
     "few points",
@@ -54,7 +54,7 @@ def find_degeneracies(
     sigma_deg: tuple[float, float],
     second_best: EpipolarFit | None,
     blocks_of_pattern: int,
-    limits: DegeneracyLimits = DEFAULT_SETTINGS.degeneracy,
+    limits: DegeneracyLimits = RELATIVE_POSE_DEFAULTS.degeneracy,
 ) -> tuple[Degeneracy, ...]:
     """All degeneracies that a frame shows.
 
@@ -101,7 +101,7 @@ def ray_angles(found: EpipolarFit, rays: RayPairs) -> Float64[ndarray, "n"]:
 
 
 def epipole_in_view(
-    found: EpipolarFit, rays: RayPairs, sectors: int = DEFAULT_SETTINGS.degeneracy.epipole_sectors
+    found: EpipolarFit, rays: RayPairs, sectors: int = RELATIVE_POSE_DEFAULTS.degeneracy.epipole_sectors
 ) -> bool:
     """Whether one device, or its mirror image behind, lies within the cone of rays that see the object."""
     return _surrounded(found.t, rays.d_camera, sectors) or _surrounded(found.R.T @ found.t, rays.d_projector, sectors)

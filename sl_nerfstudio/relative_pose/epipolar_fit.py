@@ -12,7 +12,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
 from sl_nerfstudio.relative_pose.sampson import moved, sampson, sampson_jacobian
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, EpipolarFitSettings, Separation
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings, Separation
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class EpipolarFit:
     cost: float  # robust sum of squared residuals over that of outliers alone: 0 perfect, 1 nothing fits
 
 
-def noise_of(residual: Float64[ndarray, "n"], floor_px: float = DEFAULT_SETTINGS.fit.noise_floor_px) -> float:
+def noise_of(residual: Float64[ndarray, "n"], floor_px: float = RELATIVE_POSE_DEFAULTS.fit.noise_floor_px) -> float:
     """Robust standard deviation about zero."""
     return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), floor_px)
 
@@ -45,7 +45,7 @@ def fit_epipolar(
     R: Float64[ndarray, "3 3"],
     t: Float64[ndarray, "3"],
     rays: RayPairs,
-    settings: EpipolarFitSettings = DEFAULT_SETTINGS.fit,
+    settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit,
 ) -> EpipolarFit:
     """Levenberg-Marquardt from a start that is right to within a few degrees.
 
@@ -81,7 +81,7 @@ def _cost(r: Float64[ndarray, "n"], width: float) -> float:
 
 
 def covariance(
-    found: EpipolarFit, rays: RayPairs, settings: EpipolarFitSettings = DEFAULT_SETTINGS.fit
+    found: EpipolarFit, rays: RayPairs, settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit
 ) -> Float64[ndarray, "5 5"]:
     """Covariance of (w, b), robust against errors that depend on each other (the cluster-robust sandwich estimator).
 

@@ -17,7 +17,7 @@ from sl_nerfstudio.relative_pose.five_point import five_point_candidates, in_fro
 from sl_nerfstudio.relative_pose.pattern_blocks import block_count
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.sampson import direction_basis, sampson
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, RelativePoseSettings
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings
 
 
 class RelativePoseError(UserError):
@@ -67,7 +67,7 @@ def estimate_relative_pose(
     camera: Device,
     projector: Device,
     seed: int = 0,
-    settings: RelativePoseSettings = DEFAULT_SETTINGS,
+    settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS,
 ) -> RelativePose:
     """Relative pose of camera and projector from decoded pixels; any projector model, any lens.
 
@@ -117,7 +117,7 @@ def judge_relative_pose(
     uv_projector: Float[ndarray, "n 2"],
     camera: Device,
     projector: Device,
-    settings: RelativePoseSettings = DEFAULT_SETTINGS,
+    settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS,
 ) -> RelativePose:
     """A known pose, with the covariance and inliers that a frame's coordinates give it; degeneracies are not sought.
 

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, distinct, fit_epipolar
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, RelativePoseSettings, Separation
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings, Separation
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Candidate:
 
 
 def five_point_candidates(
-    rays: RayPairs, rng: np.random.Generator, settings: RelativePoseSettings = DEFAULT_SETTINGS
+    rays: RayPairs, rng: np.random.Generator, settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS
 ) -> list[Candidate]:
     """Distinct local optima with most rays meeting in front of both devices, the best first; may be empty."""
     s = settings.five_point

@@ -20,7 +20,7 @@ from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.sampson import moved, sampson, sampson_jacobian
 from sl_nerfstudio.relative_pose.settings import FOCAL_DEFAULTS, FocalSettings
 
-Pose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
+UnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def refine_projector_focal(
     )
 
 
-def _normal(pose: Pose, rays: RayPairs, around: tuple[RayPairs, RayPairs], width: float, h: float) -> _Normal:
+def _normal(pose: UnitPose, rays: RayPairs, around: tuple[RayPairs, RayPairs], width: float, h: float) -> _Normal:
     """`around`: the same correspondences with the logarithm of the focal length larger and smaller by `h`."""
     r, J = sampson_jacobian(*pose, rays)
     ahead, behind = (sampson(*pose, side) for side in around)
@@ -135,6 +135,6 @@ def _rays(frame: PosedFrame, index: Int64[ndarray, "m"], projector: Device, sett
     return rays
 
 
-def _noise(poses: Sequence[Pose], rays: Sequence[RayPairs], settings: FocalSettings) -> float:
+def _noise(poses: Sequence[UnitPose], rays: Sequence[RayPairs], settings: FocalSettings) -> float:
     residuals = [sampson(*pose, own) for pose, own in zip(poses, rays, strict=True)]
     return noise_of(np.concatenate(residuals), settings.fit.noise_floor_px)

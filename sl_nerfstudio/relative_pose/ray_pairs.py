@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian, unproject
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, PatternBlocks
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, PatternBlocks
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def ray_pairs(
     uv_projector: Float[ndarray, "n 2"],
     camera: Device,
     projector: Device,
-    blocks: PatternBlocks = DEFAULT_SETTINGS.blocks,
+    blocks: PatternBlocks = RELATIVE_POSE_DEFAULTS.blocks,
 ) -> tuple[RayPairs, Int64[ndarray, "m"]]:
     """Rays of correspondences, and the indices of those that have a ray in both devices.
 

@@ -6,10 +6,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, DegeneracyLimits
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, DegeneracyLimits
 
 
-def plane_relief(rays: RayPairs, settings: DegeneracyLimits = DEFAULT_SETTINGS.degeneracy) -> float:
+def plane_relief(rays: RayPairs, settings: DegeneracyLimits = RELATIVE_POSE_DEFAULTS.degeneracy) -> float:
     """Robust RMS, in projector pixels, of what the best homography between the two views leaves."""
     w = np.full(len(rays), 1.0)
     r = np.zeros(len(rays))
@@ -26,7 +26,7 @@ def plane_relief(rays: RayPairs, settings: DegeneracyLimits = DEFAULT_SETTINGS.d
     return _trimmed_rms(r, settings.relief_share)
 
 
-def rotation_relief(rays: RayPairs, settings: DegeneracyLimits = DEFAULT_SETTINGS.degeneracy) -> float:
+def rotation_relief(rays: RayPairs, settings: DegeneracyLimits = RELATIVE_POSE_DEFAULTS.degeneracy) -> float:
     """Robust RMS, in projector pixels, of what the best pure rotation between the two devices leaves."""
     w = np.full(len(rays), 1.0)
     r = np.zeros(len(rays))

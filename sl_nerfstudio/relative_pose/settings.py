@@ -148,12 +148,12 @@ class FocalSettings:
     final_iterations: int = 10
     """iterations of the fit of each pose in the end"""
     significant_sigmas: float = 3.0
-    """standard deviations of its own uncertainty by which the focal length must change"""
+    """standard deviations by which the focal length must change to be significant"""
     blocks: PatternBlocks = field(default_factory=PatternBlocks)
     """squares of the pattern"""
     fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
     """the fit of each pose in the end"""
 
 
-DEFAULT_SETTINGS = RelativePoseSettings()
+RELATIVE_POSE_DEFAULTS = RelativePoseSettings()
 FOCAL_DEFAULTS = FocalSettings()

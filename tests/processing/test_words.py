@@ -44,7 +44,7 @@ DEGENERACIES: dict[str, tuple[Degeneracy, str]] = {
     ),
     "epipole in view": (
         Degeneracy("epipole in view", ()),
-        "one device stands in the other's view of the object, and depth cannot be measured around that place; move the "
+        "one device is in the other's view of the object, and depth cannot be measured around that place; move the "
         "projector to the side",
     ),
     "ambiguous": (

@@ -13,7 +13,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pair_registration import register_pair
 from sl_nerfstudio.registration.rotation_search import around_guess, rotations, without_guess
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS, Search
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, Search
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, difference, on_a_ball, part_of, rolled, similarities_of
@@ -21,7 +21,7 @@ from tests.registration.analytic_clouds import clouds_of, difference, on_a_ball,
 SIZE, FRAMES = 100, 18  # 20 degrees from frame to frame
 RIG = rig_of(FRAMES, SIZE)
 TRUE = similarities_of(RIG.T_world_camera.numpy(), RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy())
-PAIR = DEFAULT_SETTINGS.pair
+PAIR = REGISTRATION_DEFAULTS.pair
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_neighbours_find_each_other(maps, i, j):
     assert found.fitness > 0.9
     assert found.fitness >= found.overlap > 0.4
     assert PAIR.least_rms <= found.rms < PAIR.tolerance
-    assert found.second_best_ratio < DEFAULT_SETTINGS.edge.ambiguous_ratio
+    assert found.second_best_ratio < REGISTRATION_DEFAULTS.edge.ambiguous_ratio
     assert found.rotation_sigma_deg < 1
 
 

@@ -12,7 +12,7 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unprojec
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.hypotheses import Hypotheses
-from sl_nerfstudio.registration.settings import DEFAULT_SETTINGS
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_agreement import Side, agreement, agreement_at
 from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
@@ -21,7 +21,7 @@ from tests.registration.analytic_clouds import clouds_of, similarities_of
 SIZE = 100
 RIG = rig_of(18, SIZE)
 TRUE = similarities_of(RIG.T_world_camera.numpy(), RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy())
-PENALTY = DEFAULT_SETTINGS.pair.agreement.behind_penalty
+PENALTY = REGISTRATION_DEFAULTS.pair.agreement.behind_penalty
 CAMERAS = {
     "pinhole": Device(40, 30, 50.0, 52.0, 19.0, 16.0),
     "lens": Device(40, 30, 50.0, 52.0, 19.0, 16.0, k1=-0.3, k2=0.1, p1=5e-3, p2=-8e-3),
@@ -60,7 +60,7 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
 
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: float, width: float, facing_least: float):
     """H, g and the shares and mean square of one similarity, point by point as the module's text says."""
-    limits = DEFAULT_SETTINGS.pair.agreement
+    limits = REGISTRATION_DEFAULTS.pair.agreement
     tau, kernel, hidden = (x * target.map.radius for x in (tolerance, width, limits.hidden_depth))
     H, g, shares, squares = np.zeros((7, 7)), np.zeros(7), [], []
     for mover, seen, reverse in ((source, target, False), (target, source, True)):
@@ -104,7 +104,7 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
         )
         for _ in range(4)
     ]
-    limits = replace(DEFAULT_SETTINGS.pair.agreement, least_facing_cosine=0.5)
+    limits = replace(REGISTRATION_DEFAULTS.pair.agreement, least_facing_cosine=0.5)
     found = agreement(*sides, stacked(*similarities), 0.05, 0.08, limits)
     for k, S in enumerate(similarities):
         H, g, shares, squares = plain_sums(*sides, S, 0.05, 0.08, 0.5)
@@ -168,6 +168,6 @@ def test_a_surface_moved_back_is_behind_until_it_is_hidden(maps):
 
 
 def test_agreement_of_one_similarity(maps):
-    found = agreement_at((maps[0], maps[1]), between(0, 1), np.random.default_rng(0), 0.04, DEFAULT_SETTINGS.pair)
+    found = agreement_at((maps[0], maps[1]), between(0, 1), np.random.default_rng(0), 0.04, REGISTRATION_DEFAULTS.pair)
     assert len(found.agreeing) == 1
     assert found.fitness[0] > 0.9

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.relative_pose.epipolar_fit import distinct
 from sl_nerfstudio.relative_pose.five_point import essential_matrices, five_point_candidates, in_front, poses_of
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs
-from sl_nerfstudio.relative_pose.settings import DEFAULT_SETTINGS, Separation
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, Separation
 from tests.relative_pose.two_views import PROJECTORS, View, view
 
 
@@ -78,7 +78,7 @@ def test_from_exact_rays_the_true_pose_is_the_best_candidate(seed, projector, ro
     best = found[0]
     assert max(errors_deg(best.fit.R, best.fit.t, frame)) < 1e-4
     assert best.in_front == 1.0
-    assert best.fit.noise_px == pytest.approx(DEFAULT_SETTINGS.fit.noise_floor_px)
+    assert best.fit.noise_px == pytest.approx(RELATIVE_POSE_DEFAULTS.fit.noise_floor_px)
     assert [c.fit.noise_px for c in found] == sorted(c.fit.noise_px for c in found)
     assert np.linalg.det(best.fit.R) == pytest.approx(1)
     assert np.linalg.norm(best.fit.t) == pytest.approx(1)
@@ -97,14 +97,16 @@ def test_a_third_of_wrong_coordinates_does_not_hide_the_true_pose(seed, projecto
 
 def test_candidates_differ_from_each_other():
     frame = view(relief=0.02, count=1000).noisy(0.3, seed=1)  # nearly a plane: two solutions
-    separation = DEFAULT_SETTINGS.five_point.solution_separation
+    separation = RELATIVE_POSE_DEFAULTS.five_point.solution_separation
     found = five_point_candidates(rays_of(frame), np.random.default_rng(0))
     assert len(found) > 1
     for i, a in enumerate(found):
         for b in found[:i]:
             assert distinct((a.fit.R, a.fit.t), (b.fit.R, b.fit.t), separation)
-    wide = replace(DEFAULT_SETTINGS.five_point, solution_separation=Separation(10.0, 10.0))
-    one = five_point_candidates(rays_of(frame), np.random.default_rng(0), replace(DEFAULT_SETTINGS, five_point=wide))
+    wide = replace(RELATIVE_POSE_DEFAULTS.five_point, solution_separation=Separation(10.0, 10.0))
+    one = five_point_candidates(
+        rays_of(frame), np.random.default_rng(0), replace(RELATIVE_POSE_DEFAULTS, five_point=wide)
+    )
     assert len(one) == 1
 
 

@@ -11,7 +11,7 @@ OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2))
 
 
 def views_with(projector: str, factor: float, noise: float = 0.0):
-    """Frames calibrated with a focal length that is `factor` times the true one, and that projector."""
+    """Frames with the relative poses that a focal length `factor` times the true one gives, and that projector."""
     wrong = replace(PROJECTORS[projector], fl_x=PROJECTORS[projector].fl_x * factor,
                     fl_y=PROJECTORS[projector].fl_y * factor)  # fmt: skip
     views = []

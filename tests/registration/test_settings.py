@@ -1,0 +1,93 @@
+"""Settings of relative pose estimation and of registration: documented, frozen, used, and obeyed."""
+
+import ast
+import dataclasses
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio import registration, relative_pose
+from sl_nerfstudio.registration import settings as registration_settings
+from sl_nerfstudio.registration.frame_cloud import frame_cloud
+from sl_nerfstudio.registration.settings import FrameCloudSettings
+from sl_nerfstudio.relative_pose import settings as relative_pose_settings
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
+from tests.relative_pose.two_views import view
+
+MODULES = {relative_pose_settings: relative_pose, registration_settings: registration}
+CLASSES = [
+    (module, cls)
+    for module in MODULES
+    for cls in vars(module).values()
+    if dataclasses.is_dataclass(cls) and isinstance(cls, type)
+]
+
+
+@pytest.mark.parametrize(("module", "cls"), CLASSES, ids=lambda x: getattr(x, "__name__", ""))
+def test_every_setting_is_frozen_documented_and_used(module, cls):
+    source = Path(module.__file__)
+    code = "\n".join(p.read_text() for p in source.parent.glob("*.py") if p != source)
+    tree = ast.parse(source.read_text())
+    body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__).body
+    texts = {
+        ast.unparse(field.target): following.value.value
+        for field, following in pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(following, ast.Expr)
+    }
+    assert cls.__dataclass_params__.frozen
+    for field in dataclasses.fields(cls):
+        assert re.search(r"\w+ \w+", texts[field.name]), field.name
+        assert re.search(rf"\.{field.name}\b", code), f"{cls.__name__}.{field.name} is not used"
+
+
+@pytest.mark.parametrize("package", [relative_pose, registration], ids=["relative_pose", "registration"])
+def test_no_other_file_has_numbers_of_its_own(package):
+    """Numbers that decide something are settings; a private constant elsewhere would hide one."""
+    for path in Path(package.__file__).parent.glob("*.py"):
+        if path.name == "settings.py":
+            continue
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.Assign):
+                held = [n.value for n in ast.walk(node.value) if isinstance(n, ast.Constant)]
+                numbers = [v for v in held if isinstance(v, int | float) and not isinstance(v, bool)]
+                name = ast.unparse(node.targets[0])
+                assert not numbers or name == "_METRES", f"{path.name}: {name}"
+
+
+def test_the_limits_of_a_relative_pose_are_obeyed():
+    frame = view(count=300).noisy(0.3, seed=0)
+    with pytest.raises(RelativePoseError, match=r"300 decoded pixels are too few .* \(at least 301\)"):
+        estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, fewest=301))
+    with pytest.raises(RelativePoseError, match=r"300 decoded pixels are too few to judge .* \(at least 301\)"):
+        judge_relative_pose(
+            frame.T_camera_projector, *frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, fewest=301)
+        )
+    with pytest.raises(RelativePoseError, match="best relative pose fits"):
+        estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, least_inlier_share=1.1))
+    narrow = estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, inlier_sigmas=1.0))
+    assert 0.5 < narrow.inliers.mean() < 0.8  # of a normal distribution: 0.68
+    floor = replace(RELATIVE_POSE_DEFAULTS, fit=EpipolarFitSettings(noise_floor_px=0.5))
+    assert estimate_relative_pose(*view(count=300).arguments, settings=floor).residual_px == 0.5
+
+
+def test_the_limit_of_a_cloud_is_obeyed():
+    frame = view(count=100)
+    coords = np.full((frame.camera.h, frame.camera.w, 2), np.nan, dtype=np.float32)
+    column, row = np.floor(frame.uv_camera).astype(int).T
+    coords[row, column] = frame.uv_projector
+    count = int(np.isfinite(coords).all(-1).sum())
+    uv = np.argwhere(np.isfinite(coords).all(-1))[:, ::-1] + 0.5
+    pose = judge_relative_pose(
+        frame.T_camera_projector, uv, coords[np.isfinite(coords).all(-1)].astype(np.float64),
+        frame.camera, frame.projector,
+    )  # fmt: skip
+    pose = replace(pose, inliers=np.full(count, True))
+    devices = frame.camera, frame.projector
+    assert len(frame_cloud("a", coords, *devices, pose).points) == count
+    with pytest.raises(RelativePoseError, match=rf"a: only {count} points agree .* \(at least 1000\)"):
+        frame_cloud("a", coords, *devices, pose, FrameCloudSettings(fewest_points=1000))
