@@ -20,6 +20,7 @@ from benchmarks.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -63,7 +64,6 @@ def from_errors(scan: Scan, setup: Setup) -> Scan:
 
 def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, float]) -> Row:
     """Adjust one set of starting poses."""
-    start, truth = setup.start, (setup.truth.T_world_camera, setup.truth.T_world_projector)
     begin = time.monotonic()
     found = adjust_scan(
         from_errors(loaded.scan, setup),
@@ -75,8 +75,9 @@ def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, flo
     )
     seconds = time.monotonic() - begin
     S = loaded.S_scene_world.inverse()
-    end = compare_poses(S.poses(found.T_scene_camera.numpy()), S.poses(found.T_scene_projector.numpy()), *truth).camera
-    before = compare_poses(start.T_world_camera, start.T_world_projector, *truth).camera
+    adjusted = DevicePoses(found.T_scene_camera.numpy(), found.T_scene_projector.numpy()).mapped(S)
+    end = compare_poses(adjusted, setup.truth).camera
+    before = compare_poses(setup.start, setup.truth).camera
     return Row(
         seed,
         *level,

@@ -21,6 +21,7 @@ from numpy import ndarray
 
 from benchmarks.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
@@ -74,12 +75,9 @@ class Row:
     remarks: tuple[str, ...]
 
 
-def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
+def truth_of(scan: Scan) -> DevicePoses:
     """True poses, or the ones in the file."""
-    truth = read_ground_truth(scan)
-    if truth.T_world_camera is None or truth.T_world_projector is None:
-        return scan.T_world_camera, scan.T_world_projector
-    return truth.T_world_camera, truth.T_world_projector
+    return read_ground_truth(scan).poses or scan.poses
 
 
 def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Calibration]:
@@ -120,7 +118,7 @@ def calibrate(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], Cal
     )
 
 
-def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray], seconds: float) -> Poses:
+def pose_errors(T_camera: ndarray, baseline: ndarray, truth: DevicePoses, seconds: float) -> Poses:
     """Errors of registered frames after one similarity that fits cameras and the places they look at.
 
     `truth` holds the true poses of cameras and projectors.
@@ -128,8 +126,8 @@ def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndar
     from scipy.spatial.transform import Rotation
 
     known = np.isfinite(baseline)
-    true = truth[0][known]
-    true_baseline = np.linalg.norm(truth[0][:, :3, 3] - truth[1][:, :3, 3], axis=1)[known]
+    true = truth.T_world_camera[known]
+    true_baseline = truth.baseline[known]
     found, length = T_camera[known], baseline[known]
     ahead = np.linalg.norm(true[:, :3, 3] - true[:, :3, 3].mean(0), axis=1).mean()
     ratio = float(np.exp(np.mean(np.log(true_baseline / length))))
@@ -152,8 +150,8 @@ def pose_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndar
 def measure(root: Path, sequence: bool = True) -> Row:
     """Calibrate, register, adjust."""
     scan = read_scan(root)
-    camera, projector = truth_of(scan)
-    clouds, calibration = calibrate(scan, np.linalg.inv(camera) @ projector)
+    truth = truth_of(scan)
+    clouds, calibration = calibrate(scan, truth.T_camera_projector)
     start = time.process_time()
     found = register(clouds, sequence)
     middle = time.process_time()
@@ -165,8 +163,8 @@ def measure(root: Path, sequence: bool = True) -> Row:
         scan.projector.model,
         len(clouds),
         calibration,
-        pose_errors(found.T_world_camera, found.baseline, (camera, projector), middle - start),
-        pose_errors(joint.T_world_camera, baseline, (camera, projector), end - middle),
+        pose_errors(found.T_world_camera, found.baseline, truth, middle - start),
+        pose_errors(joint.T_world_camera, baseline, truth, end - middle),
         found.reasons,
         found.remarks,
     )

@@ -1,1 +1,4 @@
-"""What others do, as a yardstick: fusion, rigid registration, window matching."""
+"""Classical methods to compare with: TSDF fusion, ICP registration, window matching.
+
+In: a scan with poses, or the nodes that the decoder found. Out: a mesh, registered poses, or matched nodes.
+"""

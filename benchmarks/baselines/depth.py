@@ -1,4 +1,4 @@
-"""Triangulated depth maps of frames, as classical fusion needs them."""
+"""Triangulated depth maps of frames, for classical fusion."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan import Frame, Scan
 
 _LEAST_REGION = 0.01  # of the frame's known pixels; smaller islands of depth are wrong decodings
-_STEP_PIXELS = 8.0  # neighbours whose depth differs by more than this many pixel footprints do not belong together
+_STEP_PIXELS = 8.0  # neighbours whose depth differs by more than this many pixel footprints are not connected
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def triangulated_depth(
 
 
 def drop_islands(depth: Float[ndarray, "h w"], step: float) -> Float[ndarray, "h w"]:
-    """Set small regions to 0; neighbours belong together if their depths differ by less than `step` times depth."""
+    """Set small regions to 0; neighbours are connected if their depths differ by less than `step` times depth."""
     h, w = depth.shape
     index = np.arange(h * w).reshape(h, w)
     pairs = [
@@ -66,7 +66,7 @@ def _joined(a: ndarray, b: ndarray, depth_a: ndarray, depth_b: ndarray, step: fl
 
 
 def _undistorted(depth: Float[ndarray, "h w"], camera: Device) -> DepthMap:
-    """The map as the same camera without distortion would see it (nearest pixel: depths must not be mixed)."""
+    """The map as the same camera without distortion would see it (nearest pixel: depths must not be interpolated)."""
     pinhole = Device(camera.w, camera.h, camera.fl_x, camera.fl_y, camera.cx, camera.cy)
     if pinhole == camera:
         return DepthMap(depth, pinhole)

@@ -6,7 +6,6 @@ of the baselines where nothing is; position and orientation to the least-squares
 """
 
 import math
-import re
 
 import torch
 from jaxtyping import Float
@@ -23,12 +22,6 @@ _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
 def baselines(rig: Rig) -> Float[Tensor, "frames"]:
     """Distance between camera and projector of every frame."""
     return rig.T_camera_projector[:, :3, 3].norm(dim=-1)
-
-
-def known_baseline(source: str, frames: int) -> int | None:
-    """The frame whose baseline a scan's `scale.source` names ("baseline of frame 0"), or None."""
-    match = re.search(r"baseline of frame (\d+)", source)
-    return int(match[1]) if match and int(match[1]) < frames else None
 
 
 def baseline_scale(start: Rig, rig: Rig, frame: int | None) -> float:

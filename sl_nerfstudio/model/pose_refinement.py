@@ -16,15 +16,16 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.dataparser.samples import PixelSamples
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan import Scan, measured_length
 
 _HELD_OUT_PER_FRAME = 300
 # times the decoding noise: beyond it a residual is a wrong decoding, or something else hides the place
@@ -79,8 +80,8 @@ class ScanAdjustment:
 
 def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
     """The scan's devices at their starting poses, in the scene frame."""
-    camera = torch.from_numpy(S_scene_world.poses(scan.T_world_camera))
-    projector = torch.from_numpy(S_scene_world.poses(scan.T_world_projector))
+    poses = scan.poses.mapped(S_scene_world)
+    camera, projector = torch.from_numpy(poses.T_world_camera), torch.from_numpy(poses.T_world_projector)
     return Rig(
         camera=Intrinsics.of([frame.camera for frame in scan.frames], torch.float64),
         projector=Intrinsics.of(scan.projector, torch.float64),
@@ -91,9 +92,8 @@ def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
     """Stated uncertainty of each frame's starting pose, else the defaults; in scene units and radian."""
-    baseline = np.linalg.norm(scan.T_world_camera[:, :3, 3] - scan.T_world_projector[:, :3, 3], axis=1)
     rows = []
-    for frame, length in zip(scan.frames, baseline * S_scene_world.scale, strict=True):
+    for frame, length in zip(scan.frames, scan.poses.baseline * S_scene_world.scale, strict=True):
         stated = frame.pose_sigma
         if stated is None:
             rows.append(
@@ -132,18 +132,23 @@ def adjust_scan(
     maps, held_out = maps_and_held_out(scan, samples)
     stated = pose_prior(scan, S_scene_world, prior)
     found = adjust(constrained(mode, start), maps, stated, mode, settings)
-    rig = restore(start, found.rig, _scale(scan, mode, start, found.rig, stated))
+    rig = restore(start, found.rig, _scale(scan, S_scene_world, mode, start, found.rig, stated))
     verdict = cross_validate(start, rig, held_out, maps, guard_width(found.noise_px))
     sigma = found.sigma if verdict.better else _prior_sigma(stated)
     return ScanAdjustment(rig if verdict.better else start, sigma, verdict, found.noise_px, found.intrinsics)
 
 
-def _scale(scan: Scan, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
-    """The factor by which the adjusted rig gets the scan's lengths."""
-    frame = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
-    if frame is None and scan.scale.known and mode != "known-rig":
-        return agreeing_scale(start, rig, prior)
-    return baseline_scale(start, rig, frame)
+def _scale(scan: Scan, S_scene_world: Similarity, mode: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
+    """The factor by which the adjusted rig gets the scan's lengths; a known rig keeps its baselines."""
+    known = scan.scale
+    if known.baseline_of is not None:
+        return baseline_scale(start, rig, scan.index_of(known.baseline_of))
+    if not known.known or mode == "known-rig":
+        return baseline_scale(start, rig, None)
+    if known.bar is not None:
+        poses = DevicePoses(rig.T_world_camera.numpy(), rig.T_world_projector.numpy())
+        return known.bar.length * S_scene_world.scale / measured_length(scan, known.bar, poses)
+    return agreeing_scale(start, rig, prior)
 
 
 def _prior_sigma(prior: PosePrior) -> Float[Tensor, "frames 12"]:

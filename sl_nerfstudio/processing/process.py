@@ -33,7 +33,7 @@ from sl_nerfstudio.relative_pose.estimation import RelativePose, estimate_relati
 from sl_nerfstudio.relative_pose.projector_focal import CalibratedView, refine_projector_focal
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
-from sl_nerfstudio.scan.types import Scale
+from sl_nerfstudio.scan.types import UNITS, PickedPixel, Scale, ScaleBar
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 REPORT = "processing.html"
@@ -178,7 +178,7 @@ def _place(
         _require_used(known, clouds)
         factor = scale_to(known, known.unit, clouds, joint.T_world_camera, joint.T_world_projector)
         joint, units = joint.scaled(factor), known.unit
-        scale = Scale(True, _source_in_scan(known, clouds, registration))
+        scale = stated_scale(known)
     return Placed(registration, joint, units, scale)
 
 
@@ -204,12 +204,13 @@ def _require_used(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
         )
 
 
-def _source_in_scan(known: KnownLength, clouds: Sequence[FrameCloud], registration: Registration) -> str:
-    """The known length in words; a baseline by the frame's number among those that are in the scan."""
-    if known.pixels:
-        return known.source
-    index = [cloud.name for cloud in clouds].index(known.frames[0])
-    return f"baseline of frame {int(registration.registered[:index].sum())} ({known.frames[0]})"
+def stated_scale(known: KnownLength) -> Scale:
+    """The known length as the scan states it; its frames are given by name."""
+    if not known.pixels:
+        return Scale(True, known.source, baseline_of=known.frames[0])
+    first, second = (PickedPixel(*end) for end in zip(known.frames, known.pixels, strict=True))
+    length = known.metres / (UNITS[known.unit] or 1.0)
+    return Scale(True, known.source, bar=ScaleBar((first, second), length))
 
 
 def _too_few(

@@ -1,4 +1,4 @@
-"""What a person must know to make a run again: settings, versions, convergence; as plain JSON values."""
+"""What a person needs to repeat a run: settings, versions, convergence; as plain JSON values."""
 
 import math
 import platform
@@ -18,7 +18,7 @@ _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_
 def training_record(run: TrainedRun) -> dict[str, Any]:
     """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
 
-    The last says how intrinsics were changed, and what the captures say against them ("": nothing).
+    The last describes how intrinsics were changed, and what in the captures contradicts them ("": nothing).
     """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
@@ -34,18 +34,18 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
 
 
 def _changed(scan: Scan) -> str:
-    """That the run's intrinsics are not those of the scan folder; "" if they are."""
+    """How the run's intrinsics differ from those of the scan folder; "" if they do not."""
     if not scan.intrinsics_change:
         return ""
     camera, projector = 100 * scan.intrinsics_change.camera.focal, 100 * scan.intrinsics_change.projector.focal
     return (
         f"The intrinsics are not those of the scan folder: focal length of the camera {camera:+.2f} %, of the "
-        f"projector {projector:+.2f} %. The transforms.json of the refined poses holds them"
+        f"projector {projector:+.2f} %. The transforms.json of the refined poses contains them"
     )
 
 
 def run_settings(config: Any) -> dict[str, Any]:
-    """The settings of a run that its result depends on, from nerfstudio's trainer configuration."""
+    """The settings that determine the result of a run, from nerfstudio's trainer configuration."""
     chosen = {name: plain(getattr(config, name)) for name in _SETTINGS if hasattr(config, name)}
     return {
         **chosen,
@@ -57,7 +57,7 @@ def run_settings(config: Any) -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that compute."""
+    """Versions of the packages that do the computation."""
     found = {}
     for name in _PACKAGES:
         try:
@@ -68,7 +68,7 @@ def package_versions() -> dict[str, str]:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, paths, types, numbers and containers as JSON has them; what is not finite becomes None."""
+    """Dataclasses, paths, types, numbers and containers as JSON values; numbers that are not finite become None."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")}
     if isinstance(value, dict):

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, DeviceKind, Intrinsics, project, unproject
-from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 
 Distortion = tuple[float, float, float, float]
@@ -34,7 +34,7 @@ class DeviceOptions:
     projector_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
 
 
-def make_devices(scene: Scene, poses: Poses, pattern_size: tuple[int, int], options: DeviceOptions) -> Pair:
+def make_devices(scene: Scene, poses: DevicePoses, pattern_size: tuple[int, int], options: DeviceOptions) -> Pair:
     """A square camera and a projector of the pattern's (w, h), zoomed so that every frame holds the whole object."""
     n, (w, h) = options.resolution, pattern_size
     # principal points a little off the middle, as real devices have them

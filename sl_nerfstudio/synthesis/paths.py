@@ -1,12 +1,12 @@
 """Where camera and projector stand in each frame: smooth, hand-held-like paths around the object."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.synthesis.scene import Scene
 
 PathKind = Literal["hand-held", "rigid-rig", "static-projector"]
@@ -18,15 +18,7 @@ _CAMERA_ROLL, _PROJECTOR_ROLL = np.radians(25.0), np.radians(35.0)
 _FRAMES_A_LAP = 30
 
 
-@dataclass(frozen=True)
-class Poses:
-    """Device-to-world poses of all frames, devices looking along -z with y up."""
-
-    T_world_camera: Float64[ndarray, "n 4 4"]
-    T_world_projector: Float64[ndarray, "n 4 4"]
-
-
-def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generator) -> Poses:
+def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generator) -> DevicePoses:
     """Poses of `frames` captures, in millimetres, about the scene's centre.
 
     hand-held: both devices move on their own, so that their relative pose differs in every frame;
@@ -39,8 +31,8 @@ def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generat
     camera = _around_the_object(scene, t, rng)
     if kind == "rigid-rig":
         T_camera_projector = _rig(scene)
-        return Poses(camera, camera @ T_camera_projector)
-    return Poses(camera, _beside(scene, camera, t, rng))
+        return DevicePoses(camera, camera @ T_camera_projector)
+    return DevicePoses(camera, _beside(scene, camera, t, rng))
 
 
 def look_at(
@@ -141,7 +133,7 @@ def _rig(scene: Scene) -> Float64[ndarray, "4 4"]:
     return T
 
 
-def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> Poses:
+def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> DevicePoses:
     """A projector that stands still, and a camera that circles about its line of sight, nearer and farther."""
     azimuth, elevation = np.array([rng.uniform(0, 2 * np.pi)]), np.radians([50.0])
     out = _direction(azimuth, elevation)
@@ -152,4 +144,4 @@ def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Gene
     direction = _tilt(np.broadcast_to(out, (len(t), 3)), angle, bearing)
     position = scene.centre + _distance(scene, t, rng)[:, None] * direction
     camera = look_at(position, _aim(scene, t, rng), _CAMERA_ROLL * wander(t, rng, 4.0))
-    return Poses(camera, np.repeat(projector, len(t), axis=0))
+    return DevicePoses(camera, np.repeat(projector, len(t), axis=0))

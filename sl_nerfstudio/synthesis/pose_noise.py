@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.se3 import exp_so3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.devices import Pair
-from sl_nerfstudio.synthesis.paths import Poses
 
 _FEWEST_POINTS = 20  # with fewer, a frame is not registered anew
 
@@ -56,13 +56,13 @@ class Correspondences:
 
 
 def disturb_poses(
-    truth: Poses,
+    truth: DevicePoses,
     noise: PoseNoise,
     centre: Float[ndarray, "3"],
     devices: Pair,
     matches: list[Correspondences],
     rng: np.random.Generator,
-) -> Poses:
+) -> DevicePoses:
     """Starting poses: auto-calibration errors, registration of what they yield, registration errors."""
     if noise.is_zero:
         return truth
@@ -74,7 +74,7 @@ def disturb_poses(
             camera[n] = _registered(camera[n], calibrated[n], devices, match)
     motion = _motions_about(centre, len(camera), noise, rng)
     camera = motion @ camera
-    return Poses(camera, camera @ calibrated)
+    return DevicePoses(camera, camera @ calibrated)
 
 
 def disturb_relative(
@@ -94,7 +94,7 @@ def disturb_relative(
     return out
 
 
-def pose_sigma(truth: Poses, start: Poses, centre: Float[ndarray, "3"]) -> PoseSigma | None:
+def pose_sigma(truth: DevicePoses, start: DevicePoses, centre: Float[ndarray, "3"]) -> PoseSigma | None:
     """Standard deviation along each axis (RMS length / sqrt(3)) of the errors that `start` really has.
 
     "Camera" errors are those of the frame as a whole, turning about `centre`, where the translation is taken.

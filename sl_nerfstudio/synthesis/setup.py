@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.pattern.files import read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.types import PoseSigma
@@ -14,7 +15,7 @@ from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.devices import DeviceOptions, Pair, make_devices
 from sl_nerfstudio.synthesis.noise import Cells
-from sl_nerfstudio.synthesis.paths import DISTANCE, Poses, make_paths
+from sl_nerfstudio.synthesis.paths import DISTANCE, make_paths
 from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, pose_sigma
 from sl_nerfstudio.synthesis.ray_casting import Caster
 from sl_nerfstudio.synthesis.render import Capture, capture, look
@@ -51,8 +52,8 @@ class Setup:
     grid: GridPattern | None  # None: the pattern is a plain image
     cells: Cells
     appearance: Appearance
-    truth: Poses
-    start: Poses
+    truth: DevicePoses
+    start: DevicePoses
     sigma: PoseSigma | None
 
     def render(self, frame: int, supersampling: int) -> Capture:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.pattern.files import encode_grid
 from sl_nerfstudio.pattern.normalise import normalise_locally
@@ -21,7 +22,6 @@ from sl_nerfstudio.scan.writing import ScanWriter, device_fields, sigma_fields
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.mesh_file import encode_ply
 from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords, disturb_image
-from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
@@ -96,7 +96,11 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
         image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
         coords = disturb_coords(rendered.coords, rendered.mask, setup.cells, noise, decoder)
         pattern = _pattern_image(image, rendered.mask, setup)
-        yield SyntheticFrame(f"frame_{index:05d}", image, pattern, coords, rendered.mask)
+        yield SyntheticFrame(_frame_name(index), image, pattern, coords, rendered.mask)
+
+
+def _frame_name(index: int) -> str:
+    return f"frame_{index:05d}"
 
 
 def _pattern_image(image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
@@ -115,7 +119,7 @@ def _scan_writer(config: SynthConfig, setup: Setup, root: Path) -> ScanWriter:
     extra: dict[str, Any] = {}
     if config.pose_sigma and setup.sigma is not None:
         extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
-    scale = Scale(True, "baseline of frame 0") if config.scale_known else Scale(False)
+    scale = Scale(True, "baseline of frame 0", _frame_name(0)) if config.scale_known else Scale(False)
     return ScanWriter(
         root,
         units=config.units,
@@ -135,7 +139,7 @@ def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
     )
 
 
-def _world_poses(config: SynthConfig, setup: Setup, poses: Poses, index: int) -> TwoPoses:
+def _world_poses(config: SynthConfig, setup: Setup, poses: DevicePoses, index: int) -> TwoPoses:
     """Camera and projector of one frame in the axes and the unit that are written."""
     S_world_scene = world_from_scene(config, setup.scene)
     return S_world_scene.poses(poses.T_world_camera[index]), S_world_scene.poses(poses.T_world_projector[index])
