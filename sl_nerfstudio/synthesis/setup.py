@@ -1,4 +1,4 @@
-"""Everything that is settled before the first frame is rendered: scene, devices, paths and their errors."""
+"""Everything that is fixed before the first frame is rendered: scene, devices, paths and their errors."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -13,20 +13,20 @@ from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
-from sl_nerfstudio.synthesis.devices import DeviceOptions, Pair, make_devices
+from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices
 from sl_nerfstudio.synthesis.noise import Cells
 from sl_nerfstudio.synthesis.paths import DISTANCE, make_paths
-from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, pose_sigma
-from sl_nerfstudio.synthesis.ray_casting import Caster
-from sl_nerfstudio.synthesis.render import Capture, capture, look
+from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, pose_sigma
+from sl_nerfstudio.synthesis.ray_casting import RayCaster
+from sl_nerfstudio.synthesis.render import RenderedCapture, render_capture, visible_points
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.scenes import make_scene
 
-_REGISTRATION_GRID = 28  # pixels a side that a frame's disturbed points are registered by
+_REGISTRATION_GRID = 28  # pixels per side of the grid with which a frame's disturbed points are registered
 
 
 class Stream(IntEnum):
-    """Every use of randomness has its own stream: changing one leaves the others as they were."""
+    """Every use of randomness has its own stream: a change in one does not affect the others."""
 
     PATHS = 1
     TEXTURE = 2
@@ -43,11 +43,11 @@ def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Genera
 
 @dataclass(frozen=True)
 class Setup:
-    """A scan before it is taken; lengths in millimetres, poses in the scene's axes."""
+    """A scan before it is rendered; lengths in millimetres, poses in the scene's axes."""
 
     scene: Scene
-    caster: Caster
-    devices: Pair
+    caster: RayCaster
+    devices: DevicePair
     pattern: Float32[ndarray, "h w"]
     grid: GridPattern | None  # None: the pattern is a plain image
     cells: Cells
@@ -56,9 +56,9 @@ class Setup:
     start: DevicePoses
     sigma: PoseSigma | None
 
-    def render(self, frame: int, supersampling: int) -> Capture:
+    def render(self, frame: int, supersampling: int) -> RenderedCapture:
         """Frame number `frame`, without noise."""
-        return capture(
+        return render_capture(
             self.caster,
             self.devices,
             self.truth.T_world_camera[frame],
@@ -70,7 +70,7 @@ class Setup:
 
 
 def make_setup(config: SynthConfig) -> Setup:
-    """Scene, devices, paths and their errors, as the configuration says. Raises UserError for bad files."""
+    """Scene, devices, paths and their errors, as configured. Raises UserError for bad files."""
     scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
     pattern, grid = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
@@ -78,7 +78,7 @@ def make_setup(config: SynthConfig) -> Setup:
         config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
     )
     devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
-    caster = Caster(scene)
+    caster = RayCaster(scene)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
@@ -98,7 +98,7 @@ def make_setup(config: SynthConfig) -> Setup:
 
 
 def make_cells(pattern: Float32[ndarray, "h w"], grid: GridPattern | None) -> Cells:
-    """The grid's cells; a plain image counts as 40 cells along its longer side."""
+    """The grid's cells; a plain image is treated as 40 cells along its longer side."""
     h, w = pattern.shape
     if grid is not None:
         return Cells(grid.period, grid.x0, grid.y0, grid.rows, grid.columns, w, h)
@@ -114,10 +114,13 @@ def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], GridPat
 
 
 def _matches(
-    caster: Caster, devices: Pair, T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]
-) -> Correspondences:
+    caster: RayCaster,
+    devices: DevicePair,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+) -> ExactMatches:
     """Exact correspondences on a coarse grid of pixels."""
     place = (np.arange(_REGISTRATION_GRID) + 0.5) / _REGISTRATION_GRID
     uv = np.stack(np.meshgrid(place * devices.camera.w, place * devices.camera.h), -1).reshape(-1, 2)
-    sight = look(caster, devices, T_world_camera, T_world_projector, uv)
-    return Correspondences(uv[sight.lit], sight.uv_projector[sight.lit], sight.p_world[sight.lit])
+    seen = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    return ExactMatches(uv[seen.lit], seen.uv_projector[seen.lit], seen.p_world[seen.lit])

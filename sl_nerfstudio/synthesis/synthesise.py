@@ -26,7 +26,7 @@ from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
-GAIN = 1.05  # exposure: a surface of mean albedo, perpendicular, in full light, comes to 0.82 of full scale
+GAIN = 1.05  # exposure: a surface of mean albedo that faces the lamp in full light has 0.82 of full scale
 _WINDOW = 0.8  # of local normalisation, in periods of the pattern
 
 
@@ -42,7 +42,7 @@ class SyntheticFrame:
 
 
 def synthesise(config: SynthConfig, output: Path) -> None:
-    """Make a scan folder at `output`, with its truth under ground_truth/.
+    """Make a scan folder at `output`, with the truth under ground_truth/.
 
     With `config.images_only`, `output` holds images, pattern and intrinsics, and ground_truth/ is a complete scan
     with exact coordinates and poses. Raises UserError for bad flags or files, or an output that is not empty.
@@ -76,7 +76,7 @@ def without_noise(config: SynthConfig) -> SynthConfig:
 
 
 def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
-    """How what is written lies to what is rendered: the unit, and a turn and shift of the world if asked for."""
+    """The map from the rendered scene to the written world: the unit, and a random rotation and shift on request."""
     scale = MILLIMETRES[config.units]
     if config.world_turn is None:
         return Similarity(scale, np.eye(3), np.zeros(3))
@@ -104,8 +104,8 @@ def _frame_name(index: int) -> str:
 
 
 def _pattern_image(image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
-    """The captured image with albedo, shading and fall-off taken out."""
-    # both devices are about equally far away, so focal lengths tell how large a period appears
+    """The captured image without albedo, shading and fall-off."""
+    # both devices are about equally far away, so the focal lengths give the apparent size of a period
     period = setup.cells.period * setup.devices.camera.fl_x / setup.devices.projector.fl_x
     mean, contrast = float(setup.pattern.mean()), float(setup.pattern.std())
     return _to_8_bit(normalise_locally(image / 255, mask, _WINDOW * period, mean, contrast))
@@ -140,7 +140,7 @@ def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
 
 
 def _world_poses(config: SynthConfig, setup: Setup, poses: DevicePoses, index: int) -> TwoPoses:
-    """Camera and projector of one frame in the axes and the unit that are written."""
+    """Camera and projector of one frame in the written axes and unit."""
     S_world_scene = world_from_scene(config, setup.scene)
     return S_world_scene.poses(poses.T_world_camera[index]), S_world_scene.poses(poses.T_world_projector[index])
 
@@ -167,7 +167,7 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, mesh: str)
 
 
 def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
-    """What a decoder starts from, and apart from it the scan that it should come to."""
+    """The images that a decoder starts from, and separately the scan that it should produce."""
     exact = replace(config, noise=0.0, missing=0.0, wrong=0.0, pose_sigma=False)
     with _scan_writer(exact, setup, output / "ground_truth") as truth:
         for index, frame in enumerate(_frames(exact, setup)):

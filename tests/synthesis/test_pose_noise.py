@@ -8,7 +8,7 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
 from sl_nerfstudio.synthesis.devices import DeviceOptions, make_devices
 from sl_nerfstudio.synthesis.paths import make_paths
-from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, disturb_relative, pose_sigma
+from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, disturb_relative, pose_sigma
 
 _FRAMES = 24
 
@@ -31,7 +31,7 @@ def rig(scene, truth):
     p = scene.centre + rng.uniform(-1, 1, (150, 3)) * np.ptp(scene.vertices, axis=0) / 2
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     return devices, [
-        Correspondences(_pixel(devices.camera, T_c, p), _pixel(devices.projector, T_p, p), p) for T_c, T_p in pairs
+        ExactMatches(_pixel(devices.camera, T_c, p), _pixel(devices.projector, T_p, p), p) for T_c, T_p in pairs
     ]
 
 
