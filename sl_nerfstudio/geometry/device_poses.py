@@ -17,13 +17,6 @@ class DevicePoses:
     T_world_camera: Float64[ndarray, "n 4 4"]
     T_world_projector: Float64[ndarray, "n 4 4"]
 
-    def __post_init__(self) -> None:
-        """Raises ValueError unless there are as many cameras as projectors."""
-        if len(self.T_world_camera) != len(self.T_world_projector):
-            raise ValueError(
-                f"{len(self.T_world_camera)} camera poses, but {len(self.T_world_projector)} projector poses"
-            )
-
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.T_world_camera)

@@ -4,9 +4,8 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,65 +13,15 @@ import torch
 
 from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.runs.run_record import plain
-from sl_nerfstudio.runs.trained_run import TrainedRun
 from sl_nerfstudio.scan import Scan, read_poses
-from tests.meshing.ray_cast_scan import pairs_around, scan_of
-
-CENTRE, RADIUS = np.array([3.0, -2.0, 5.0]), 40.0  # of the ball, mm
-S_SCENE_WORLD = Similarity(1 / 60, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.02, -0.03, 0.01]))
-
-
-@dataclass
-class BallModel:
-    """What sl-export needs from a model, for a ball."""
-
-    scan: Scan
-    sigma: np.ndarray | None = None
-    S_scene_world: Similarity = S_SCENE_WORLD
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-
-    def sdf(self, p_scene):
-        centre = torch.from_numpy(self.S_scene_world.points(CENTRE)).float()
-        return (p_scene - centre).norm(dim=-1) - RADIUS * self.S_scene_world.scale
-
-    def poses(self):
-        return self.scan.poses
-
-    def pose_sigma(self):
-        return self.sigma
-
-    def intrinsics_doubt(self):
-        return "the camera is too long"
-
-    def history(self):
-        return {"step": [0.0, 5.0], "loss": [1.0, float("nan")]}
+from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> Scan:
-    low, high = ((float(c[0]), float(c[1]), float(c[2])) for c in (CENTRE - 44, CENTRE + 44))
-    ball = extract_mesh(lambda p: (p - torch.from_numpy(CENTRE).float()).norm(dim=-1) - RADIUS, 60, low, high)
-    return scan_of(ball, pairs_around(6, 40), tmp_path_factory.mktemp("export") / "scan")
-
-
-def run_of(scan: Scan, sigma: np.ndarray | None = None) -> TrainedRun:
-    settings = SimpleNamespace(
-        method_name="sl-neus",
-        max_num_iterations=10,
-        pipeline=SimpleNamespace(
-            datamanager=SimpleNamespace(
-                data=scan.root,
-                train_num_rays_per_batch=7,
-                dataparser=SimpleNamespace(intrinsics_change=scan.intrinsics_change),
-            ),
-            model={"lr": 1e-3, "where": Path("a")},
-        ),
-    )
-    return TrainedRun(BallModel(scan, sigma), settings, 10)
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return ball_scan(tmp_path_factory.mktemp("export") / "scan")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])

@@ -67,7 +67,9 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
     record = json.loads((refined / "training.json").read_text())
     assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["step"] == 39
     assert record["settings"]["model"]["sdf"]["hidden"] == 32
-    assert len(record["curves"]["step"]) > 0 and record["versions"]["torch"] == torch.__version__
+    curves = record["curves"]
+    assert curves["step"] == list(range(0, 40, 5)) and curves["loss"][-1] < 0.3 * curves["loss"][0]
+    assert record["versions"]["torch"] == torch.__version__
     assert f"sl-eval --mesh '{mesh_path}' --data {scan_root} --poses {refined}/transforms.json" in said
     assert " cm\n" in said
 

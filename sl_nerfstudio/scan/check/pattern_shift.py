@@ -52,7 +52,7 @@ def shift_problems(shifts: Sequence[Float64[ndarray, "2"] | None]) -> Iterator[P
     if len(known) < _FEWEST_FRAMES:
         return
     middle = np.median(known, axis=0)
-    sign = np.sign(middle[0])
+    sign = np.copysign(1.0, middle[0])  # np.sign would call a shift of exactly 0 half a pixel
     half = sign * _HALF
     same = np.abs(np.array(known) - half).max(1) < _TOLERANCE_FRAME
     if np.abs(middle - half).max() < _TOLERANCE and same.mean() >= _MOST:
