@@ -21,8 +21,6 @@ class Alignment:
 
     S_target_source: Similarity
     residual: float  # RMS distance of the best 80 % of the points, in the target's unit
-    iterations: int
-    converged: bool
 
 
 def align_poses(
@@ -65,8 +63,7 @@ def icp(
     Directions that the data do not determine (the rotations of a sphere) stay at their start.
     """
     S = start
-    converged, done = False, 0
-    for done in range(1, max_iterations + 1):  # noqa: B007
+    for _ in range(max_iterations):
         moved = S.points(points)
         near = target.closest(moved)
         weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
@@ -76,11 +73,10 @@ def icp(
         S = Similarity(start.scale * float(np.exp(bounded)), proposed.R, proposed.t)
         change = np.abs(S.points(points) - moved).max()
         if change < 1e-5 * target.diagonal:
-            converged = True
             break
     final = np.sort(target.distance(S.points(points)))
     best = final[: max(1, int(0.8 * len(final)))]
-    return Alignment(S, float(np.sqrt((best**2).mean())), done, converged)
+    return Alignment(S, float(np.sqrt((best**2).mean())))
 
 
 def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:

@@ -40,7 +40,7 @@ class EvaluationInputs:
     reference: Reference | None
     poses_path: Path | None  # None: the scan's own poses are evaluated
     pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # one per frame, or empty
-    training: dict[str, Any] | None = None  # training.json beside the poses: settings, versions, curves
+    training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
 
 
 def read_inputs(

@@ -88,7 +88,7 @@ class PointReference:
         """ICP of the reference points onto the result's triangles, inverted."""
         found = icp(_thinned(self.observed), result, start.inverse(), with_scale)
         S = found.S_target_source.inverse()
-        return Alignment(S, found.residual * S.scale, found.iterations, found.converged)
+        return Alignment(S, found.residual * S.scale)
 
 
 Reference = MeshReference | PointReference

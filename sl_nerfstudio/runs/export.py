@@ -41,7 +41,7 @@ class Exported:
 
 
 def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
-    """Extract the surface, trim it to what the frames observed unless told otherwise, and write the files.
+    """Extract the surface, trim it to what the frames observed (unless it is to be kept), and write the files.
 
     Raises UserError if there is no surface, if no part of it was observed, or if a file cannot be written.
     """

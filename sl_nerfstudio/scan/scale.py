@@ -104,7 +104,7 @@ def _read_bar(section: Fields) -> ScaleBar | None:
     if ends is None or length is None:
         section.fault(
             "length" if length is None else "distance_between", "is missing",
-            "distance_between and length belong together", "give both or neither",
+            "distance_between and length are only valid together", "give both or neither",
         )  # fmt: skip
         return None
     number = section.read_number("length")

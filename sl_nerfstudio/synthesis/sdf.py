@@ -1,7 +1,7 @@
 """Building blocks of free-form objects: (approximate) signed distances, positive outside, and how to join them.
 
-After Inigo Quilez' distance functions. The distance of an ellipsoid is a first-order one, so that a value says
-how far the surface is only nearby: enough to find the zero level, which is all that is asked here.
+After Inigo Quilez' distance functions. The distance of an ellipsoid is correct to first order, so its values are
+distances only near the surface; that is enough to find the zero level.
 """
 
 from collections.abc import Callable

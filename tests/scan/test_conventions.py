@@ -171,7 +171,7 @@ def test_poses_that_no_known_mistake_explains() -> None:
 def test_units_that_cannot_be(metres: float | None, words: str) -> None:
     found = list(convention_problems(frames_of(poses()), PROJECTOR, metres))
     assert [key for _, key, _ in found] == (["units"] if words else [])
-    assert all(words in problem.problem and "m and mm swapped" in problem.cause for _, _, problem in found)
+    assert all(words in problem.problem and "m and mm mixed up" in problem.cause for _, _, problem in found)
 
 
 def test_spread_is_the_distance_between_the_frames_surfaces() -> None:

@@ -13,7 +13,6 @@ from PIL import Image
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 
 CLAY = (0.80, 0.78, 0.74)
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -215,7 +215,7 @@ def _summary(report: ReportInput) -> list[tuple[str, str]]:
     size = np.ptp(mesh.vertices, axis=0)
     cameras = sorted({f"{f.camera.w} × {f.camera.h}" for f in scan.frames})
     decoded = np.mean([f.decoded_share for f in frames])
-    scale = f"known ({scan.scale.source})" if scan.scale.known else "not known: all lengths are relative"
+    scale = f"known ({scan.scale.source})" if scan.scale.known else "unknown: all lengths are relative"
     return [
         ("Frames", str(len(scan.frames))),
         ("Image size", ", ".join(cameras) + " pixels"),

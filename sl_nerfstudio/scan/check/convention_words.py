@@ -30,11 +30,11 @@ def describe(interpretation: Interpretation, given: GeometricFit, index: int | N
     """The mistake that `interpretation` undoes, in all frames or in frame `index`; `given` is the fit before."""
     residual = given.typical_px if index is None else float(given.residual_px[index])
     spread = given.typical_spread if index is None else float(given.spread[index])
-    whom = "all frames" if index is None else "this frame"
+    which = "all frames" if index is None else "this frame"
     symptom = _symptom(residual, spread)
     if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
-        return _describe_coords(interpretation, f"do not fit the poses in {whom}: {symptom}")
-    problem = f"does not fit the coordinates in {whom}: {symptom}"
+        return _describe_coords(interpretation, f"do not fit the poses in {which}: {symptom}")
+    problem = f"does not fit the coordinates in {which}: {symptom}"
     if interpretation.projector_unit != 1:
         return Problem(
             problem,
@@ -96,6 +96,6 @@ def wrong_unit(metres: float) -> Problem:
     """A working distance that is impossible for a scanner."""
     return Problem(
         f"would put the object {metres:.3g} m from the camera",
-        "lengths are in another unit than stated (m and mm swapped?)",
+        "lengths are in another unit than stated (m and mm mixed up?)",
         'state the unit that the poses are in, or "arbitrary" if it is unknown',
     )
