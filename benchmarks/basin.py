@@ -62,7 +62,6 @@ def from_errors(scan: Scan, setup: Setup) -> Scan:
 
 def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, float]) -> Row:
     """Adjust one set of starting poses."""
-    start, truth = setup.start, (setup.truth.T_world_camera, setup.truth.T_world_projector)
     begin = time.monotonic()
     found = adjust_scan(
         from_errors(loaded.scan, setup),
@@ -73,9 +72,8 @@ def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, flo
         AdjustmentSettings(),
     )
     seconds = time.monotonic() - begin
-    end_poses = found.rig.poses(loaded.S_scene_world.inverse())
-    end = compare_poses(end_poses.T_world_camera, end_poses.T_world_projector, *truth).camera
-    before = compare_poses(start.T_world_camera, start.T_world_projector, *truth).camera
+    end = compare_poses(found.rig.poses(loaded.S_scene_world.inverse()), setup.truth).camera
+    before = compare_poses(setup.start, setup.truth).camera
     return Row(
         seed,
         *level,

@@ -17,11 +17,12 @@ from benchmarks.accuracy import FRAMES
 from benchmarks.machine import write_rows
 from benchmarks.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -45,7 +46,7 @@ def rules(loaded: LoadedScan) -> dict[str, Rig]:
     start, prior = scene_rig(scan, S), pose_prior(scan, S, PriorConfig())
     maps, _ = maps_and_held_out(scan, loaded.samples, AdjustmentSettings())
     rig = adjust(start, maps, prior, "free", AdjustmentSettings()).rig
-    frame = known_baseline(scan.scale.source, len(scan.frames))
+    frame = None if scan.scale.baseline_of is None else scan.index_of(scan.scale.baseline_of)
     return {
         "starting poses": start,
         "left alone": rig,
@@ -58,12 +59,12 @@ def rules(loaded: LoadedScan) -> dict[str, Rig]:
 def measure(loaded: LoadedScan, scene: str, seed: int) -> list[Row]:
     """All rules on one scan."""
     truth = read_ground_truth(loaded.scan)
-    assert truth.T_world_camera is not None and truth.T_world_projector is not None
+    assert truth.poses is not None
     S = loaded.S_scene_world.inverse()
     rows = []
     for rule, rig in rules(loaded).items():
-        poses = S.poses(rig.T_world_camera.numpy()), S.poses(rig.T_world_projector.numpy())
-        found = compare_poses(*poses, truth.T_world_camera, truth.T_world_projector)
+        poses = DevicePoses(rig.T_world_camera.numpy(), rig.T_world_projector.numpy()).mapped(S)
+        found = compare_poses(poses, truth.poses)
         turn = np.degrees(np.arccos(np.clip((np.trace(found.S_truth_estimate.R) - 1) / 2, -1, 1)))
         shift = float(np.linalg.norm(found.S_truth_estimate.points(S.t[None])[0] - S.t))
         rows.append(Row(scene, seed, rule, 100 * found.scale_error, shift, float(turn)))

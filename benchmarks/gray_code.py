@@ -58,8 +58,8 @@ def main() -> None:
     for k in range(len(pairs)):
         turn, swing = _angles(_relative(scan, k), _relative(reference, k))
         print(f"{scan.frames[k].name}: relative pose: rotation {turn:.3f} deg, direction {swing:.3f} deg off")
-    first = np.linalg.inv(scan.T_world_camera[0]) @ scan.T_world_camera
-    first_reference = np.linalg.inv(reference.T_world_camera[0]) @ reference.T_world_camera
+    first = np.linalg.inv(scan.poses.T_world_camera[0]) @ scan.poses.T_world_camera
+    first_reference = np.linalg.inv(reference.poses.T_world_camera[0]) @ reference.poses.T_world_camera
     for k in range(1, len(pairs)):
         turn, swing = _angles(first[k], first_reference[k])
         print(f"camera {k} against camera 0: rotation {turn:.3f} deg, direction {swing:.3f} deg off")
@@ -138,7 +138,7 @@ def _of(device: Device) -> Intrinsics:
 
 
 def _relative(scan: Scan, k: int) -> Float64[ndarray, "4 4"]:
-    return np.linalg.inv(scan.T_world_camera[k]) @ scan.T_world_projector[k]
+    return scan.poses.T_camera_projector[k]
 
 
 def _angles(a: Float64[ndarray, "4 4"], b: Float64[ndarray, "4 4"]) -> tuple[float, float]:

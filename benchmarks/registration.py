@@ -22,6 +22,7 @@ from numpy import ndarray
 
 from benchmarks.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.processing.words import exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
@@ -76,12 +77,9 @@ class Row:
     remarks: tuple[str, ...]
 
 
-def truth_of(scan: Scan) -> tuple[ndarray, ndarray]:
-    """True poses of cameras and projectors; those in the file if there is no ground truth."""
-    truth = read_ground_truth(scan)
-    if truth.T_world_camera is None or truth.T_world_projector is None:
-        return scan.T_world_camera, scan.T_world_projector
-    return truth.T_world_camera, truth.T_world_projector
+def truth_of(scan: Scan) -> DevicePoses:
+    """True poses, or the ones in the file."""
+    return read_ground_truth(scan).poses or scan.poses
 
 
 def relative_poses(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud], RelativePoseErrors]:
@@ -136,7 +134,7 @@ class FrameErrors:
         return (self.rotation_deg < 2) & (self.scale < 0.03)
 
 
-def frame_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, ndarray]) -> FrameErrors:
+def frame_errors(T_camera: ndarray, baseline: ndarray, truth: DevicePoses) -> FrameErrors:
     """Errors of registered frames after one similarity that fits cameras and the places they look at.
 
     `truth` holds the true poses of cameras and projectors.
@@ -144,8 +142,8 @@ def frame_errors(T_camera: ndarray, baseline: ndarray, truth: tuple[ndarray, nda
     from scipy.spatial.transform import Rotation
 
     known = np.isfinite(baseline)
-    true = truth[0][known]
-    true_baseline = np.linalg.norm(truth[0][:, :3, 3] - truth[1][:, :3, 3], axis=1)[known]
+    true = truth.T_world_camera[known]
+    true_baseline = truth.baseline[known]
     found, length = T_camera[known], baseline[known]
     ahead = np.linalg.norm(true[:, :3, 3] - true[:, :3, 3].mean(0), axis=1).mean()
     ratio = float(np.exp(np.mean(np.log(true_baseline / length))))
@@ -170,8 +168,8 @@ def summary_of(errors: FrameErrors, seconds: float) -> Poses:
 def measure(root: Path, sequence: bool = True) -> Row:
     """Estimate relative poses, register, adjust."""
     scan = read_scan(root)
-    camera, projector = truth_of(scan)
-    clouds, relative = relative_poses(scan, np.linalg.inv(camera) @ projector)
+    truth = truth_of(scan)
+    clouds, relative = relative_poses(scan, truth.T_camera_projector)
     start = time.process_time()
     found = register(clouds, sequence)
     middle = time.process_time()
@@ -182,8 +180,8 @@ def measure(root: Path, sequence: bool = True) -> Row:
         scan.projector.model,
         len(clouds),
         relative,
-        summary_of(frame_errors(found.T_world_camera, found.baseline, (camera, projector)), middle - start),
-        summary_of(frame_errors(joint.poses.T_world_camera, joint.poses.baseline, (camera, projector)), end - middle),
+        summary_of(frame_errors(found.T_world_camera, found.baseline, truth), middle - start),
+        summary_of(frame_errors(joint.poses.T_world_camera, joint.poses.baseline, truth), end - middle),
         {e.frame: exclusion_sentence(e) for e in found.exclusions},
         tuple(map(uncertainty_sentence, found.uncertainties)),
     )

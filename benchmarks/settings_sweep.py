@@ -116,8 +116,7 @@ def errors_of(root: Path, settings: StageSettings) -> FrameErrors:
         return FrameErrors(*np.zeros((3, 0)))
     number = {frame.name: k for k, frame in enumerate(scan.frames)}
     rows = [number[name] for name in names]
-    camera, projector = truth_of(scan)
-    return frame_errors(T_world_camera, baseline, (camera[rows], projector[rows]))
+    return frame_errors(T_world_camera, baseline, truth_of(scan)[rows])
 
 
 def measure(roots: Sequence[Path], path: str, value: float) -> Row:

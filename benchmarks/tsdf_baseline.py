@@ -15,10 +15,11 @@ from benchmarks.baselines.tsdf import fuse
 from benchmarks.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
+from sl_nerfstudio.evaluation.evaluate import score_alignments
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.reference import mesh_reference
 from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
 from sl_nerfstudio.scan import read_ground_truth, read_scan
 
@@ -57,10 +58,9 @@ def measure(root: Path, meshes: Path | None) -> list[Row]:
     """Fuse one scan with all three kinds of poses. Raises UserError for a scan without truth."""
     scan = read_scan(root)
     truth = read_ground_truth(scan)
-    if truth.mesh_path is None or truth.T_world_camera is None or truth.T_world_projector is None:
+    if truth.mesh_path is None or truth.poses is None:
         raise UserError(f"{root}: has no complete ground_truth/\n    remedy: make one with sl-synth")
-    true = Poses(truth.T_world_camera, truth.T_world_projector)
-    initial = Poses(scan.T_world_camera, scan.T_world_projector)
+    true, initial = truth.poses, scan.poses
     reference = mesh_reference(read_mesh(truth.mesh_path), scan, true)
     rows = []
     for name in ("initial", "registered", "true"):
@@ -70,10 +70,8 @@ def measure(root: Path, meshes: Path | None) -> list[Row]:
         seconds = time.perf_counter() - start
         if meshes is not None:
             write_mesh(meshes / f"{root.name}-{name}.ply", mesh)
-        scores = score_alignments(Surface(mesh), reference, poses, true)
-        errors = compare_poses(
-            poses.T_world_camera, poses.T_world_projector, true.T_world_camera, true.T_world_projector
-        )
+        scores = score_alignments(IndexedMesh(mesh), reference, poses, true)
+        errors = compare_poses(poses, true)
         rows.append(_row(root.name, name, scan.units, seconds, scores["rigid"], scores["similarity"], errors.camera))
     return rows
 

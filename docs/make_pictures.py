@@ -23,8 +23,8 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from sl_nerfstudio.evaluation.report.pictures import ColourScale, View, render
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, OrthographicView, render
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.scan import read_ground_truth, read_scan
@@ -47,15 +47,15 @@ def draw_demo(demo: Path) -> None:
         raise SystemExit(f"{demo / 'scan'} has no true surface to compare with")
     matrix = np.array(json.loads((demo / "evaluation.json").read_text())["rigid"]["matrix"])
     aligned = mesh.mapped(Similarity(1.0, matrix[:3, :3], matrix[:3, 3]))
-    near = Surface(read_mesh(truth.mesh_path)).closest(aligned.vertices)
+    near = IndexedMesh(read_mesh(truth.mesh_path)).closest(aligned.vertices)
     error = np.where(((aligned.vertices - near.point) * near.normal).sum(1) < 0, -near.distance, near.distance)
     limit = float(f"{3 * np.sqrt(np.mean(error**2)):.1g}")
     scale = ColourScale("RdBu_r", -limit, limit)
 
     frame = scan.frames[FRAME]
-    surface = Surface(aligned)
-    T = scan.T_world_camera[FRAME]
-    view = View(T[:3, 3] - surface.centre, T[:3, 1])
+    surface = IndexedMesh(aligned)
+    T = scan.poses.T_world_camera[FRAME]
+    view = OrthographicView(T[:3, 3] - surface.centre, T[:3, 1])
     plain, coloured = (render(surface, view, colours, SIZE, SIZE) for colours in (None, scale(error)))
     rows, columns = np.nonzero(frame.read_mask())
     crop = square(rows, columns, frame.read_mask().shape)

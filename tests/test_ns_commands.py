@@ -399,7 +399,9 @@ def test_viewer_shows_cameras_and_projectors_before_and_after(viewer: Viewer, pi
         assert page.status == 200
     view = pipeline.scene_view
     loaded = pipeline.datamanager.dataparser.loaded
-    starting = [loaded.S_scene_world.poses(T) for T in (loaded.scan.T_world_camera, loaded.scan.T_world_projector)]
+    starting = [
+        loaded.S_scene_world.poses(T) for T in (loaded.scan.poses.T_world_camera, loaded.scan.poses.T_world_projector)
+    ]
     refined = [T.numpy() for T in pipeline._sl_model.poses_scene()]
     for handles, poses in zip((*view._starting, *view._refined), (*starting, *refined), strict=True):
         positions = [h.position for h in handles]

@@ -1,5 +1,4 @@
-"""Classical methods to compare with: TSDF fusion, rigid ICP registration, window matching.
+"""Classical methods to compare with: TSDF fusion, ICP registration, window matching.
 
-They take scans, poses and grid graphs of the package, and return meshes, poses and node assignments. The package itself
-never imports them.
+In: a scan with poses, or the nodes that the decoder found. Out: a mesh, registered poses, or matched nodes.
 """

@@ -20,7 +20,7 @@ _STEP_PIXELS = 8.0  # neighbours whose depth differs by more than this many pixe
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth along the camera axis (not along the ray) as an ideal pinhole camera sees it; 0 where unknown."""
+    """Depth along the camera's axis (not along the ray), 0 where unknown, as an ideal pinhole camera sees it."""
 
     depth: Float[ndarray, "h w"]
     camera: Device  # without distortion
@@ -66,7 +66,7 @@ def _joined(a: ndarray, b: ndarray, depth_a: ndarray, depth_b: ndarray, step: fl
 
 
 def _undistorted(depth: Float[ndarray, "h w"], camera: Device) -> DepthMap:
-    """The map that the same camera would see without distortion (nearest pixel, because depths must not be mixed)."""
+    """The map as the same camera without distortion would see it (nearest pixel: depths must not be interpolated)."""
     pinhole = Device(camera.w, camera.h, camera.fl_x, camera.fl_y, camera.cx, camera.cy)
     if pinhole == camera:
         return DepthMap(depth, pinhole)

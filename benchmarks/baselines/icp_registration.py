@@ -1,4 +1,4 @@
-"""Rigid multiway registration of the frames' point clouds (Open3D), as in classical pipelines.
+"""Rigid multiway registration of the frames' point clouds (Open3D), as classical pipelines do it.
 
 Each frame moves as a whole, camera and projector together, so a wrong relative pose or baseline stays wrong.
 """
@@ -12,12 +12,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.baselines.tsdf import backprojected, depth_maps, object_size
-from sl_nerfstudio.evaluation.evaluate import Poses
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Scan
 
 _SIZE = 100.0
-_LEAST_OVERLAP = 0.3  # share of a cloud's points with a partner; pairs with less are unreliable
+_LEAST_OVERLAP = 0.3  # share of a cloud's points with a partner; pairs with a smaller share are ignored
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class RegistrationConfig:
     """Settings, lengths relative to the size of the object."""
 
     voxel: float = 1 / 80
-    distances: tuple[float, ...] = (0.08, 0.03, 0.015)  # maximum correspondence distance, coarse to fine
-    neighbours: int = 8  # pairs per frame: those with the most similar viewing directions
+    distances: tuple[float, ...] = (0.08, 0.03, 0.015)  # of correspondence, coarse to fine
+    neighbours: int = 8  # pairs per frame: those whose cameras look in the most similar directions
     rounds: int = 2
 
 
-def register(scan: Scan, poses: Poses, config: RegistrationConfig | None = None) -> Poses:
+def register(scan: Scan, poses: DevicePoses, config: RegistrationConfig | None = None) -> DevicePoses:
     """Poses after pairwise point-to-plane ICP and a pose graph over all overlapping pairs."""
     config = config or RegistrationConfig()
     depths = depth_maps(scan, poses)
@@ -45,7 +45,7 @@ def register(scan: Scan, poses: Poses, config: RegistrationConfig | None = None)
         step = _multiway(moved, motion @ start, [d * _SIZE for d in distances], config.neighbours)
         motion = step @ motion
     motion[:, :3, 3] /= unit
-    return Poses(motion @ poses.T_world_camera, motion @ poses.T_world_projector)
+    return DevicePoses(motion @ poses.T_world_camera, motion @ poses.T_world_projector)
 
 
 def _cloud(p_camera: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"], voxel: float) -> o3d.geometry.PointCloud:
@@ -63,7 +63,7 @@ def _multiway(
     distances: Sequence[float],
     neighbours: int,
 ) -> Float[ndarray, "n 4 4"]:
-    """Motion of each cloud; the first one stays in place."""
+    """Motion of each cloud; the first one stays."""
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()
     for _ in clouds:
@@ -90,7 +90,7 @@ def _multiway(
 
 
 def _pairs(T_world_camera: Float[ndarray, "n 4 4"], neighbours: int) -> list[tuple[int, int]]:
-    """Frames to register with each other: each with its successor and with those of most similar viewing direction."""
+    """Frames to register with each other: each with its successor and with those that look in similar directions."""
     looking = -T_world_camera[:, :3, 2]
     alike = looking @ looking.T
     pairs = {(i, i + 1) for i in range(len(looking) - 1)}
@@ -104,7 +104,7 @@ def _pairs(T_world_camera: Float[ndarray, "n 4 4"], neighbours: int) -> list[tup
 def _pair(
     source: o3d.geometry.PointCloud, target: o3d.geometry.PointCloud, distances: Sequence[float]
 ) -> tuple[Float[ndarray, "4 4"], Float[ndarray, "6 6"]] | None:
-    """Motion of `source` onto `target` and its information matrix; None for too little overlap."""
+    """Motion of `source` onto `target` and its information matrix; None if they overlap too little."""
     registration = o3d.pipelines.registration
     T = np.eye(4)
     fitness = 0.0

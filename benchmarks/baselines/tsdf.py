@@ -1,4 +1,4 @@
-"""Classical fusion: triangulate each frame, and fuse the depth maps into a truncated SDF (Open3D)."""
+"""Classical fusion for comparison: triangulate each frame, then fuse into a truncated signed distance (Open3D)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.baselines.depth import DepthMap, triangulated_depth
-from sl_nerfstudio.evaluation.evaluate import Poses
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Scan
 
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
-_UNIT_SIZE = 100.0  # the object is scaled to about this size, which Open3D's defaults assume
+_UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class TsdfConfig:
 
     voxel: float = 1 / 250  # of the object's size
     truncation_voxels: float = 5.0
-    least_component: float = 0.02  # of the largest connected piece's triangles; smaller ones are dropped
+    least_component: float = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
 
 
-def fuse(scan: Scan, poses: Poses, config: TsdfConfig | None = None) -> Mesh:
+def fuse(scan: Scan, poses: DevicePoses, config: TsdfConfig | None = None) -> Mesh:
     """TSDF fusion of the scan's triangulated depth maps with the given poses; world units and axes."""
     config = config or TsdfConfig()
     depths = depth_maps(scan, poses)
@@ -55,7 +55,7 @@ def fuse(scan: Scan, poses: Poses, config: TsdfConfig | None = None) -> Mesh:
     return _largest_pieces(volume.extract_triangle_mesh(), config.least_component, unit)
 
 
-def depth_maps(scan: Scan, poses: Poses) -> list[DepthMap]:
+def depth_maps(scan: Scan, poses: DevicePoses) -> list[DepthMap]:
     """Triangulated depth of every frame."""
     work = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
     return [
@@ -64,7 +64,7 @@ def depth_maps(scan: Scan, poses: Poses) -> list[DepthMap]:
 
 
 def object_size(depths: Sequence[DepthMap]) -> float:
-    """Rough extent of the depth maps: that of the widest frame, between its 2nd and 98th percentile."""
+    """Rough extent of the object: that of the widest depth map, between its 2nd and 98th percentile."""
     return max((_extent(depth) for depth in depths), default=0.0)
 
 
@@ -74,7 +74,7 @@ def _extent(depth: DepthMap) -> float:
 
 
 def backprojected(depth: DepthMap) -> Float[ndarray, "n 3"]:
-    """Points of a depth map in the camera's axes (nerfstudio's: looking along -z)."""
+    """Points of a depth map in the camera's axes (looking along -z)."""
     row, column = np.nonzero(depth.depth)
     z, camera = depth.depth[row, column], depth.camera
     x, y = (column + 0.5 - camera.cx) / camera.fl_x, (row + 0.5 - camera.cy) / camera.fl_y

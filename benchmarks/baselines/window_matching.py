@@ -1,7 +1,7 @@
 """Classical window matching: every 3 x 3 window is looked up in the pattern, and windows vote for their nodes.
 
-The graph network is compared with it. It uses only the most probable symbol, and windows of one size. Missing nodes are
-wildcards; a window votes if one place of the pattern matches it better than all others.
+For comparison with the graph network: it uses only the most probable symbol, and windows of one size. Missing nodes
+match everything; a window votes if one place in the pattern is closer to it than all others.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _LEAST_SEEN = 6  # of the nine nodes of a window
 def match_windows(
     score: Float32[ndarray, "n 5"], around: Int32[ndarray, "n 25"], pattern: TurnedPattern, largest_distance: int = 1
 ) -> Int64[ndarray, "n"]:
-    """The node of the turned pattern that each node is matched with; -1 where no window votes.
+    """The node of the turned pattern that each node is matched to; -1 where no window votes.
 
     `largest_distance` is the number of symbols in which a window may differ from the pattern.
     """

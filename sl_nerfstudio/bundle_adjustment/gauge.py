@@ -6,7 +6,6 @@ and orientation return to the best agreement, in least squares, with the startin
 """
 
 import math
-import re
 
 import torch
 from jaxtyping import Float
@@ -18,12 +17,6 @@ from sl_nerfstudio.geometry.se3 import pose, rotate
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
 _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
-
-
-def known_baseline(source: str, frames: int) -> int | None:
-    """The frame whose baseline a scan's `scale.source` names ("baseline of frame 0"), or None."""
-    match = re.search(r"baseline of frame (\d+)", source)
-    return int(match[1]) if match and int(match[1]) < frames else None
 
 
 def baseline_scale(start: Rig, rig: Rig, frame: int | None) -> float:

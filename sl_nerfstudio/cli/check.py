@@ -9,7 +9,7 @@ import tyro
 from sl_nerfstudio.cli.run import run
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.scan.check.examination import Examination
+    from sl_nerfstudio.scan.check.folder import FolderCheck
 
 
 def main() -> None:
@@ -27,16 +27,16 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
         folder: The scan folder, which holds transforms.json.
     """
     from sl_nerfstudio.errors import ScanError
-    from sl_nerfstudio.scan.check.examination import examine
+    from sl_nerfstudio.scan.check.folder import check_folder
 
-    result = examine(folder)
+    result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
     sys.stdout.write(summary(result))
 
 
-def summary(result: "Examination") -> str:
-    """What a person wants to know of a good scan, in a few lines."""
+def summary(result: "FolderCheck") -> str:
+    """The main facts about a good scan, in a few lines."""
     scan, fit = result.scan, result.fit
     if scan is None or fit is None:
         raise ValueError("a scan with faults has no summary")
@@ -47,7 +47,7 @@ def summary(result: "Examination") -> str:
         f"{scan.root}: no faults",
         f"  frames              {len(scan.frames)}, {', '.join(f'{w} x {h}' for w, h in sizes)} pixels",
         f"  projector           {scan.projector.model}, {scan.projector.w} x {scan.projector.h} pixels",
-        f"  units               {scan.units}, scale {'known' if scan.scale.known else 'not known'}"
+        f"  units               {scan.units}, scale {'known' if scan.scale.known else 'unknown'}"
         + (f" ({scan.scale.source})" if scan.scale.source else ""),
         f"  working distance    {fit.depth:.4g} {unit} (median)",
         f"  decoded             {100 * min(decoded):.0f} to {100 * max(decoded):.0f} % of the masked pixels",

@@ -1,4 +1,4 @@
-"""sl-eval: compare a mesh and its poses with a scan, and with the truth where it is known."""
+"""sl-eval: compare a mesh and its poses with a scan, and with the truth if it is known."""
 
 import json
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Evaluate a mesh and its poses on a scan, and against the truth where it is known."""
+    """Evaluate a mesh and its poses with a scan, and with the truth if it is known."""
 
     mesh: Path
     """The surface, in the scan's unit and world axes: .ply, .obj, .stl or .glb."""
     data: Path
     """The scan folder. Its ground_truth/ is used if it is there."""
     poses: Path | None = None
-    """transforms.json with the poses, and the intrinsics if it has any, to evaluate, such as refined/transforms.json;
-    default: the scan's own. training.json beside it goes into the report."""
+    """transforms.json with the poses (and the intrinsics, if it has any) to evaluate, such as refined/transforms.json;
+    default: the scan's own. A training.json in the same folder goes into the report."""
     json: Path | None = None
     """Where to write all figures."""
     report: Path | None = None
@@ -34,38 +34,25 @@ class EvalConfig:
     f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D [D ...]")] = ()
     """Distances for the F-score, in the scan's unit; default: four round ones from 0.1 % to 1 % of the truth's size."""
     samples: int = 100_000
-    """Points that are spread over each surface to measure distances."""
+    """Number of points spread over each surface to measure distances."""
     seed: int = 0
-    """Of these points: the same seed gives the same figures."""
+    """Random seed of these points; the same seed gives the same figures."""
 
 
 def evaluate_scan(config: EvalConfig) -> None:
-    """Do what the command line asks for. Raises UserError for anything a user can mend."""
+    """Do what the command line asks for. Raises UserError for anything a user can correct."""
     _check(config)
-    from sl_nerfstudio.cli.evaluate_files import read_poses_file, read_reference, read_sigmas, read_training
-    from sl_nerfstudio.evaluation.evaluate import Poses, evaluate
-    from sl_nerfstudio.evaluation.report.thumbnails import ThumbnailCollector
+    from sl_nerfstudio.evaluation.evaluate import evaluate
+    from sl_nerfstudio.evaluation.inputs import read_inputs
+    from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
-    from sl_nerfstudio.meshing.mesh_io import read_mesh
-    from sl_nerfstudio.scan import read_devices, read_ground_truth, read_scan
     from sl_nerfstudio.scan.atomic import write_atomic
 
-    mesh = read_mesh(config.mesh)
-    scan = read_scan(config.data)
-    truth = read_ground_truth(scan)
-    poses_path = config.poses / "transforms.json" if config.poses and config.poses.is_dir() else config.poses
-    poses = read_poses_file(poses_path, scan) if poses_path else Poses(scan.T_world_camera, scan.T_world_projector)
-    scan = read_devices(poses_path, scan) if poses_path else scan
-    true_poses = None
-    if truth.T_world_camera is not None and truth.T_world_projector is not None:
-        true_poses = Poses(truth.T_world_camera, truth.T_world_projector)
-    reference = read_reference(
-        config.reference or truth.mesh_path, scan, true_poses or poses, config.samples, config.seed
-    )
-    thumbnails = ThumbnailCollector()
+    inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
+    thumbnails = ResidualThumbnails()
     evaluation = evaluate(
-        mesh, scan, poses, reference, true_poses, config.f_distances, config.samples, config.seed,
-        on_frame=thumbnails if config.report else None,
+        inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
+        config.samples, config.seed, on_frame=thumbnails if config.report else None,
     )  # fmt: skip
     results: dict[Path, str] = {}
     if config.json:
@@ -73,26 +60,19 @@ def evaluate_scan(config: EvalConfig) -> None:
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
-        results[config.report] = render_report(
-            ReportInput(
-                evaluation, scan, mesh, poses, thumbnails.frames,
-                mesh_name=config.mesh.name,
-                poses_name=f"{poses_path.parent.name}/{poses_path.name}" if poses_path else "",
-                pose_sigma=read_sigmas(poses_path, scan) if poses_path else [],
-                training=read_training(poses_path.with_name("training.json")) if poses_path else None,
-            )
-        )  # fmt: skip
+        results[config.report] = render_report(ReportInput(evaluation, inputs, thumbnails.frames, config.mesh.name))
     for path, text in results.items():
         write_atomic(path, text.encode())
     print_summary(evaluation, list(results))
 
 
 def _check(config: EvalConfig) -> None:
-    """Faults that the flags show by themselves."""
+    """Check what the flags alone can show."""
     for distance in config.f_distances:
         if not 0 < distance < float("inf"):
             raise UserError(
-                f"--f-distances: {distance:g} is no distance\n    remedy: give numbers above 0, in the scan's unit"
+                f"--f-distances: {distance:g} is not a distance\n"
+                "    remedy: give numbers greater than 0, in the scan's unit"
             )
     if config.samples < 1000:
         raise UserError(
@@ -107,7 +87,7 @@ def _check(config: EvalConfig) -> None:
 
 
 def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
-    """The figures that matter as tables on stdout."""
+    """Print the main figures as tables."""
     from rich.console import Console
     from rich.table import Table
 
@@ -135,15 +115,15 @@ def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
                 ]
                 table.add_row(name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %")
         console.print(table)
-    fit = evaluation.fit
-    table = Table(title="Fit to the captures", title_justify="left")
+    agreement = evaluation.agreement
+    table = Table(title="Agreement with the captures", title_justify="left")
     for column in ("coordinates px (median)", "epipolar px (median)", "pattern cosine", "covered"):
         table.add_column(column, justify="right")
     table.add_row(
-        f"{fit.coordinate_px_median:.3f}",
-        f"{fit.epipolar_px_median:.3f}",
-        f"{fit.pattern_cosine:.4f}",
-        f"{fit.hit_share:.1%}",
+        f"{agreement.coordinate_px_median:.3f}",
+        f"{agreement.epipolar_px_median:.3f}",
+        f"{agreement.pattern_cosine:.4f}",
+        f"{agreement.hit_share:.1%}",
     )
     console.print(table)
     for path in written:

@@ -1,4 +1,4 @@
-"""How every command line of the package ends: faults of the user without a traceback."""
+"""How every command of the package ends: faults that a user can correct are shown without a traceback."""
 
 import os
 import sys
@@ -13,7 +13,7 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 def run(main: Callable[[], None]) -> None:
     """Call `main`; a `UserError` becomes `error: ...` on stderr and exit status 1, control-C status 130.
 
-    Anything else is a fault of this package and keeps its traceback.
+    Anything else is a bug in this package and keeps its traceback.
     """
     try:
         main()

@@ -12,9 +12,9 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 
 @dataclass(frozen=True)
 class Arguments:
-    """Make a synthetic scan with its truth: a moving camera and a moving projector about a matte object.
+    """Make a synthetic scan with its truth: a camera and a projector that move around a matte object.
 
-    Lengths in flags are millimetres, fractions lie between 0 and 1.
+    Lengths in flags are in millimetres, fractions are between 0 and 1.
     """
 
     output: Path

@@ -92,7 +92,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         self._samples = self.samples.to(self.device) if self.config.images_on_gpu else self.samples
         self.train_pixel_sampler = SLPixelSampler(self._samples, self.config.train_num_rays_per_batch, held_out=False)
         loaded = self.dataparser.loaded
-        poses = torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.T_world_camera)).float()
+        poses = torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.poses.T_world_camera)).float()
         self.scene_rays = SceneRays(loaded.scan, poses.to(self.device))
 
     def setup_eval(self) -> None:

@@ -73,7 +73,7 @@ class SLDataParser(DataParser):
 
 def scene_cameras(scan: Scan, S_scene_world: Similarity, downscale_factor: float | int | None = None) -> Cameras:
     """The scan's cameras in the normalised scene; `metadata["sl_view"]` is the number of the frame."""
-    poses = torch.from_numpy(S_scene_world.poses(scan.T_world_camera)[:, :3]).float()
+    poses = torch.from_numpy(S_scene_world.poses(scan.poses.T_world_camera)[:, :3]).float()
     devices = [frame.camera for frame in scan.frames]
     distortion = _column(devices, "k1", "k2", "zero", "zero", "p1", "p2")
     cameras = Cameras(

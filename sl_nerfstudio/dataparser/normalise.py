@@ -42,7 +42,7 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
         )
     centre, radius = enclosing_sphere(without_lonely(points))
     scale = OBJECT_RADIUS / radius
-    R = upright(scan.T_world_camera)
+    R = upright(scan.poses.T_world_camera)
     return Similarity(scale, R, -scale * R @ centre)
 
 

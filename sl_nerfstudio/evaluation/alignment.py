@@ -1,4 +1,4 @@
-"""Bringing a result onto the truth: by its poses, then by its surface (ICP)."""
+"""Aligning a result with the truth: by its poses, then by its surface (ICP)."""
 
 from dataclasses import dataclass
 
@@ -6,29 +6,27 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.similarity import Similarity
 
-_MAX_LOG_SCALE = np.log(1.5)  # ICP with scale may not go further from its start: it could collapse onto a patch
-_TRUSTED = 0.7  # share of the points that are taken to be surface of the target
+_MAX_LOG_SCALE = np.log(1.5)  # limit for ICP with scale, which could otherwise shrink the result onto a patch
+_TRUSTED = 0.7  # share of the points assumed to lie on the target
 _TRUSTED_SIGMA = 1.0364  # quantile of |x| at _TRUSTED, x standard normal
 _TUKEY = 4.685  # of the robust sigma: 95 % efficiency on normal residuals (Tukey's biweight)
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A fitted map and how well it fits."""
+    """A fitted map, and how well it fits."""
 
     S_target_source: Similarity
     residual: float  # RMS distance of the best 80 % of the points, in the target's unit
-    iterations: int
-    converged: bool
 
 
 def align_poses(
     T_estimated: Float[ndarray, "n 4 4"], T_true: Float[ndarray, "n 4 4"], with_scale: bool = True
 ) -> Similarity:
-    """Least-squares map of estimated onto true device poses, over centres and orientations together.
+    """Least-squares map of estimated onto true device poses, from centres and orientations together.
 
     The rotation minimises the squared centre errors (relative to the spread of the centres) plus the
     squared chordal distances of the orientations, so that two devices, or centres on one line, are enough.
@@ -38,7 +36,7 @@ def align_poses(
     mean_s, mean_t = source.mean(0), target.mean(0)
     s, t = source - mean_s, target - mean_t
     spread = float(np.sqrt((s * s).sum(1).mean() * (t * t).sum(1).mean()))
-    # The orientation of one device: the true one is R @ the estimated one.
+    # The true orientation of a device is R @ the estimated one.
     turns = np.einsum("nij,nkj->ik", T_true[:, :3, :3], T_estimated[:, :3, :3]) / len(s)
     centres = t.T @ s / len(s) / spread if spread > 0 else np.zeros((3, 3))
     U, _, Vt = np.linalg.svd(turns + centres)
@@ -51,7 +49,7 @@ def align_poses(
 
 def icp(
     points: Float[ndarray, "n 3"],
-    target: Surface,
+    target: IndexedMesh,
     start: Similarity,
     with_scale: bool,
     max_iterations: int = 60,
@@ -60,13 +58,12 @@ def icp(
 
     Each round matches every point with the nearest point of the target's triangles and takes one
     Gauss-Newton step on the point-to-plane distances, weighted by Tukey's biweight with the sigma of the best
-    70 % of the current distances: surface that the target does not have ends with weight zero. (Not of the best
-    half: a plate that fits perfectly would then silence everything that stands on it.)
-    Directions the data do not determine (a sphere's rotations) stay as started.
+    70 % of the current distances, so surface that the target does not have gets weight zero. (With the best half, a
+    plate that fits perfectly would give weight zero to everything on it.)
+    Directions that the data do not determine (the rotations of a sphere) stay at their start.
     """
     S = start
-    converged, done = False, 0
-    for done in range(1, max_iterations + 1):  # noqa: B007
+    for _ in range(max_iterations):
         moved = S.points(points)
         near = target.closest(moved)
         weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
@@ -76,11 +73,10 @@ def icp(
         S = Similarity(start.scale * float(np.exp(bounded)), proposed.R, proposed.t)
         change = np.abs(S.points(points) - moved).max()
         if change < 1e-5 * target.diagonal:
-            converged = True
             break
     final = np.sort(target.distance(S.points(points)))
     best = final[: max(1, int(0.8 * len(final)))]
-    return Alignment(S, float(np.sqrt((best**2).mean())), done, converged)
+    return Alignment(S, float(np.sqrt((best**2).mean())))
 
 
 def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:
@@ -95,14 +91,14 @@ def _gauss_newton_step(
     weights: Float[ndarray, "n"],
     with_scale: bool,
 ) -> Similarity:
-    """The small similarity about the centroid of `p` that best brings `p` onto the planes through `q`."""
+    """The small similarity about the centroid of `p` that moves `p` closest to the planes through `q`."""
     total = weights.sum()
     if total <= 0:
         return Similarity.identity()
     centroid = weights @ p / total
     local = p - centroid
     size = float(np.sqrt(weights @ (local**2).sum(1) / total)) or 1.0
-    local = local / size  # unit-free columns: rotation, translation and scale weigh alike
+    local = local / size  # columns without units: rotation, translation and scale have equal weight
     columns = [normal, np.cross(local, normal)]
     if with_scale:
         columns.append((local * normal).sum(1, keepdims=True))
@@ -116,7 +112,7 @@ def _gauss_newton_step(
 
 
 def _rotation(w: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
-    """Rotation by |w| about w, at most 0.5 rad a step."""
+    """Rotation by |w| about w, at most 0.5 rad per step."""
     angle = float(np.linalg.norm(w))
     if angle < 1e-300:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""The whole evaluation of one result: surface against truth, poses against truth, fit to the captures."""
+"""The whole evaluation of one result: its surface and poses against the truth, and its agreement with the captures."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,12 +9,18 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.alignment import align_poses
-from sl_nerfstudio.evaluation.capture_fit import CaptureFit, FitAccumulator, FrameFit, FramePixels, fit_captures
+from sl_nerfstudio.evaluation.capture_agreement import (
+    AgreementAccumulator,
+    CaptureAgreement,
+    FrameAgreement,
+    FramePixels,
+    compare_captures,
+)
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
-from sl_nerfstudio.evaluation.observed import observable
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
-from sl_nerfstudio.evaluation.reference import MeshReference, Reference
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.reference import Reference
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
@@ -24,89 +30,77 @@ ALIGNMENTS = ("rigid", "similarity", "none")
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Camera and projector poses of all frames of a scan, device to world."""
-
-    T_world_camera: Float[ndarray, "n 4 4"]
-    T_world_projector: Float[ndarray, "n 4 4"]
-
-    def stacked(self) -> Float[ndarray, "m 4 4"]:
-        """Cameras, then projectors."""
-        return np.concatenate([self.T_world_camera, self.T_world_projector])
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """Everything `sl-eval` finds; lengths in `units`, distances from the truth in `truth_units`."""
 
     units: str
-    fit: CaptureFit
+    agreement: CaptureAgreement
     reference: Reference | None
     surface: dict[str, SurfaceScore]  # alignment -> score; empty without a reference
     pose_errors: PoseErrors | None  # of the poses that were evaluated
-    initial_pose_errors: PoseErrors | None  # of the scan's own poses, where they are others
+    initial_pose_errors: PoseErrors | None  # of the scan's own poses, if others were evaluated
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
 
     @property
     def truth_units(self) -> str:
-        """Unit of distances from the truth: an alignment with scale brings a scan of unknown unit to the truth's."""
+        """Unit of distances from the truth; a scan of unknown unit is scaled to that of the truth."""
         return "units of the truth" if self.units == "arbitrary" else self.units
 
     @property
     def alignment(self) -> str:
-        """The alignment to judge by: rigid, but where nothing says how long a unit is, with scale."""
+        """The alignment to judge by: rigid, or with scale if the scan's unit is unknown."""
         return "similarity" if self.units == "arbitrary" else "rigid"
 
 
 def evaluate(
     mesh: Mesh,
     scan: Scan,
-    poses: Poses,
+    poses: DevicePoses,
     reference: Reference | None = None,
-    true_poses: Poses | None = None,
+    true_poses: DevicePoses | None = None,
     f_distances: Sequence[float] = (),
     samples: int = 100_000,
     seed: int = 0,
-    on_frame: Callable[[Frame, FrameFit, FramePixels], None] | None = None,
+    on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None = None,
 ) -> Evaluation:
     """Evaluate `mesh` with `poses` on `scan`.
 
-    `on_frame` is called with each frame's pixels as they pass (for pictures). Raises UserError where the
-    mesh cannot belong to the scan.
+    `on_frame` is called with each frame and its pixels in turn (to make pictures). Raises UserError if the mesh cannot
+    be a surface of this scan.
     """
-    surface = Surface(mesh)
-    fit = _fit(surface, scan, poses, on_frame)
-    initial = Poses(scan.T_world_camera, scan.T_world_projector)
+    surface = IndexedMesh(mesh)
+    agreement = _agreement(surface, scan, poses, on_frame)
+    initial = scan.poses
     moved = not np.array_equal(initial.stacked(), poses.stacked())
     scores: dict[str, SurfaceScore] = {}
     if reference is not None:
-        # Without true poses the scan's own ones tell where the reference lies: ICP starts from there, too.
-        towards = true_poses or (initial if moved else None)
-        scores = score_alignments(surface, reference, poses, towards, f_distances, samples, seed)
+        # Without true poses the scan's own ones show where the reference is: ICP starts from there as well.
+        target_poses = true_poses or (initial if moved else None)
+        scores = score_alignments(surface, reference, poses, target_poses, f_distances, samples, seed)
     return Evaluation(
         units=scan.units,
-        fit=fit,
+        agreement=agreement,
         reference=reference,
         surface=scores,
-        pose_errors=_pose_errors(poses, true_poses),
-        initial_pose_errors=_pose_errors(initial, true_poses) if moved else None,
+        pose_errors=compare_poses(poses, true_poses) if true_poses else None,
+        initial_pose_errors=compare_poses(initial, true_poses) if true_poses and moved else None,
         starting_poses=not moved,
     )
 
 
 def score_alignments(
-    surface: Surface,
+    surface: IndexedMesh,
     reference: Reference,
-    poses: Poses | None,
-    true_poses: Poses | None,
+    poses: DevicePoses | None,
+    true_poses: DevicePoses | None,
     f_distances: Sequence[float] = (),
     samples: int = 100_000,
     seed: int = 0,
 ) -> dict[str, SurfaceScore]:
-    """Scores under rigid ICP, under ICP with scale, and as is.
+    """Scores after rigid ICP, after ICP with scale, and without any alignment.
 
-    ICP starts from where the result lies and, with true poses (or others in the reference's world), from the map
-    that brings the estimated devices onto those; the better end counts.
+    ICP starts from where the result is. With true poses (or others in the reference's world) it starts a second time
+    from the map of the estimated devices onto those, and the better result counts.
     """
     points, _ = surface.sample(samples, seed)
     distances = tuple(f_distances) or default_f_distances(reference.size)
@@ -123,9 +117,13 @@ def score_alignments(
 
 
 def _starts(
-    poses: Poses | None, true_poses: Poses | None, with_scale: bool, points: Float[ndarray, "n 3"], tolerance: float
+    poses: DevicePoses | None,
+    true_poses: DevicePoses | None,
+    with_scale: bool,
+    points: Float[ndarray, "n 3"],
+    tolerance: float,
 ) -> list[Similarity]:
-    """Where ICP starts from; one start only if the poses say that the result lies where it should."""
+    """Where ICP starts from; a single start if the poses say that the result is already in place."""
     identity = Similarity.identity()
     if poses is None or true_poses is None:
         return [identity]
@@ -134,65 +132,31 @@ def _starts(
     return [identity, by_poses] if apart else [identity]
 
 
-def mesh_reference(mesh: Mesh, scan: Scan, poses: Poses, samples: int = 100_000, seed: int = 0) -> MeshReference:
-    """A true mesh with the part of it that `scan` could observe with `poses` (the true ones, if known)."""
-    surface = Surface(mesh)
-    points, normals = surface.sample(samples, seed + 1)
-    frames = [
-        (frame.camera, T_c, scan.projector, T_p)
-        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    ]
-    seen = observable(points, normals, surface, frames)
-    # A closed mesh that is inside out shows next to nothing; turned round, it shows much more.
-    few = seen.mean() < 0.05
-    if not seen.any() or (few and observable(points, -normals, surface, frames).mean() > 4 * seen.mean()):
-        raise UserError(
-            "no part of the reference mesh is both seen by a camera and lit by its projector\n"
-            f"    cause:  it is inside out, in another unit than the scan ({scan.units}), or in other axes\n"
-            "    remedy: give a mesh in the world axes and unit of transforms.json, triangles counter-clockwise "
-            "from outside"
-        )
-    return MeshReference(
-        surface,
-        points[seen],
-        f"true mesh; {seen.mean():.0%} of its area is seen by at least one camera while its projector lights it, "
-        "and only that part counts for completeness",
-    )
-
-
-def _fit(
-    surface: Surface,
+def _agreement(
+    surface: IndexedMesh,
     scan: Scan,
-    poses: Poses,
-    on_frame: Callable[[Frame, FrameFit, FramePixels], None] | None,
-) -> CaptureFit:
-    fit = FitAccumulator()
-    frames = fit_captures(surface, scan, poses.T_world_camera, poses.T_world_projector)
+    poses: DevicePoses,
+    on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None,
+) -> CaptureAgreement:
+    total = AgreementAccumulator()
+    frames = compare_captures(surface, scan, poses)
     for frame, figures, pixels in track(frames, "ray casting the frames", total=len(scan.frames)):
-        fit.add(figures, pixels)
+        total.add(figures, pixels)
         if on_frame is not None:
             on_frame(frame, figures, pixels)
-    result = fit.result()
+    result = total.result()
     if not any(frame.hit_share > 0 for frame in result.frames):
         raise UserError(_missed(surface, scan, poses))
     return result
 
 
-def _missed(surface: Surface, scan: Scan, poses: Poses) -> str:
-    """Why no ray meets the mesh, as far as sizes and distances tell."""
+def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
+    """Why no ray hits the mesh, as far as sizes and distances show."""
     distance = float(np.median(np.linalg.norm(poses.T_world_camera[:, :3, 3] - surface.centre, axis=1)))
     return (
-        "no camera ray through a masked pixel meets the mesh\n"
-        f"    cause:  mesh and poses do not belong together: the mesh measures {surface.diagonal:.4g}, and the cameras "
-        f"stand {distance:.4g} from it (median; the scan's unit is {scan.units}); another unit, other axes or "
-        "another scan are likely\n"
+        "no camera ray through a masked pixel hits the mesh\n"
+        f"    cause:  mesh and poses do not match: the mesh measures {surface.diagonal:.4g}, and the cameras are "
+        f"{distance:.4g} away from it (median; the scan's unit is {scan.units}); probably another unit, other axes or "
+        "another scan\n"
         "    remedy: give the mesh that was exported from this scan, in its unit and world axes"
-    )
-
-
-def _pose_errors(poses: Poses, true_poses: Poses | None) -> PoseErrors | None:
-    if true_poses is None:
-        return None
-    return compare_poses(
-        poses.T_world_camera, poses.T_world_projector, true_poses.T_world_camera, true_poses.T_world_projector
     )

@@ -1,7 +1,7 @@
 """Distances between a reconstructed surface and the truth.
 
-*Accuracy* asks of every part of the result how far the truth is: it punishes surface that is wrong or invented.
-*Completeness* asks of every part of the truth that the scan could observe how far the result is: it punishes holes.
+*Accuracy* is the distance of every part of the result from the truth: wrong or invented surface makes it worse.
+*Completeness* is the distance of every observable part of the truth from the result: holes make it worse.
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.reference import Reference
-from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
 
 
@@ -38,29 +38,29 @@ class DistanceStats:
 
 @dataclass(frozen=True)
 class SurfaceScore:
-    """How near result and truth are under one alignment; lengths in the truth's unit."""
+    """How close result and truth are after one alignment; lengths in the truth's unit."""
 
     accuracy: DistanceStats  # result -> truth
     completeness: DistanceStats  # observed truth -> result
     chamfer: float  # mean of the two means
-    f_score: dict[float, float]  # distance -> harmonic mean of the shares of result and truth nearer than it
+    f_score: dict[float, float]  # distance -> harmonic mean of the shares of result and truth that are closer than it
     scale: float  # factor the result was multiplied by
     S_truth_result: Similarity
 
 
 def score_surface(
-    result: Surface,
+    result: IndexedMesh,
     samples: Float[ndarray, "n 3"],
     reference: Reference,
     S_truth_result: Similarity,
     f_distances: Sequence[float],
 ) -> SurfaceScore:
-    """Distances both ways after the result has been moved by `S_truth_result`.
+    """Distances in both directions after the result was moved by `S_truth_result`.
 
     `samples` are area-uniform points on the result, in its own frame.
     """
     accuracy = reference.distance(S_truth_result.points(samples))
-    # Truth carried into the result's frame: the same distances, without building a second ray caster.
+    # The truth is moved into the result's frame: the same distances without building a second search tree.
     observed = S_truth_result.inverse().points(reference.observed)
     completeness = result.distance(observed) * S_truth_result.scale
     return SurfaceScore(

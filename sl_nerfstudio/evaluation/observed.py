@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
@@ -15,21 +15,21 @@ from sl_nerfstudio.geometry.se3 import inverse, transform
 def observable(
     points: Float[ndarray, "m 3"],
     normals: Float[ndarray, "m 3"],
-    surface: Surface,
+    surface: IndexedMesh,
     frames: Iterable[tuple[Device, Float[ndarray, "4 4"], Device, Float[ndarray, "4 4"]]],
 ) -> Bool[ndarray, "m"]:
     """Whether at least one frame's camera sees a point while that frame's projector lights it.
 
-    Seen and lit mean: the surface faces the device, the point falls inside its image, and nothing of the
-    surface stands between. `frames` holds (camera, T_world_camera, projector, T_world_projector).
+    Seen and lit mean: the surface faces the device, the point projects into its image, and no other part of the
+    surface is in between. `frames` holds (camera, T_world_camera, projector, T_world_projector).
     """
     seen = np.zeros(len(points), bool)
     for camera, T_world_camera, projector, T_world_projector in frames:
-        open_ = np.flatnonzero(~seen)
+        unseen = np.flatnonzero(~seen)
         for device, T in ((camera, T_world_camera), (projector, T_world_projector)):
-            open_ = open_[faces_and_falls_inside(points[open_], normals[open_], device, T)]
-            open_ = open_[~surface.occluded(points[open_], T[:3, 3])]
-        seen[open_] = True
+            unseen = unseen[faces_and_falls_inside(points[unseen], normals[unseen], device, T)]
+            unseen = unseen[~surface.occluded(points[unseen], T[:3, 3])]
+        seen[unseen] = True
     return seen
 
 

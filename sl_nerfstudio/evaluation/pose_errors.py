@@ -8,6 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from sl_nerfstudio.evaluation.alignment import align_poses
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.se3 import log_so3
 from sl_nerfstudio.geometry.similarity import Similarity
 
@@ -32,41 +33,35 @@ class DeviceErrors:
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors after one common similarity has brought all estimated devices onto the true ones."""
+    """Errors after one common similarity has aligned all estimated devices with the true ones."""
 
     camera: DeviceErrors
     projector: DeviceErrors
-    relative: DeviceErrors  # projector as seen from its own camera; needs no alignment but the scale
+    relative: DeviceErrors  # projector relative to the camera of its frame; needs no alignment except for the scale
     scale_error: float  # estimated lengths are 1 + scale_error times the true ones
     S_truth_estimate: Similarity
 
 
-def compare_poses(
-    T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
-    true_T_world_camera: Float[ndarray, "n 4 4"],
-    true_T_world_projector: Float[ndarray, "n 4 4"],
-) -> PoseErrors:
-    """Errors of all poses. The gauge (where the world lies, how it is turned, its scale) is no error.
+def compare_poses(estimated: DevicePoses, true: DevicePoses) -> PoseErrors:
+    """Errors of all poses. The gauge (position, orientation and scale of the world) is not an error.
 
-    One map is fitted to all camera and projector centres and orientations together, so what is left
-    are contradictions between the poses; the scale it finds is reported apart.
+    One map is fitted to all camera and projector centres and orientations together. What remains are contradictions
+    between the poses; the scale error is reported separately.
     """
-    estimated = np.concatenate([T_world_camera, T_world_projector])
-    true = np.concatenate([true_T_world_camera, true_T_world_projector])
-    S = align_poses(estimated, true)
-    relative = np.linalg.inv(T_world_camera) @ T_world_projector
+    S = align_poses(estimated.stacked(), true.stacked())
+    relative = estimated.T_camera_projector
     relative[:, :3, 3] *= S.scale
+    aligned = estimated.mapped(S)
     return PoseErrors(
-        camera=device_errors(S.poses(T_world_camera), true_T_world_camera),
-        projector=device_errors(S.poses(T_world_projector), true_T_world_projector),
-        relative=device_errors(relative, np.linalg.inv(true_T_world_camera) @ true_T_world_projector),
+        camera=_device_errors(aligned.T_world_camera, true.T_world_camera),
+        projector=_device_errors(aligned.T_world_projector, true.T_world_projector),
+        relative=_device_errors(relative, true.T_camera_projector),
         scale_error=1 / S.scale - 1,
         S_truth_estimate=S,
     )
 
 
-def device_errors(T: Float[ndarray, "n 4 4"], true_T: Float[ndarray, "n 4 4"]) -> DeviceErrors:
+def _device_errors(T: Float[ndarray, "n 4 4"], true_T: Float[ndarray, "n 4 4"]) -> DeviceErrors:
     """Distance of the centres and angle between the orientations, frame by frame."""
     turn = torch.as_tensor(np.swapaxes(true_T[:, :3, :3], -1, -2) @ T[:, :3, :3], dtype=torch.float64)
     return DeviceErrors(

@@ -10,10 +10,11 @@ from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Plain dict for `json.dump`: figures that do not exist are null, blocks that do not exist are absent.
+    """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
-    errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`; `fit` is always there.
+    errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
+    the captures, is always there.
     """
     out: dict[str, Any] = {"format": 1, "units": evaluation.units}
     if evaluation.reference is not None or evaluation.pose_errors is not None:
@@ -26,7 +27,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         out |= _poses(evaluation.pose_errors)
     if evaluation.initial_pose_errors is not None:
         out["initial"] = _poses(evaluation.initial_pose_errors)
-    out["fit"] = asdict(evaluation.fit)
+    out["fit"] = asdict(evaluation.agreement)
     return _finite(out)
 
 

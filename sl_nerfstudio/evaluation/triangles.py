@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-_THIN = 0.1  # height over length
+_THIN = 0.1  # height divided by length
 
 
 def nearest_on_triangle(
@@ -21,9 +21,9 @@ def nearest_on_triangle(
     best = np.where(inside[:, None], foot, np.inf)
     distance2 = np.where(inside, 0.0, np.inf)
     for start, end in ((a, b), (b, c), (c, a)):
-        way = end - start
-        t = ((p - start) * way).sum(1) / np.maximum((way**2).sum(1), 1e-300)
-        point = start + np.clip(t, 0, 1)[:, None] * way
+        side = end - start
+        t = ((p - start) * side).sum(1) / np.maximum((side**2).sum(1), 1e-300)
+        point = start + np.clip(t, 0, 1)[:, None] * side
         square = ((p - point) ** 2).sum(1)
         nearer = square < distance2
         best, distance2 = np.where(nearer[:, None], point, best), np.where(nearer, square, distance2)

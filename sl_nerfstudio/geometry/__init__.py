@@ -1,5 +1,5 @@
-"""Rigid motions, similarities, device models, rays, triangulation and epipolar residuals.
+"""Geometry without files: SE(3), Sim(3), device models, rays, triangulation, epipolar residuals.
 
-Functions take poses, intrinsics, pixels and points as arrays or tensors, and return the same. They know nothing about
-scans or files, and all other folders build on them.
+In: poses, intrinsics, pixels and points, as arrays or tensors. Out: the same kinds of values; most functions are
+differentiable.
 """

@@ -21,7 +21,7 @@ class DevicePoses:
         """Number of frames."""
         return len(self.T_world_camera)
 
-    def __getitem__(self, frames: Sequence[int] | ndarray) -> "DevicePoses":
+    def __getitem__(self, frames: Sequence[int] | slice | ndarray) -> "DevicePoses":
         """The poses of some frames."""
         return DevicePoses(self.T_world_camera[frames], self.T_world_projector[frames])
 

@@ -11,7 +11,7 @@ from sl_nerfstudio.meshing.marching_table import EDGE_CORNERS, triangle_table
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.sparse_grid import LEAF, Field, Grid, Leaves, evaluate_leaves, find_leaves
 
-_MARGIN = 1e-3  # of an edge: how near to a corner a vertex may come, so that no triangle collapses
+_MARGIN = 1e-3  # of an edge: the smallest distance of a vertex from a corner, so that no triangle collapses
 
 
 def extract_mesh(
@@ -26,7 +26,7 @@ def extract_mesh(
     """Mesh of the zero level of `sdf` in the box, with `resolution` cells along its longest side.
 
     `sdf` takes float32 points on `device`, at most 2^18 at a time, and gives the distance in the same units, negative
-    inside; it need only be nearly a distance (`safety`: the larger, the farther off a surface is looked for). The mesh
+    inside; an approximate distance is enough (with a larger `safety` the surface is searched farther away). The mesh
     is in the box's frame, closed except where the surface leaves the box, and its normals point to positive values.
     `polish` regula falsi steps move each vertex along its grid edge to the field's own zero, beyond linear
     interpolation, for one more evaluation per vertex and step.

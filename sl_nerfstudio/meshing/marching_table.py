@@ -1,11 +1,11 @@
-"""The 256 cases of marching cubes, derived instead of typed in, so that the surface closes by construction.
+"""The 256 cases of marching cubes, derived by program, so that the surface is closed by construction.
 
 Corner `c` of a cell lies at `(c & 1, c >> 1 & 1, c >> 2 & 1)`. Bit `c` of a case is set where the field is
 negative there (inside). Edge `4 * axis + k` runs along `axis`; see EDGE_CORNERS.
 
-On every face of the cell the negative corners are kept apart: a diagonal pair gives two segments, each cutting off one
-negative corner. That depends on the face's own signs alone, so the two cells at a face draw the same segments,
-and each edge that the surface cuts has exactly one segment on either of its faces: the segments close to loops
+On every face of the cell the negative corners are separated: a diagonal pair gives two segments, each cutting off one
+negative corner. This depends only on the signs at that face, so the two cells at a face draw the same segments, and
+each edge that the surface cuts has exactly one segment on each of its faces: the segments form closed loops
 (Lorensen and Cline, SIGGRAPH 1987, with the face rule that makes their table free of holes).
 """
 
@@ -49,7 +49,7 @@ def _loops(case: int) -> list[list[int]]:
     for face in FACE_CORNERS:
         inside = [bool(case >> c & 1) for c in face]
         for i in range(4):
-            if inside[i] and not inside[i - 1]:  # a run of negative corners begins here
+            if inside[i] and not inside[i - 1]:  # a sequence of negative corners begins here
                 j = i
                 while inside[(j + 1) % 4]:
                     j += 1
@@ -72,7 +72,7 @@ def _on_one_face(a: int, b: int) -> bool:
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
     """Triangles of a loop without a diagonal inside a face of the cell; None if there is no such choice.
 
-    A diagonal inside a face could be drawn by the neighbouring cell too: four triangles would meet in it.
+    The neighbouring cell could draw the same diagonal inside a face: four triangles would meet in it.
     """
     if len(loop) == 3:
         return [(loop[0], loop[1], loop[2])]
@@ -91,7 +91,7 @@ def triangle_table() -> tuple[Int[ndarray, "256 t 3"], Int[ndarray, "256"]]:
     """Edges of the triangles of each case (-1 beyond the last) and how many triangles it has.
 
     Triangles are counter-clockwise as seen from the positive side, so normals point outward.
-    Raises ValueError if a case had no clean triangulation (tests show that none is without).
+    Raises ValueError if a case has no such triangulation (tests show that all have one).
     """
     cases = []
     for case in range(256):

@@ -1,4 +1,4 @@
-"""The mesh that every step of this folder hands to the next."""
+"""The mesh type of this package."""
 
 from dataclasses import dataclass
 

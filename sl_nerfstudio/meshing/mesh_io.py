@@ -17,7 +17,7 @@ MAX_TRIANGLES = 200_000_000  # about 10 GB once read
 
 
 def check_suffix(path: Path) -> str:
-    """The suffix in lower case. Raises UserError, naming the choices, if it is no known one."""
+    """The suffix in lower case. Raises UserError, naming the choices, if it is not a known one."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         problem = f"unknown kind of mesh file {path.suffix!r}" if suffix else "the name of a mesh file needs a suffix"
@@ -29,10 +29,10 @@ def check_suffix(path: Path) -> str:
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh; `path` appears whole or not at all.
+    """Write a mesh; `path` appears complete or not at all.
 
-    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. No axis is turned:
-    GLB viewers that expect y up show the world as it is. Raises UserError for an unknown suffix, a mesh without
+    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. Axes are not
+    changed, although GLB viewers may expect y up. Raises UserError for an unknown suffix, a mesh without
     triangles, a vertex that is not a number, or a place where writing is impossible.
     """
     suffix = check_suffix(path)
@@ -40,12 +40,12 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
         raise UserError(
             f"{path}: not written, the mesh has no triangles\n"
             "    cause:  no surface was found, or nothing of it was observed by any frame\n"
-            "    remedy: look at the run in ns-viewer; sl-export --keep-unobserved writes the surface uncut"
+            "    remedy: look at the run in ns-viewer; sl-export --keep-unobserved writes the whole surface"
         )
     if not np.isfinite(mesh.vertices).all():
         raise UserError(
             f"{path}: not written, {int((~np.isfinite(mesh.vertices)).any(1).sum())} vertices are not numbers\n"
-            "    cause:  the training diverged, or the scan's poses are broken\n"
+            "    cause:  the training diverged, or the scan's poses are wrong\n"
             "    remedy: check the scan with sl-check and train again"
         )
     write_atomic(path, _ply(mesh) if suffix == ".ply" else _by_trimesh(mesh, suffix))
@@ -72,8 +72,9 @@ def _by_trimesh(mesh: Mesh, suffix: str) -> bytes:
 def read_mesh(path: Path) -> Mesh:
     """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
 
-    Vertices at one place are welded only in STL, which cannot share them. Raises UserError if the file is missing,
-    empty, broken, too large, without triangles, refers to vertices that do not exist, or holds numbers that are none.
+    Vertices at the same place are merged only in STL, which cannot share them. Raises UserError if the file is missing,
+    empty, damaged, too large, without triangles, refers to vertices that do not exist, or holds values that are not
+    numbers.
     """
     suffix = check_suffix(path)
     check_file(path)
@@ -81,11 +82,11 @@ def read_mesh(path: Path) -> Mesh:
         vertices, faces = _load(path, suffix)
     except MemoryError as error:
         raise FileError(
-            path, "does not fit into memory", "a huge or broken mesh", "decimate or export it again"
+            path, "does not fit into memory", "a huge or damaged mesh", "decimate or export it again"
         ) from error
-    except Exception as error:  # every loader has its own ways to fail on a broken file
+    except Exception as error:  # every loader fails in its own way on a damaged file
         problem = f"cannot be read as {suffix[1:].upper()} ({_first_line(error)})"
-        cause = "the file is truncated, broken or of another kind"
+        cause = "the file is truncated, damaged or of another kind"
         raise FileError(path, problem, cause, "export or copy it again") from error
     if suffix == ".ply":
         _check_ply_counts(path, len(vertices), len(faces))
@@ -93,7 +94,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def _check_ply_counts(path: Path, vertices: int, faces: int) -> None:
-    """The loader takes what there is of a truncated text file; the header says how much there should be."""
+    """The loader accepts a truncated text file; the header says how much there should be."""
     with path.open("rb") as stream:
         header = stream.read(65536).split(b"end_header")[0].decode("ascii", "replace")
     stated = {kind: int(count) for kind, count in re.findall(r"element (vertex|face) (\d+)", header)}
@@ -102,7 +103,7 @@ def _check_ply_counts(path: Path, vertices: int, faces: int) -> None:
         problem = (
             f"should hold {stated['vertex']} vertices and {stated['face']} faces, but {vertices} and {faces} were read"
         )
-        raise FileError(path, problem, "the file is truncated or broken", "export or copy it again")
+        raise FileError(path, problem, "the file is truncated or damaged", "export or copy it again")
 
 
 def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
@@ -132,7 +133,7 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         raise FileError(path, f"has {len(faces)} triangles", f"{MAX_TRIANGLES} are supported", "decimate it first")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise FileError(
-            path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is broken", again
+            path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is damaged", again
         )
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     bad = ~np.isfinite(vertices).all(1)
@@ -140,7 +141,7 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         problem = f"has {int(bad.sum())} vertices that are not numbers, the first is number {int(bad.argmax())}"
         raise FileError(path, problem, "it was written by a computation that failed", again)
     if (reach := np.abs(vertices).max()) > 1e12:
-        raise FileError(path, f"reaches out to {reach:.0e} units", "a broken file or a wrong unit", again)
+        raise FileError(path, f"reaches out to {reach:.0e} units", "a damaged file or a wrong unit", again)
     return Mesh(vertices, faces)
 
 

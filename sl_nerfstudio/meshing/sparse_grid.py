@@ -17,7 +17,7 @@ Field = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """Signed distance, negative inside, of points; both in the units of the box."""
 
 LEAF = 2  # cells along an edge of the smallest blocks
-MAX_LEAVES = 30_000_000  # about 30 GB: a field with more of them near its zero level is no surface
+MAX_LEAVES = 30_000_000  # about 30 GB: if more are near the zero level, the field is not a surface
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ def _offsets(n: int, device: torch.device) -> Int[Tensor, "n3 3"]:
 
 
 def slope_bound(grid: Grid, samples: int = 32) -> float:
-    """How steep the field is between neighbours of a coarse lattice: its 99th percentile, at least 1.
+    """Slope of the field between neighbours of a coarse lattice: its 99th percentile, at least 1.
 
-    A distance has slope 1; a trained field has it nearly. The bound scales the radius within which a block is kept.
+    A distance has slope 1, a trained field almost. The bound scales the radius within which a block is kept.
     """
     extent = torch.tensor(grid.cells, device=grid.device)
     value = grid.values(_offsets(samples, grid.device) / (samples - 1) * extent, "slope").reshape((samples,) * 3)
@@ -115,7 +115,7 @@ def find_leaves(grid: Grid, safety: float) -> Int[Tensor, "n 3"]:
             return block
         if len(block) * 8 > MAX_LEAVES * 2:
             raise UserError(
-                f"the zero level passes through {len(block)} blocks of {size} cells: the field is no surface yet. "
+                f"the zero level passes through {len(block)} blocks of {size} cells: the field is not a surface yet. "
                 "Train longer, or lower --resolution."
             )
         size //= 2
@@ -126,8 +126,9 @@ def find_leaves(grid: Grid, safety: float) -> Int[Tensor, "n 3"]:
 def evaluate_leaves(grid: Grid, lower: Int[Tensor, "n 3"]) -> Leaves:
     """The field at the corners of leaf blocks, and of those that the surface enters from them.
 
-    Where the field is not a distance the search may have missed a block; the surface then leaves the known ones
-    through a face. Such neighbours are added until none is missing: a component is found whole if any part of it was.
+    Where the field is not a distance the search may have missed a block; the surface then continues through a face of a
+    known block. Such neighbours are added until none is missing, so a component is found completely if any part of it
+    was found.
     """
     offsets = _offsets(LEAF + 1, grid.device)
     key = torch.empty(0, dtype=torch.long, device=grid.device)

@@ -51,7 +51,8 @@ def refine_intrinsics(
     def adjusted_with(change: IntrinsicsChange) -> Found:
         scan = loaded.scan.with_intrinsics_change(change)
         start = scene_rig(scan, loaded.S_scene_world)
-        return adjusted(scan, start, maps, refine, pose_prior(scan, loaded.S_scene_world, prior), settings)
+        known = pose_prior(scan, loaded.S_scene_world, prior)
+        return adjusted(scan, loaded.S_scene_world, start, maps, refine, known, settings)
 
     before = adjusted_with(stated)
     if before.intrinsics is None or not before.intrinsics.contradicts(s):

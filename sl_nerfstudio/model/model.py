@@ -16,6 +16,7 @@ from sl_nerfstudio.bundle_adjustment.free_parameters import constrained
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.field.cached_grid import CachedGrid
 from sl_nerfstudio.field.sdf_field import SDFField
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
 from sl_nerfstudio.geometry.se3 import inverse, rotate
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -92,11 +93,11 @@ class SLModel(Model):
         with torch.no_grad():
             return self.device_poses()
 
-    def poses(self) -> tuple[Float[ndarray, "frames 4 4"], Float[ndarray, "frames 4 4"]]:
-        """Present poses of cameras and projectors in the scan's world and units."""
+    def poses(self) -> DevicePoses:
+        """Current poses of all devices in the scan's world and units."""
         S = self.S_scene_world.inverse()
         camera, projector = self.poses_scene()
-        return S.poses(camera.cpu().numpy()), S.poses(projector.cpu().numpy())
+        return DevicePoses(S.poses(camera.cpu().numpy()), S.poses(projector.cpu().numpy()))
 
     def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
         """1 sigma per frame (see pose_refinement.sigmas_in_scan_units), or None where it was not estimated."""

@@ -13,7 +13,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
@@ -23,7 +23,7 @@ from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
-from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan import Scan, measured_length
 
 _LEAST_SIGMA = 1e-9  # scene units and radian: stands for a pose that is known exactly, and keeps equations solvable
 
@@ -63,15 +63,13 @@ class ScanAdjustment:
 
 def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
     """The scan's devices at their starting poses, in the scene frame."""
-    poses = DevicePoses(scan.T_world_camera, scan.T_world_projector)
-    return Rig.of([frame.camera for frame in scan.frames], scan.projector, poses, S_scene_world)
+    return Rig.of([frame.camera for frame in scan.frames], scan.projector, scan.poses, S_scene_world)
 
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
     """Stated uncertainty of each frame's starting pose, else the defaults; in scene units and radian."""
-    baseline = np.linalg.norm(scan.T_world_camera[:, :3, 3] - scan.T_world_projector[:, :3, 3], axis=1)
     rows = []
-    for frame, length in zip(scan.frames, baseline * S_scene_world.scale, strict=True):
+    for frame, length in zip(scan.frames, scan.poses.baseline * S_scene_world.scale, strict=True):
         stated = frame.pose_sigma
         if stated is None:
             rows.append(
@@ -108,7 +106,7 @@ def adjust_scan(
     start = scene_rig(scan, S_scene_world)
     maps, held_out = maps_and_held_out(scan, samples, settings)
     stated = pose_prior(scan, S_scene_world, prior)
-    found = adjusted(scan, start, maps, refine, stated, settings)
+    found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
         return ScanAdjustment(found.rig, found.sigma, decision, found.noise_px, found.intrinsics)
@@ -126,20 +124,31 @@ class Found:
 
 
 def adjusted(
-    scan: Scan, start: Rig, maps: CoordinateMaps, refine: RefinePoses, prior: PosePrior, settings: AdjustmentSettings
+    scan: Scan,
+    S_scene_world: Similarity,
+    start: Rig,
+    maps: CoordinateMaps,
+    refine: RefinePoses,
+    prior: PosePrior,
+    settings: AdjustmentSettings,
 ) -> Found:
     """Adjust the scan's poses from `start`, and give them the scan's lengths."""
     found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
-    rig = restore(start, found.rig, _scale(scan, refine, start, found.rig, prior))
+    rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     return Found(rig, found.sigma, found.noise_px, found.intrinsics)
 
 
-def _scale(scan: Scan, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
-    """The factor by which the adjusted rig gets the scan's lengths."""
-    frame = known_baseline(scan.scale.source, len(scan.frames)) if scan.scale.known else None
-    if frame is None and scan.scale.known and refine != "known-rig":
-        return agreeing_scale(start, rig, prior)
-    return baseline_scale(start, rig, frame)
+def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
+    """The factor by which the adjusted rig gets the scan's lengths; a known rig keeps its baselines."""
+    known = scan.scale
+    if known.baseline_of is not None:
+        return baseline_scale(start, rig, scan.index_of(known.baseline_of))
+    if not known.known or refine == "known-rig":
+        return baseline_scale(start, rig, None)
+    if known.bar is not None:
+        poses = DevicePoses(rig.T_world_camera.numpy(), rig.T_world_projector.numpy())
+        return known.bar.length * S_scene_world.scale / measured_length(scan, known.bar, poses)
+    return agreeing_scale(start, rig, prior)
 
 
 def maps_and_held_out(

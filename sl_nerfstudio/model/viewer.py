@@ -39,7 +39,7 @@ class SceneView(ViewerControl):
     def __init__(self, scan: Scan, S_scene_world: Similarity, current_poses: Callable[[], ScenePoses]) -> None:
         """`current_poses` gives the poses of cameras and projectors in the scene."""
         self._scan = scan
-        self._initial = (S_scene_world.poses(scan.T_world_camera), S_scene_world.poses(scan.T_world_projector))
+        self._initial = tuple(S_scene_world.poses(T) for T in (scan.poses.T_world_camera, scan.poses.T_world_projector))
         self._current_poses = current_poses
         self._refined: tuple[list[viser.CameraFrustumHandle], list[viser.CameraFrustumHandle]] = ([], [])
         self._starting: tuple[list[viser.CameraFrustumHandle], list[viser.CameraFrustumHandle]] = ([], [])

@@ -12,7 +12,7 @@ from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
 from sl_nerfstudio.scan.document import document_faults, frame_label, read_document
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.partial_scan import POSES, read_pose
+from sl_nerfstudio.scan.partial_frame import POSES, read_pose
 from sl_nerfstudio.scan.problem import Faults
 from sl_nerfstudio.scan.types import UNITS
 

@@ -9,7 +9,7 @@ from sl_nerfstudio.processing.given_poses import GivenPoses, align_to
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.known_length import KnownLength, scale_to
 from sl_nerfstudio.registration.result import Registration
-from sl_nerfstudio.scan.types import Scale
+from sl_nerfstudio.scan.types import UNITS, PickedPixel, Scale, ScaleBar
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def find_scan_poses(
     if given is not None:
         poses = _in_given_axes(poses, registration, given)
     if known is not None:
-        poses = _with_known_length(poses, clouds, registration, known)
+        poses = _with_known_length(poses, clouds, known)
     return poses
 
 
@@ -45,14 +45,12 @@ def _in_given_axes(poses: ScanPoses, registration: Registration, given: GivenPos
     return ScanPoses(poses.adjusted.mapped(S_given_found), given.units, scale)
 
 
-def _with_known_length(
-    poses: ScanPoses, clouds: Sequence[FrameCloud], registration: Registration, known: KnownLength
-) -> ScanPoses:
+def _with_known_length(poses: ScanPoses, clouds: Sequence[FrameCloud], known: KnownLength) -> ScanPoses:
     """The poses scaled until the length is the true one."""
     adjusted = poses.adjusted
     devices = adjusted.poses
     factor = scale_to(known, known.unit, clouds, devices.T_world_camera, devices.T_world_projector)
-    return ScanPoses(adjusted.scaled(factor), known.unit, Scale(True, _describe_source(known, clouds, registration)))
+    return ScanPoses(adjusted.scaled(factor), known.unit, _stated_scale(known))
 
 
 def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
@@ -64,9 +62,10 @@ def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
         )
 
 
-def _describe_source(known: KnownLength, clouds: Sequence[FrameCloud], registration: Registration) -> str:
-    """The known length in words; a baseline by the frame's number among those in the scan."""
-    if known.pixels:
-        return known.source
-    index = [cloud.name for cloud in clouds].index(known.frames[0])
-    return f"baseline of frame {int(registration.registered[:index].sum())} ({known.frames[0]})"
+def _stated_scale(known: KnownLength) -> Scale:
+    """The known length as the scan states it; its frames are given by name."""
+    if not known.pixels:
+        return Scale(True, known.source, baseline_of=known.frames[0])
+    first, second = (PickedPixel(*end) for end in zip(known.frames, known.pixels, strict=True))
+    length = known.metres / (UNITS[known.unit] or 1.0)
+    return Scale(True, known.source, bar=ScaleBar((first, second), length))

@@ -1,4 +1,4 @@
-"""What a person must know to make a run again: settings, versions, convergence; as plain JSON values."""
+"""What a person needs to repeat a run: settings, versions, convergence; as plain JSON values."""
 
 import math
 import platform
@@ -50,7 +50,7 @@ def _self_calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
 
 
 def run_settings(config: Any) -> dict[str, Any]:
-    """The settings of a run that its result depends on, from nerfstudio's trainer configuration."""
+    """The settings that determine the result of a run, from nerfstudio's trainer configuration."""
     chosen = {name: plain(getattr(config, name)) for name in _SETTINGS if hasattr(config, name)}
     return {
         **chosen,
@@ -62,7 +62,7 @@ def run_settings(config: Any) -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that compute."""
+    """Versions of the packages that do the computation."""
     found = {}
     for name in _PACKAGES:
         try:
@@ -73,7 +73,7 @@ def package_versions() -> dict[str, str]:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, paths, types, numbers and containers as JSON has them; what is not finite becomes None."""
+    """Dataclasses, paths, types, numbers and containers as JSON values; numbers that are not finite become None."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")}
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""A finished training run, loaded for export on whatever device there is."""
+"""A finished training run, loaded for export on the GPU if there is one, else on the CPU."""
 
 import json
 import warnings
@@ -18,15 +18,16 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan
 
-_SAME_SCENE = 1e-3  # scene units: far above float32's rounding, far below what can be seen
+_SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
 
 
 @runtime_checkable
 class TrainedModel(Protocol):
-    """What export asks of a model; poses are in the scan's world and unit, the field in the scene frame."""
+    """What an export needs from a model; poses are in the scan's world and unit, the field is in the scene frame."""
 
     scan: Scan
     S_scene_world: Similarity
@@ -40,12 +41,12 @@ class TrainedModel(Protocol):
         """Signed distance in scene units."""
         ...
 
-    def poses(self) -> tuple[Float[ndarray, "frames 4 4"], Float[ndarray, "frames 4 4"]]:
+    def poses(self) -> DevicePoses:
         """Poses of cameras and projectors."""
         ...
 
     def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
-        """One sigma of each frame's poses, in the order of PoseSigma's fields; None where it was not estimated."""
+        """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
         ...
 
     def self_calibration(self) -> SelfCalibration | None:
@@ -69,8 +70,8 @@ class TrainedRun:
 def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     """Load the last checkpoint of the run that `config_path` (config.yml) describes.
 
-    nerfstudio's own `eval_setup` ends in assertions or tracebacks where files were moved or cut off; here a run whose
-    folder was moved is found beside its config.yml, and `data` names the scan folder if that was moved.
+    nerfstudio's own `eval_setup` fails with assertions or tracebacks if files were moved or truncated. Here a run whose
+    folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
     Raises UserError for anything missing, broken or made by another method.
     """
     path = config_path / "config.yml" if config_path.is_dir() else config_path
@@ -86,7 +87,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     except RuntimeError as error:
         raise UserError(
             f"{checkpoint}: does not fit the scan in {config.pipeline.datamanager.data} ({_last_line(error)})\n"
-            "    cause:  the scan has other frames than when the run was trained, or another version of this package\n"
+            "    cause:  the scan has other frames than in the training, or another version of this package was used\n"
             "    remedy: give the scan of the training with --data FOLDER, or train again"
         ) from error
     pipeline.eval()
@@ -105,29 +106,29 @@ def _read_config(path: Path) -> Any:
         raise UserError(
             f"--load-config {path}: no such file\n"
             "    cause:  the path is mistyped, or the training never started\n"
-            "    remedy: give the config.yml that ns-train named at its end: outputs/SCAN/sl-neus/DATE/config.yml"
+            "    remedy: give the config.yml that ns-train prints at the end: outputs/SCAN/sl-neus/DATE/config.yml"
         )
     try:
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
     except (yaml.YAMLError, UnicodeDecodeError, ImportError, AttributeError, TypeError, OSError) as error:
         raise UserError(
             f"{path}: cannot be read as a training configuration ({type(error).__name__}: {_last_line(error)})\n"
-            "    cause:  the file is broken, or written by a version with other settings\n"
+            "    cause:  the file is damaged, or was written by a version with other settings\n"
             "    remedy: give an untouched config.yml, and the version of this package that wrote it"
         ) from error
     if not isinstance(config, TrainerConfig):
-        raise UserError(f"{path}: is no training configuration\n    remedy: give the config.yml that ns-train wrote")
+        raise UserError(f"{path}: is not a training configuration\n    remedy: give the config.yml that ns-train wrote")
     if not isinstance(config.pipeline.model, SLModelConfig):
         raise UserError(
             f"{path}: is a run of {config.method_name}\n"
-            "    cause:  sl-export knows the surface of sl-neus and sl-neus-paper only\n"
+            "    cause:  sl-export works only with runs of sl-neus and sl-neus-paper\n"
             "    remedy: use ns-export for other methods"
         )
     return config
 
 
 def _last_checkpoint(config: Any, path: Path) -> Path:
-    """Of the folder beside config.yml; that is where the run's settings put it unless the run was moved."""
+    """The last checkpoint next to config.yml, or where the settings put it if there is none."""
     folders = [path.absolute().parent / config.relative_model_dir, config.get_checkpoint_dir()]
     for folder in folders:
         found = sorted(folder.glob("step-*.ckpt"))
@@ -135,8 +136,8 @@ def _last_checkpoint(config: Any, path: Path) -> Path:
             return found[-1]
     raise UserError(
         f"{folders[0]}: no checkpoint step-*.ckpt\n"
-        "    cause:  the training was broken off before its first checkpoint, or the folder was moved from config.yml\n"
-        "    remedy: train again, or put nerfstudio_models/ back beside config.yml"
+        "    cause:  the training was interrupted before its first checkpoint, or its folder was moved\n"
+        "    remedy: train again, or put nerfstudio_models/ back next to config.yml"
     )
 
 
@@ -146,10 +147,10 @@ def _scan_folder(config: Any, data: Path | None) -> Path:
     stated = data or config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data
     root = scan_root(stated)
     if not (root / "transforms.json").is_file():
-        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted since the training"
+        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted after the training"
         raise UserError(
-            f"{root}: no transforms.json, so not the scan that the run was trained on\n"
-            f"    cause:  {cause}\n    remedy: say where it is: --data FOLDER"
+            f"{root}: has no transforms.json, so it is not the scan that the run was trained on\n"
+            f"    cause:  {cause}\n    remedy: give its folder: --data FOLDER"
         )
     return root
 
@@ -161,13 +162,13 @@ def _read_checkpoint(path: Path) -> dict[str, Any]:
     except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError, KeyError, TypeError) as error:
         raise UserError(
             f"{path}: cannot be read as a checkpoint ({type(error).__name__})\n"
-            "    cause:  it is cut off, as by a full disk, or another file\n"
-            "    remedy: remove it, so that the one before it is taken, or train again"
+            "    cause:  it is truncated, for example by a full disk, or another kind of file\n"
+            "    remedy: remove it, so that the previous one is used, or train again"
         ) from error
 
 
 def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str]) -> None:
-    """nerfstudio leaves weights that a checkpoint lacks as they were made, without a word."""
+    """Raise UserError if weights are missing: nerfstudio would silently keep their initial values."""
     missing = {_plain(key) for key in wanted} - {_plain(key) for key in stored}
     if missing:
         raise UserError(
@@ -178,25 +179,25 @@ def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str])
 
 
 def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
-    """nerfstudio wrote down how the scene lay in the world in training; the scan must still say the same."""
+    """Raise UserError if the scan now gives another scene frame than the one nerfstudio stored in training."""
     try:
         stated = json.loads(path.read_text(encoding="utf-8"))
         trained = stated["scale"] * np.array(stated["transform"], dtype=np.float64)
     except (OSError, ValueError, KeyError, TypeError):
-        return  # without that file nothing is known to differ
+        return  # without that file there is nothing to compare with
     corners = S_scene_world.inverse().points(np.array(list(product((-1.0, 1.0), repeat=3))))
     moved = corners @ trained[:, :3].T + trained[:, 3] - S_scene_world.points(corners)
     if np.abs(moved).max() > _SAME_SCENE:
         raise UserError(
-            f"{path}: the scan does not lie in the scene as it did when the run was trained "
+            f"{path}: the scan has another place in the scene than in the training "
             f"(off by {np.abs(moved).max():.2g} of the scene's radius)\n"
-            "    cause:  its poses, unit or coordinates were changed, or another version of this package reads it\n"
-            "    remedy: give the unchanged scan with --data FOLDER, use the version that trained, or train again"
+            "    cause:  its poses, unit or coordinates were changed, or another version of this package made the run\n"
+            "    remedy: give the unchanged scan with --data FOLDER, use the version that trained it, or train again"
         )
 
 
 def _plain(key: str) -> str:
-    return key.replace("module.", "")  # put there by training on several GPUs
+    return key.replace("module.", "")  # added by training on several GPUs
 
 
 def _last_line(error: Exception) -> str:

@@ -32,7 +32,7 @@ _DAMAGE = (
 
 
 def read_coords_size(path: Path) -> tuple[int, int]:
-    """(w, h) of a coordinate file, from its head alone. Raises FileError if it is not of the required kind."""
+    """(w, h) of a coordinate file, from its header alone. Raises FileError if it is not of the required kind."""
     with _open_member(path) as (stream, size):
         return _read_head(path, stream, size)
 
@@ -40,8 +40,8 @@ def read_coords_size(path: Path) -> tuple[int, int]:
 def read_coords(path: Path) -> Float32[ndarray, "h w 2"]:
     """Pattern coordinates (x_p, y_p) of every pixel, as stored.
 
-    Raises FileError if the file is missing, damaged, pickled, or not float32 of shape (H, W, 2); the head is
-    checked against the size of the file before any memory is taken.
+    Raises FileError if the file is missing, damaged, pickled, or not float32 of shape (H, W, 2); the header is
+    checked against the size of the file before any memory is allocated.
     """
     with _open_member(path) as (stream, size):
         _read_head(path, stream, size)
@@ -59,7 +59,7 @@ def encode_coords(coords: Float32[ndarray, "h w 2"]) -> bytes:
 
 @contextmanager
 def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
-    """The .npy stream in `path` and its length in bytes; every damage becomes a FileError."""
+    """The .npy stream in `path` and its length in bytes; any damage becomes a FileError."""
     size = check_file(path)
     try:
         if path.suffix.lower() == ".npy":
@@ -71,14 +71,14 @@ def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
                 with archive.open(member) as stream:
                     yield stream, member.file_size  # type: ignore[misc]
         else:
-            raise FileError(path, "is neither .npz nor .npy", "another format of array", _EXPORT_AGAIN)
+            raise FileError(path, "is neither .npz nor .npy", "it is an array in another format", _EXPORT_AGAIN)
     except FileError:
         raise
     except _DAMAGE as error:
         raise FileError(
             path,
             f"cannot be read ({error})",
-            "the file is cut short, damaged or not what its name says",
+            "the file is truncated, damaged or not what its name says",
             _EXPORT_AGAIN,
         ) from error
 
@@ -86,7 +86,7 @@ def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
 def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
-        raise FileError(path, f"holds {len(members)} members", "not a coordinate file", _EXPORT_AGAIN)
+        raise FileError(path, f"holds {len(members)} members", "it is not a coordinate file", _EXPORT_AGAIN)
     found = [member for member in members if member.filename == f"{KEY}.npy"]
     if len(found) != 1:
         names = ", ".join(repr(member.filename.removesuffix(".npy")) for member in members[:5]) or "nothing"
@@ -100,7 +100,7 @@ def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
 
 
 def _read_head(path: Path, stream: BufferedIOBase, size: int) -> tuple[int, int]:
-    """Check the head of a .npy stream of `size` bytes in all; return (w, h)."""
+    """Check the header of a .npy stream of `size` bytes in total; return (w, h)."""
     version = npy.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise FileError(path, f"is of .npy version {version}", "it does not hold plain numbers", _EXPORT_AGAIN)
@@ -110,7 +110,7 @@ def _read_head(path: Path, stream: BufferedIOBase, size: int) -> tuple[int, int]
         raise FileError(
             path,
             "holds pickled Python objects, which are never loaded",
-            "it was saved from an array of dtype object; such a file may run code when loaded",
+            "it was saved from an array of dtype object; such a file can run code when it is loaded",
             _EXPORT_AGAIN,
         )
     if dtype.kind != "f" or dtype.itemsize != 4:
@@ -118,14 +118,14 @@ def _read_head(path: Path, stream: BufferedIOBase, size: int) -> tuple[int, int]
             path, f"holds {dtype} instead of float32", "it was saved from an array of another type", _EXPORT_AGAIN
         )
     if len(shape) != 3 or shape[2] != 2 or 0 in shape:
-        cause = "the channels stand first" if len(shape) == 3 and shape[0] == 2 else "another kind of array"
+        cause = "the channels come first" if len(shape) == 3 and shape[0] == 2 else "it is another kind of array"
         raise FileError(path, f"has the shape {shape} instead of (H, W, 2)", cause, _EXPORT_AGAIN)
     expected = math.prod(shape) * dtype.itemsize + stream.tell()
     if size != expected:
         raise FileError(
             path,
-            f"has {size} bytes where its head asks for {expected}",
-            "the file is cut short, or its head is wrong",
+            f"has {size} bytes, but its header says {expected}",
+            "the file is truncated, or its header is wrong",
             _EXPORT_AGAIN,
         )
     return shape[1], shape[0]

@@ -9,25 +9,26 @@ from typing import Any
 from sl_nerfstudio.scan.file_error import FileError, read_bytes
 from sl_nerfstudio.scan.problem import Faults, Problem
 
+TRANSFORMS = "transforms.json"
 MAX_BYTES = 256 << 20
-_TOO_DEEP = Problem("is nested too deeply", "not a description of a scan", "write the file again")
+_TOO_DEEP = Problem("is nested too deeply", "it does not describe a scan", "write the file again")
 _BOM = b"\xef\xbb\xbf"
 
 
 class Record(dict[str, Any]):
-    """A JSON object that remembers which of its keys stood there more than once."""
+    """A JSON object that remembers which of its keys occurred more than once."""
 
     duplicates: tuple[str, ...] = ()
 
 
 def read_document(path: Path) -> Record:
-    """The object in a JSON file. Raises FileError if the file is missing or is not one JSON object.
+    """The object in a JSON file. Raises FileError if the file is missing or does not hold one JSON object.
 
-    Numbers may come back as NaN or infinity and keys may have stood there twice: `document_faults` lists those.
+    Numbers may be NaN or infinite and keys may have occurred twice: `document_faults` lists those.
     """
     content = read_bytes(path)
     if len(content) > MAX_BYTES:
-        raise FileError(path, f"is {len(content) >> 20} MiB large", "not a description of a scan", "correct the path")
+        raise FileError(path, f"is {len(content) >> 20} MiB large", "it does not describe a scan", "correct the path")
     if content.startswith(_BOM):
         raise FileError(
             path,
@@ -49,19 +50,19 @@ def read_document(path: Path) -> Record:
     except json.JSONDecodeError as error:
         raise _syntax_error(path, content, error) from error
     except ValueError as error:  # a number with thousands of digits
-        raise FileError(path, f"is no valid JSON ({error})", "a damaged number", "write the file again") from error
+        raise FileError(path, f"is not valid JSON ({error})", "a damaged number", "write the file again") from error
     if not isinstance(document, Record):
         raise FileError(
             path,
             f"holds {_name(document)} instead of an object",
-            "another kind of JSON file",
+            "it is another kind of JSON file",
             "a scan's transforms.json starts with { and has the keys of docs/scan-format.md",
         )
     return document
 
 
 def document_faults(document: Record, file: str, faults: Faults) -> None:
-    """Add every key given twice and every number that is not finite, wherever they stand."""
+    """Add every key given twice and every number that is not finite, wherever they are."""
     try:
         for frame, key, problem in _walk(document, None, ""):
             faults.add(problem, file, frame, key or None)
@@ -85,16 +86,16 @@ def _record(pairs: list[tuple[str, Any]]) -> Record:
 
 
 def _syntax_error(path: Path, content: bytes, error: json.JSONDecodeError) -> FileError:
-    problem = f"is no valid JSON ({error.msg} in line {error.lineno}, column {error.colno})"
+    problem = f"is not valid JSON ({error.msg} in line {error.lineno}, column {error.colno})"
     rest = content.decode("utf-8")[error.pos :].strip()
     if not content.strip():
-        return FileError(path, "is empty (white space only)", "writing it was broken off", "write it again")
+        return FileError(path, "is empty (white space only)", "writing it was interrupted", "write it again")
     if not rest or error.msg.startswith("Unterminated string"):
         return FileError(
-            path, problem, "the file is cut short: writing or copying it was broken off", "write or copy it again"
+            path, problem, "the file is truncated: writing or copying it was interrupted", "write or copy it again"
         )
     return FileError(
-        path, problem, "a slip while editing: a missing or trailing comma, quote or bracket", "correct that line"
+        path, problem, "a mistake in editing: a missing or trailing comma, quote or bracket", "correct that line"
     )
 
 
@@ -104,7 +105,7 @@ def _walk(value: Any, frame: str | None, key: str) -> Iterator[tuple[str | None,
             yield (
                 frame,
                 f"{key}.{twice}".lstrip("."),
-                Problem("stands there more than once", "a slip while editing or merging files", "keep the right one"),
+                Problem("occurs more than once", "a mistake when files were edited or merged", "keep the right one"),
             )
         for name, item in value.items():
             if not key and frame is None and name == "frames" and isinstance(item, list):
@@ -133,8 +134,8 @@ def _numbers(value: list[Any]) -> Iterator[float]:
 
 def _not_finite(number: float) -> Problem:
     return Problem(
-        f"holds {number}, which is no number",
-        "registration or calibration failed here and its result was written all the same",
+        f"holds {number}, which is not a number",
+        "registration or calibration failed here and its result was written anyway",
         "calibrate again, or leave the frame out",
     )
 

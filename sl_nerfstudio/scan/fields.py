@@ -1,4 +1,4 @@
-"""Reading keys of a JSON object with their types checked; what is wrong goes to a collection of faults."""
+"""Reads keys of a JSON object and checks their types; what is wrong goes to a collection of faults."""
 
 import math
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from sl_nerfstudio.scan.problem import Faults, Problem
 
 @dataclass(frozen=True)
 class Fields:
-    """An object of transforms.json and its place; `read_*` return None after adding a fault.
+    """An object in transforms.json and where it is; `read_*` return None after adding a fault.
 
-    A number that is not finite gives None without a fault: `document_faults` has listed it.
+    A number that is not finite gives None without a fault: `document_faults` lists it.
     """
 
     record: dict[str, Any]
@@ -42,16 +42,18 @@ class Fields:
         try:
             number = float(value)
         except OverflowError:
-            return self._wrong_type(key, value, "a number of sensible size")
+            return self._wrong_type(key, value, "a number of reasonable size")
         return number if math.isfinite(number) else None
 
     def read_count(self, key: str) -> int | None:
-        """A whole number above 0."""
+        """A whole number greater than 0."""
         number = self.read_number(key)
         if number is None:
             return None
         if number < 1 or number != int(number):
-            self.fault(key, f"is {number:g}, not a whole number above 0", "a slip", "give the size in pixels")
+            self.fault(
+                key, f"is {number:g}, not a whole number greater than 0", "a typing error", "give the size in pixels"
+            )
             return None
         return int(number)
 
@@ -92,6 +94,21 @@ class Fields:
             return self._wrong_type(key, value, "an object { .. }")
         return Fields(value, self.faults, self.file, self.frame, f"{self.prefix}{key}.")
 
+    def read_numbers(self, key: str, count: int) -> list[float] | None:
+        """A list of `count` finite numbers."""
+        value = self._get(key)
+        if value is None:
+            return None
+        numbers = value if isinstance(value, list) else []
+        right = len(numbers) == count and all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+        if not right:
+            return self._wrong_type(key, value, f"a list of {count} numbers")
+        try:
+            found = [float(x) for x in numbers]
+        except OverflowError:
+            return self._wrong_type(key, value, f"a list of {count} numbers of reasonable size")
+        return found if all(map(math.isfinite, found)) else None
+
     def read_matrix(self, key: str) -> Float64[ndarray, "rows columns"] | None:
         """A list of rows of finite numbers."""
         value = self._get(key)
@@ -105,7 +122,7 @@ class Fields:
         try:
             matrix = np.array(rows, dtype=np.float64)
         except OverflowError:
-            return self._wrong_type(key, value, "a list of four rows of four numbers of sensible size")
+            return self._wrong_type(key, value, "a list of four rows of four numbers of reasonable size")
         return matrix if np.isfinite(matrix).all() else None
 
     def check_spelling(self, known: Sequence[str]) -> None:
@@ -114,11 +131,16 @@ class Fields:
         for key in self.record:
             close = [] if key in known else get_close_matches(key, absent, n=1, cutoff=0.85)
             if close:
-                self.fault(key, "is no key of a scan", "misspelt", f"did you mean {close[0]!r}?")
+                self.fault(key, "is not a key of a scan", "it is misspelt", f"did you mean {close[0]!r}?")
 
     def _get(self, key: str) -> Any:
         if key not in self.record:
-            self.fault(key, "is missing", "written by a program that does not know this format, or removed", "add it")
+            self.fault(
+                key,
+                "is missing",
+                "it was removed, or the program that wrote the file does not know this format",
+                "add it",
+            )
             return None
         if self.record[key] is None:
             self._wrong_type(key, None, "a value")

@@ -1,4 +1,4 @@
-"""Heads of the files of a scan: do they exist, are they of the right kind and size? Decodes nothing."""
+"""The headers of a scan's files: do the files exist, are they of the right kind and size? Decodes nothing."""
 
 from pathlib import Path
 
@@ -10,19 +10,19 @@ from sl_nerfstudio.scan.partial_scan import PartialFrame, PartialScan
 from sl_nerfstudio.scan.problem import Faults, Problem
 
 
-def check_headers(draft: PartialScan, faults: Faults) -> set[Path]:
-    """Add what the heads of all files tell; return the files that are worth decoding."""
+def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
+    """Check the headers of all files; return the files that can be decoded."""
     good: set[Path] = set()
-    if draft.pattern_path is not None:
-        size = None if draft.projector is None else (draft.projector.w, draft.projector.h)
-        _check_image(draft.pattern_path, draft.root, None, size, True, "the projector", good, faults)
-    for frame in draft.frames:
-        _check_frame(frame, draft.root, good, faults)
+    if partial.pattern_path is not None:
+        size = None if partial.projector is None else (partial.projector.w, partial.projector.h)
+        _check_image(partial.pattern_path, partial.root, None, size, True, "the projector", good, faults)
+    for frame in partial.frames:
+        _check_frame(frame, partial.root, good, faults)
     return good
 
 
 def relative(path: Path, root: Path) -> str:
-    """How a file is named in messages: its path below the folder, with slashes."""
+    """How messages name a file: its path below the folder, with slashes."""
     return path.relative_to(root).as_posix()
 
 
@@ -66,7 +66,7 @@ def _check_image(
         faults.add(_wrong_size(found, size, device), relative(path, root), frame)
     if grey_only and header.mode != "grey":
         faults.add(
-            Problem("is in colour", "saved by a program that knows only RGB", "save it as grey, 8 or 16 bit"),
+            Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit"),
             relative(path, root),
             frame,
         )
@@ -80,13 +80,13 @@ def _size(device: Device | None) -> tuple[int, int] | None:
 
 def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:
     if found == wanted[::-1]:
-        cause = "width and height are exchanged: it was turned, or w and h were"
+        cause = "width and height are swapped: the image was rotated, or w and h were swapped"
     elif found[0] * wanted[1] == found[1] * wanted[0]:
         cause = "it was resized, or the intrinsics are those of another resolution"
     else:
-        cause = "it was cropped, or belongs to another camera or scan"
+        cause = "it was cropped, or comes from another camera or scan"
     return Problem(
         f"is {found[0]} x {found[1]} pixels, but {device} has {wanted[0]} x {wanted[1]}",
         cause,
-        "give the original file, or the intrinsics (w, h, fl_x, fl_y, cx, cy) that belong to this one",
+        "give the original file, or the intrinsics (w, h, fl_x, fl_y, cx, cy) of this one",
     )

@@ -19,13 +19,13 @@ from sl_nerfstudio.scan.file_error import FileError, check_file, read_bytes, unr
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
 _EXIF_ORIENTATION = 0x0112
-MAX_PIXELS = 89_000_000  # Pillow warns of decompression bombs a little above
+MAX_PIXELS = 89_000_000  # just below the size at which Pillow warns of decompression bombs
 _OTHER_KINDS = {
     "P": "a colour palette",
     "RGBA": "transparency",
     "LA": "transparency",
     "PA": "transparency",
-    "1": "one bit a pixel",
+    "1": "one bit per pixel",
 }
 _DAMAGE = (
     OSError,
@@ -43,7 +43,7 @@ _DAMAGE = (
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the head of an image file says; `mode` is "grey" or "RGB"."""
+    """What the header of an image file says; `mode` is "grey" or "RGB"."""
 
     w: int
     h: int
@@ -52,7 +52,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Size and kind of an image, without decoding it. Raises FileError for kinds that a scan may not hold."""
+    """Size and kind of an image, without decoding it. Raises FileError for kinds that a scan must not hold."""
     check_file(path)
     try:
         with path.open("rb") as stream:
@@ -64,8 +64,8 @@ def read_header(path: Path) -> ImageHeader:
 def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
     """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit as stored.
 
-    Raises FileError for a file that is missing, damaged, cut short, not of a known format, turned by an EXIF tag, or
-    has a palette or transparency: nothing of that is repaired.
+    Raises FileError for a file that is missing, damaged, truncated, of an unknown format, rotated by an EXIF tag, or
+    that has a palette or transparency: none of this is repaired.
     """
     content = read_bytes(path)
     image = _open(path, BytesIO(content))
@@ -78,10 +78,10 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
         raise FileError(
             path,
             f"cannot be decoded ({error})",
-            "the file is cut short or damaged, as by a copy that was broken off or a full disk",
+            "the file is truncated or damaged, for example by an interrupted copy or a full disk",
             "copy or export this image again",
         ) from error
-    _refuse_orientation(path, image)  # again: a PNG may carry the tag behind its pixels
+    _refuse_orientation(path, image)  # again: a PNG may have the tag after its pixels
     if header.bits == 16 and header.mode == "RGB":
         return _decode_deep_colour(path, content)
     pixels = np.array(image)
@@ -89,7 +89,7 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
 
 
 def as_grey(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Float32[ndarray, "h w"]:
-    """Intensity in [0, 1]: full scale of the integer type is 1; colours are weighted as Rec. 601 does."""
+    """Intensity in [0, 1]: full scale of the integer type is 1; colours are weighted as in Rec. 601."""
     scaled = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     return scaled if scaled.ndim == 2 else scaled @ np.array(_LUMA, dtype=np.float32)
 
@@ -108,7 +108,7 @@ def encode_png(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> b
 
 
 def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
-    """The image with its head read, its pixels not yet."""
+    """The image with its header read, but not its pixels."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -117,27 +117,27 @@ def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
         raise FileError(
             path,
             f"is far too large ({str(error).split(',')[0]})",
-            "not a capture: a damaged head, or a file made to exhaust memory",
+            "it is not a capture: its header is damaged, or it was made to exhaust memory",
             f"give images of at most {MAX_PIXELS // 10**6} million pixels",
         ) from error
     except _DAMAGE as error:
         raise FileError(
             path,
-            "is no image that can be read",
-            f"it is cut short or damaged, or not one of {', '.join(FORMATS)}",
-            "export it again, best as PNG",
+            "is not an image that can be read",
+            f"it is truncated or damaged, or not one of {', '.join(FORMATS)}",
+            "export it again, preferably as PNG",
         ) from error
 
 
 def _header(path: Path, image: ImageFile) -> ImageHeader:
-    """Size and kind; FileError for every kind that a scan may not hold."""
+    """Size and kind; FileError for every kind that a scan must not hold."""
     _refuse_orientation(path, image)
     if getattr(image, "n_frames", 1) != 1:
         raise FileError(
             path,
-            "holds several pictures",
-            "an animation or a multi-page TIFF",
-            "write each picture to a file of its own",
+            "holds several images",
+            "it is an animation or a multi-page TIFF",
+            "write each image to its own file",
         )
     raw = str(image.tile[0][3]) if image.tile else ""
     transparent = "transparency" in image.info
@@ -148,33 +148,33 @@ def _header(path: Path, image: ImageFile) -> ImageHeader:
     what = _OTHER_KINDS.get(image.mode, "transparency" if transparent else f"mode {image.mode}")
     raise FileError(
         path,
-        f"is of a kind that a scan may not hold ({what})",
-        "what such a pixel means as an intensity is not certain",
+        f"is of a kind that a scan must not hold ({what})",
+        "it is not certain which intensity such a pixel has",
         "save it as grey or RGB with 8 or 16 bits, without palette or transparency",
     )
 
 
 def _refuse_orientation(path: Path, image: ImageFile) -> None:
-    # PngImageFile.getexif() would decode the pixels to look for the tag behind them.
+    # PngImageFile.getexif() would decode the pixels to look for the tag after them.
     orientation: object = 1
     if not isinstance(image, PngImageFile) or "exif" in image.info:
         try:
             orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
         except _DAMAGE as error:
             raise FileError(
-                path, f"has a damaged EXIF head ({error})", "a faulty program wrote it", "remove it"
+                path, f"has damaged EXIF data ({error})", "a faulty program wrote it", "remove the EXIF data"
             ) from error
     if orientation not in (0, 1):
         raise FileError(
             path,
-            f"is to be turned before it is shown (EXIF orientation {orientation})",
-            "a phone or camera noted how it was held; some programs turn such pictures, others do not",
-            "turn the pixels themselves and remove the tag, before calibrating",
+            f"must be rotated before it is shown (EXIF orientation {orientation})",
+            "a phone or camera recorded how it was held; some programs rotate such images, others do not",
+            "rotate the pixels themselves and remove the tag, before you calibrate",
         )
 
 
 def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
-    """16-bit RGB, which Pillow would cut down to 8 bit."""
+    """16-bit RGB, which Pillow would reduce to 8 bit."""
     import cv2
 
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -182,7 +182,7 @@ def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
         raise FileError(
             path,
             "cannot be decoded as 16-bit RGB",
-            "an unusual variant of its format",
+            "it is an unusual variant of its format",
             "save it as PNG, grey or RGB, with 8 or 16 bits",
         )
     return np.ascontiguousarray(pixels[..., ::-1])

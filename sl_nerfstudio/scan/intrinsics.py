@@ -1,4 +1,4 @@
-"""Cameras and projectors in transforms.json, and whether their numbers can be true."""
+"""Cameras and projectors in transforms.json, and whether their numbers can be right."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +15,7 @@ DISTORTION = ("k1", "k2", "p1", "p2")
 CAMERA_KEYS = ("camera_model", *REQUIRED, *DISTORTION)
 PROJECTOR_KEYS = ("model", *REQUIRED, *DISTORTION, "pattern_path")
 _UNSUPPORTED = ("k3", "k4", "k5", "k6")
-_NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: views of 0.57 and of 157 degrees
+_NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: fields of view of 0.57 and 157 degrees
 _ROUND_TRIP_PX = 1e-3
 
 
@@ -23,14 +23,14 @@ def read_device(fields: Fields, kind: str) -> Device | None:
     """The device that `fields` describes; `kind` is "camera" or "projector". None after adding faults."""
     key = "camera_model" if kind == "camera" else "model"
     choices = ("OPENCV",) if kind == "camera" else ("OPENCV", "DOE")
-    model = fields.read_choice(key, choices, "another lens model, which this format does not have")
+    model = fields.read_choice(key, choices, "it is a lens model that this format does not have")
     w, h = fields.read_count("w"), fields.read_count("h")
     values = {k: fields.read_number(k) for k in REQUIRED[2:]}
     values |= {k: fields.read_number(k, default=0.0) for k in DISTORTION}
     for k in _UNSUPPORTED:
         if fields.read_number(k, default=0.0):
             fields.fault(
-                k, "is not 0", "a lens model with more terms than k1, k2, p1, p2",
+                k, "is not 0", "the lens model has more terms than k1, k2, p1, p2",
                 "calibrate with these four, or undistort the images",
             )  # fmt: skip
     numbers = {k: v for k, v in values.items() if v is not None}
@@ -45,19 +45,24 @@ def read_device(fields: Fields, kind: str) -> Device | None:
 
 
 def device_problems(device: Device) -> Iterator[tuple[str, Problem]]:
-    """(key, problem) of every number of a device that cannot be true."""
+    """(key, problem) of every number of a device that cannot be right."""
     if device.w * device.h > MAX_PIXELS:
-        yield "w", Problem(f"times h is {device.w * device.h} pixels", "a slip", "give the size of the image in pixels")
+        yield (
+            "w",
+            Problem(
+                f"times h is {device.w * device.h} pixels", "a typing error", "give the size of the image in pixels"
+            ),
+        )
         return
     focal_problems = list(_focal_problems(device))
     yield from focal_problems
     for key, size, centre in (("cx", device.w, device.cx), ("cy", device.h, device.cy)):
-        if not -2 * size <= centre <= 3 * size:  # lens-shifted projectors have it outside, but not that far
+        if not -2 * size <= centre <= 3 * size:  # lens shift moves it outside the image, but not that far
             yield (
                 key,
                 Problem(
                     f"is {centre:g}, far outside an image of {size} pixels",
-                    "intrinsics of another resolution or in another unit",
+                    "the intrinsics are those of another resolution or in another unit",
                     "give the principal point in pixels of this image",
                 ),
             )
@@ -66,7 +71,7 @@ def device_problems(device: Device) -> Iterator[tuple[str, Problem]]:
             "k1",
             Problem(
                 "and the other distortion terms fold the image over itself: two directions share a pixel",
-                "terms of another model, in another order, or fitted without points near the corners",
+                "the terms are of another model, in another order, or were fitted without points near the corners",
                 "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
             ),
         )
@@ -80,30 +85,30 @@ def _focal_problems(device: Device) -> Iterator[tuple[str, Problem]]:
                 key,
                 Problem(
                     f"is {focal:g}",
-                    "not filled in, or the sign of OpenGL's projection",
-                    "give the focal length in pixels, a number above 0",
+                    "it was not filled in, or has the sign of OpenGL's projection",
+                    "give the focal length in pixels, a number greater than 0",
                 ),
             )
         elif not _WIDEST * size <= focal <= _NARROWEST * size:
             yield (
                 key,
                 Problem(
-                    f"is {focal:g} pixels, which no lens has on an image of {size} pixels",
-                    "given in millimetres, as a fraction of the image, or for another resolution",
+                    f"is {focal:g} pixels, which is impossible for an image of {size} pixels",
+                    "it was given in millimetres, as a fraction of the image, or for another resolution",
                     "give the focal length in pixels of this image",
                 ),
             )
 
 
 def _distortion_invertible(device: Device) -> bool:
-    """Whether every pixel of the image comes back when it is undistorted and distorted again."""
+    """Whether every pixel returns to its place when it is undistorted and distorted again."""
     x, y = torch.meshgrid(
         torch.linspace(0, device.w, 33, dtype=torch.float64),
         torch.linspace(0, device.h, 33, dtype=torch.float64),
         indexing="xy",
     )
     uv = torch.stack([x, y], -1)
-    # The lens does not know the model (pinhole or DOE) behind it; a pinhole has no limit at 90 degrees.
+    # The distortion does not depend on the model (pinhole or DOE); a pinhole has no limit at 90 degrees.
     intrinsics = Intrinsics.of(replace(device, model="OPENCV"), torch.float64)
     directions = unproject(intrinsics, uv)
     again, in_front = project(intrinsics, directions)

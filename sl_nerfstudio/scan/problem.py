@@ -8,7 +8,7 @@ from sl_nerfstudio.scan.file_error import FileError
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong, likely why, and what to do; the place is known to the caller."""
+    """What is wrong, the likely cause and the remedy; the caller knows the place."""
 
     problem: str
     cause: str
@@ -17,12 +17,12 @@ class Problem:
 
 @dataclass
 class Faults:
-    """Collects the faults of one folder; each method adds one."""
+    """Collects the faults of one folder."""
 
     found: list[Fault] = field(default_factory=list)
 
     def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
-        """Add a problem at its place. `file` is relative to the folder; `key` is a field in it."""
+        """Add a problem, once. `file` is relative to the folder; `key` is a field in it."""
         fault = Fault(file, frame, key, problem.problem, problem.cause, problem.remedy)
         if fault not in self.found:
             self.found.append(fault)

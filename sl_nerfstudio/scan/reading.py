@@ -11,14 +11,15 @@ from sl_nerfstudio.scan.types import Scan
 
 
 def read_scan(root: Path, need_coords: bool = True) -> Scan:
-    """The scan in a folder, after cheap checks: transforms.json, paths, poses, heads of all files; no pixel is decoded.
+    """The scan in a folder, after quick checks: transforms.json, paths, poses and the headers of all files.
 
-    `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all faults found.
+    No pixel is decoded. `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all
+    faults found.
     """
     root = Path(os.path.realpath(root))
     faults = Faults()
-    draft = read_partial_scan(root, faults, need_coords)
-    check_headers(draft, faults)
+    partial = read_partial_scan(root, faults, need_coords)
+    check_headers(partial, faults)
     if faults.found:
         raise ScanError(faults.found, str(root))
-    return draft.complete()
+    return partial.complete()

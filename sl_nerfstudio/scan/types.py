@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.images import as_grey, read_image
@@ -14,15 +15,43 @@ from sl_nerfstudio.scan.images import as_grey, read_image
 FORMAT = 1  # of the scan folder
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "arbitrary": None}
-"""Units of length a scan may be given in, and their length in metres (None: not known)."""
+"""Units of length that a scan may use, and their length in metres (None: unknown)."""
+
+
+@dataclass(frozen=True)
+class PickedPixel:
+    """A pixel of one frame: `pixel` is (x, y), and the centre of the first pixel is (0.5, 0.5)."""
+
+    frame: str
+    pixel: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ScaleBar:
+    """The true distance, in the scan's unit, between the surface points seen at two pixels."""
+
+    ends: tuple[PickedPixel, PickedPixel]
+    length: float
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Whether the lengths of a scan are true ones, and by what they are known."""
+    """Whether the lengths in a scan are true, and which length was measured.
+
+    At most one of `baseline_of` and `bar` is set. If neither is, all lengths of the starting poses count alike.
+    """
 
     known: bool
-    source: str = ""
+    source: str = ""  # for people: how the scale is known
+    baseline_of: str | None = None  # name of the frame whose distance from camera to projector is true
+    bar: ScaleBar | None = None
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the frames in which the known length was measured."""
+        if self.baseline_of is not None:
+            return (self.baseline_of,)
+        return () if self.bar is None else tuple(end.frame for end in self.bar.ends)
 
 
 @dataclass(frozen=True)
@@ -30,7 +59,7 @@ class PoseSigma:
     """One standard deviation of the starting poses; translations in the scan's unit.
 
     `camera_*` is the frame as a whole (camera and projector together) in the world;
-    `relative_*` is the projector against the camera of the same frame.
+    `relative_*` is the projector relative to the camera of the same frame.
     """
 
     camera_translation: float
@@ -41,7 +70,7 @@ class PoseSigma:
 
 @dataclass(frozen=True)
 class Frame:
-    """One image with its camera, its projector and what was decoded from it; paths are absolute.
+    """One image with its camera, its projector and the coordinates decoded from it; paths are absolute.
 
     Both poses map device axes (+x right, +y up, looking along -z) to the world.
     """
@@ -65,7 +94,7 @@ class Frame:
         return as_grey(read_image(self.pattern_path or self.image_path))
 
     def read_coords(self) -> Float32[ndarray, "h w 2"]:
-        """Pattern coordinates (x_p, y_p) of each pixel, NaN where not decoded (everywhere without a file)."""
+        """Pattern coordinates (x_p, y_p) of each pixel, NaN where not decoded (everywhere if there is no file)."""
         if self.coords_path is None:
             return np.full((self.camera.h, self.camera.w, 2), np.nan, dtype=np.float32)
         return read_coords(self.coords_path)
@@ -87,7 +116,19 @@ class Scan:
     projector: Device
     pattern_path: Path
     frames: tuple[Frame, ...]
-    intrinsics_change: IntrinsicsChange = UNCHANGED  # of the devices here against those of transforms.json
+    intrinsics_change: IntrinsicsChange = UNCHANGED  # of these devices relative to those in transforms.json
+
+    @property
+    def poses(self) -> DevicePoses:
+        """Starting poses, in the order of the frames."""
+        return DevicePoses(
+            np.stack([frame.T_world_camera for frame in self.frames]),
+            np.stack([frame.T_world_projector for frame in self.frames]),
+        )
+
+    def index_of(self, name: str) -> int:
+        """Position of the frame with this name. Raises ValueError if there is none."""
+        return [frame.name for frame in self.frames].index(name)
 
     def with_intrinsics_change(self, change: IntrinsicsChange) -> "Scan":
         """The scan with other focal lengths and principal points. Raises ValueError if they were changed before."""
@@ -104,21 +145,10 @@ class Scan:
         """The projected pattern in [0, 1]."""
         return as_grey(read_image(self.pattern_path))
 
-    @property
-    def T_world_camera(self) -> Float64[ndarray, "n 4 4"]:
-        """Starting poses of the cameras, in the order of the frames."""
-        return np.stack([frame.T_world_camera for frame in self.frames])
-
-    @property
-    def T_world_projector(self) -> Float64[ndarray, "n 4 4"]:
-        """Starting poses of the projectors, in the order of the frames."""
-        return np.stack([frame.T_world_projector for frame in self.frames])
-
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """What is truly known of a scan: each part None where the folder lacks it."""
+    """The true surface and the true poses of a scan; None for what the folder does not have."""
 
     mesh_path: Path | None
-    T_world_camera: Float64[ndarray, "n 4 4"] | None
-    T_world_projector: Float64[ndarray, "n 4 4"] | None
+    poses: DevicePoses | None

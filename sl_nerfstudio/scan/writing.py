@@ -15,16 +15,18 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
 from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.pose_problem import pose_problem
+from sl_nerfstudio.scan.scale import scale_record
 from sl_nerfstudio.scan.types import FORMAT, UNITS, PoseSigma, Scale
 
 _INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 class ScanWriter:
-    """Writes a scan folder (format 1) in a stream: frames as they come, transforms.json last.
+    """Writes a scan folder (format 1) frame by frame, and transforms.json last.
 
-    Use it as a context manager; until its end the folder is no scan, and if an exception leaves the block, everything
-    written is removed again. Each file is written beside its place and renamed.
+    Use it as a context manager. The folder is a scan only after the block has ended; if an exception leaves the block,
+    everything written is removed again. Each file is written under a temporary name and renamed.
 
         with ScanWriter(root, units="mm", scale=Scale(False), projector=.., pattern=.., camera=..) as writer:
             writer.add_frame("frame_00000", image=.., coords=.., T_world_camera=.., T_world_projector=..)
@@ -43,7 +45,7 @@ class ScanWriter:
     ) -> None:
         """Start a folder at `root`, which must not exist or be empty (else UserError).
 
-        `camera` holds the intrinsics common to all frames; None: each frame brings its own. `pattern` has the
+        `camera` holds the intrinsics common to all frames; None: each frame has its own. `pattern` has the
         projector's size. `extra` holds further top-level keys of transforms.json.
         """
         require_empty(root)
@@ -62,7 +64,8 @@ class ScanWriter:
             **(device_fields(camera, "camera_model") if camera else {}),
         }
         self._head["projector"] = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
-        self._head["scale"] = {"known": scale.known, **({"source": scale.source} if scale.source else {})}
+        self._head["scale"] = scale_record(scale)
+        self._scale = scale
         self._head.update(extra or {})
         self._frames: list[dict[str, Any]] = []
         self._truth: list[dict[str, Any]] = []
@@ -77,7 +80,7 @@ class ScanWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write transforms.json, or, after an exception, remove everything again."""
+        """Write transforms.json, or remove everything after an exception."""
         if kind is None:
             try:
                 self._finish()
@@ -104,19 +107,19 @@ class ScanWriter:
     ) -> None:
         """Write one frame. `name` becomes the stem of its files; `true_poses` (camera, projector) go to ground_truth/.
 
-        `coords` is None only for captures that are still to be decoded: such a folder does not pass the check.
-        `camera` overrides the common intrinsics; `extra` holds further keys of the frame. Raises ValueError for
-        a name given twice, shapes that differ from the camera's, or a pose that is not a rigid motion.
+        `coords` is None only for captures that have not been decoded yet: such a folder does not pass the check.
+        `camera` replaces the common intrinsics; `extra` holds further keys of the frame. Raises ValueError for a name
+        given twice, shapes that differ from the camera's, or a pose that is not a rigid motion.
         """
         device = camera or self._camera
         if device is None:
-            raise ValueError("a frame without common intrinsics needs a camera of its own")
+            raise ValueError("a frame needs its own camera if there are no common intrinsics")
         if (
             any(f["file_path"] == f"images/{name}.png" for f in self._frames)
             or name in ("", ".", "..")
             or Path(name).name != name
         ):
-            raise ValueError(f"frame name {name!r} was given before or is no file name")
+            raise ValueError(f"frame name {name!r} was given before or is not a file name")
         for what, array in (("image", image), ("coords", coords), ("pattern", pattern), ("mask", mask)):
             if array is not None and array.shape[:2] != (device.h, device.w):
                 raise ValueError(f"{what} of {name} is {array.shape[:2]}, the camera {(device.h, device.w)}")
@@ -151,6 +154,9 @@ class ScanWriter:
     def _finish(self) -> None:
         if not self._frames:
             raise UserError(f"{self.root}: no frame was written")
+        missing = set(self._scale.frames) - {Path(frame["file_path"]).stem for frame in self._frames}
+        if missing:
+            raise ValueError(f"the known length was measured in {sorted(missing)[0]!r}, which was not written")
         self._settle_intrinsics()
         if self._truth:
             truth = {k: v for k, v in self._head.items() if k != "sl_pose_sigma"}
@@ -159,7 +165,7 @@ class ScanWriter:
         self._write("transforms.json", encode_json({**self._head, "frames": self._frames}))
 
     def _settle_intrinsics(self) -> None:
-        """Once one frame has a camera of its own, every frame gets its own: programs differ in which they believe."""
+        """If one frame has its own camera, give every frame its own: programs differ in which value they use."""
         if self._camera is None or not any("fl_x" in frame for frame in self._frames):
             return
         common = device_fields(self._camera, "camera_model")
@@ -168,13 +174,13 @@ class ScanWriter:
         self._truth = [{**common, **frame} for frame in self._truth]
 
     def _remove(self) -> None:
-        """Remove what this writer wrote, and the folders it made, as far as the system allows."""
+        """Remove what this writer wrote and the folders it made, as far as the system allows."""
         for path in self._written:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
         below = {parent for path in self._written for parent in path.parents if self.root in parent.parents}
         for folder in [*sorted(below, key=lambda p: -len(p.parts)), *self._made]:
-            with suppress(OSError):  # not empty: somebody else's files
+            with suppress(OSError):  # not empty: it holds files of others
                 folder.rmdir()
 
 
@@ -185,8 +191,6 @@ def device_fields(device: Device, model_key: str) -> dict[str, Any]:
 
 def pose_fields(T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]) -> dict[str, Any]:
     """Both poses of a frame as keys of transforms.json. Raises ValueError unless they are rigid motions."""
-    from sl_nerfstudio.scan.poses import pose_problem
-
     fields: dict[str, Any] = {}
     for key, T in (("transform_matrix", T_world_camera), ("projector_transform_matrix", T_world_projector)):
         problem = pose_problem(np.asarray(T, dtype=np.float64))
@@ -202,5 +206,5 @@ def sigma_fields(sigma: PoseSigma) -> dict[str, float]:
 
 
 def encode_json(document: dict[str, Any]) -> bytes:
-    """JSON text as UTF-8; raises ValueError for NaN and infinity, which JSON does not have."""
+    """JSON text as UTF-8; raises ValueError for NaN and infinity, which JSON cannot hold."""
     return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()

@@ -1,4 +1,4 @@
-"""How the object, the room, the projector's lamp and the lens look."""
+"""Optical properties of the object, the room, the projector's lamp and the lens."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _WAVES = 14
 
 @dataclass(frozen=True)
 class Appearance:
-    """A matte surface with faint blotches, weak light in the room, a lamp that fades outwards, a lens with blur."""
+    """A matte surface with faint blotches, weak room light, a lamp that fades towards the corners, a slight blur."""
 
     reference_distance: float  # millimetres: where the lamp has unit strength
     wave_vectors: Float[ndarray, "k 3"]
@@ -24,18 +24,18 @@ class Appearance:
     albedo_contrast: float = 0.16
     room_light: float = 0.08
     background: float = 0.025
-    dark_leak: float = 0.04  # light of the projector between the lines
+    dark_leak: float = 0.04  # light of the projector where the pattern is dark
     corner_loss: float = 0.35  # of the lamp, in the pattern's corners
     blur: float = 0.55  # sigma of the lens, pixels
 
     def albedo(self, p_world: Float[ndarray, "n 3"]) -> Float32[ndarray, "n"]:
-        """Share of light given back: smooth random blotches of some millimetres to the size of the object."""
+        """Share of light reflected: smooth random blotches from some millimetres to the size of the object."""
         angle = p_world.astype(np.float32) @ self.wave_vectors.T.astype(np.float32)
         texture = np.cos(angle + self.wave_phases.astype(np.float32)).sum(-1) * np.sqrt(2 / _WAVES)
         return np.clip(self.mean_albedo * (1 + self.albedo_contrast * texture), 0.25, 1.0).astype(np.float32)
 
     def ambient(self, normal: Float32[ndarray, "n 3"]) -> Float32[ndarray, "n"]:
-        """Light of the room, more from above."""
+        """Light from the room, stronger from above."""
         return np.float32(self.room_light) * (np.float32(0.75) + np.float32(0.25) * normal[:, 2])
 
     def projected(self, intensity: Float32[ndarray, "n"]) -> Float32[ndarray, "n"]:
@@ -43,7 +43,7 @@ class Appearance:
         return np.float32(self.dark_leak) + np.float32(1 - self.dark_leak) * intensity
 
     def projector_fall_off(self, uv: Float[ndarray, "n 2"], projector: Device) -> Float[ndarray, "n"]:
-        """The lamp's strength across the pattern: 1 in the middle."""
+        """Strength of the lamp across the pattern: 1 in the middle."""
         middle, half = np.array([projector.w, projector.h]) / 2, np.hypot(projector.w, projector.h) / 2
         return 1 - self.corner_loss * ((uv - middle) ** 2).sum(-1) / half**2
 

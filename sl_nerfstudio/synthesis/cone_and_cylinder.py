@@ -18,7 +18,7 @@ def cone_and_cylinder() -> Scene:
     builder = _Builder()
     angles = _angles(CONE[0], half_x, half_y)
     for axis_x, sign, solid in ((CONE[0], 1.0, "cone"), (CYLINDER[0], -1.0, "cylinder")):
-        # mirrored angles on the right half make both halves share the points of the line x = 0
+        # mirrored angles in the right half make both halves share the points on the line x = 0
         theta = angles if sign > 0 else np.pi - angles[::-1]
         _solid_on_plate(builder, theta, axis_x, (min(0.0, sign * -half_x), max(0.0, sign * -half_x)), half_y, solid)
     _plate_sides(builder, half_x, half_y)
@@ -66,7 +66,7 @@ def _solid_on_plate(
     half_y: float,
     solid: str,
 ) -> None:
-    """One half of the plate's upper side and under side, and the solid that stands on it."""
+    """One half of the plate's upper side and under side, and the solid on it."""
     cos, sin, top = np.cos(theta), np.sin(theta), np.full(theta.shape, PLATE[2])
     reach_x = np.where(cos > 0, x_range[1] - axis_x, axis_x - x_range[0]) / np.maximum(np.abs(cos), 1e-12)
     reach = np.minimum(reach_x, half_y / np.maximum(np.abs(sin), 1e-12))
@@ -93,6 +93,6 @@ def _plate_sides(builder: _Builder, half_x: float, half_y: float) -> None:
     )
     _, first = np.unique(np.round(corners[on_rim], 7), axis=0, return_index=True)
     rim = corners[on_rim][first]
-    # around the rim by the angle in a square of equal sides, so that corners keep their place
+    # around the rim by the angle in a square, so that corners keep their place
     rim = rim[np.argsort(np.arctan2(rim[:, 1] / half_y, rim[:, 0] / half_x))]
     builder.strip(rim * np.array([1.0, 1.0, 0.0]), rim)

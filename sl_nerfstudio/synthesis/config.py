@@ -8,12 +8,12 @@ from sl_nerfstudio.errors import UserError
 
 Units = Literal["m", "cm", "mm", "um", "arbitrary"]
 MILLIMETRES = {"m": 1e-3, "cm": 0.1, "mm": 1.0, "um": 1e3, "arbitrary": 1.0}
-"""A millimetre in each unit; a unit that is not known counts as a millimetre."""
+"""A millimetre in each unit; an unknown unit counts as a millimetre."""
 
 
 @dataclass(frozen=True)
 class SynthConfig:
-    """A synthetic scan. Lengths in flags are millimetres, fractions lie between 0 and 1."""
+    """A synthetic scan. Lengths in flags are in millimetres, fractions are between 0 and 1."""
 
     scene: str = "cone-and-cylinder"
     """cone-and-cylinder, head, frog, or a mesh file (.ply .obj .stl .glb) whose lengths are in --units"""
@@ -22,50 +22,50 @@ class SynthConfig:
     resolution: int = 400
     """width and height of the camera's image, pixels"""
     pattern: Path | None = None
-    """what the projector throws: a pattern.json or any image; default: an 800 x 800 coded grid"""
+    """the projected pattern: a pattern.json or any image; default: an 800 x 800 coded grid"""
     seed: int = 0
-    """everything random follows from it: same flags, same bytes"""
+    """random seed: the same flags give the same bytes"""
 
     path: Literal["hand-held", "rigid-rig", "static-projector"] = "hand-held"
-    """hand-held: camera and projector move on their own; rigid-rig: together; static-projector: camera alone"""
+    """hand-held: camera and projector move independently; rigid-rig: together; static-projector: only the camera"""
     projector_model: Literal["OPENCV", "DOE"] = "OPENCV"
-    """pinhole, or a diffractive element whose pattern is even in direction cosines"""
+    """pinhole, or a diffractive element whose pattern is uniform in direction cosines"""
     camera_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """k1 k2 p1 p2 of the camera, as OpenCV has them"""
+    """k1 k2 p1 p2 of the camera, as defined by OpenCV"""
     projector_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """k1 k2 p1 p2 of the projector"""
     supersampling: int = 2
-    """rays a pixel and direction in captured images; correspondences are exact at pixel centres anyway"""
+    """rays per pixel and direction in captured images; correspondences are always exact at pixel centres"""
 
     noise: float = 0.3
     """standard deviation of decoded coordinates, pattern pixels"""
     missing: float = 0.15
     """fraction of pattern cells that were not decoded"""
     wrong: float = 0.02
-    """fraction of pattern cells that were decoded as another one, 1 to 5 periods off"""
+    """fraction of pattern cells that were decoded as others, wrong by 1 to 5 periods"""
     sensor_noise: float = 0.012
     """noise of captured images at full scale, as a fraction of full scale"""
     pose_error: tuple[float, float] = (1.0, 3.0)
-    """registration: RMS rotation (degrees) and translation (mm) of a frame as a whole, turning about the object"""
+    """registration: RMS rotation (degrees) about the object and translation (mm) of a frame as a whole"""
     autocalibration_error: tuple[float, float, float] = (0.22, 0.37, 0.02)
-    """auto-calibration: RMS rotation (degrees) of projector against camera, baseline direction (degrees) and length
-    (fraction)"""
+    """auto-calibration: RMS rotation (degrees) of projector relative to camera, baseline direction (degrees) and
+    length (fraction)"""
     clean: bool = False
-    """no noise of any kind and exact poses, whatever the flags above say"""
+    """no noise and exact poses, whatever the flags above are"""
 
     units: Units = "mm"
-    """unit of the lengths that are written"""
+    """unit of the written lengths"""
     scale_known: bool = True
-    """the length of frame 0's baseline is exact and said to be known; with --no-scale-known no length is"""
+    """the baseline of frame 0 is exact and stated as known; with --no-scale-known no length is"""
     pose_sigma: bool = True
     """state the uncertainty of the starting poses (sl_pose_sigma)"""
     world_turn: int | None = None
-    """turn and shift the world at random, by this seed"""
+    """rotate and shift the world at random, with this seed"""
     images_only: bool = False
-    """write only what a camera would bring home: images, pattern and intrinsics; the truth goes to ground_truth/"""
+    """write only what a user would have: images, pattern and intrinsics; the truth goes to ground_truth/"""
 
     def check(self) -> None:
-        """Raise UserError naming the flag if a value makes no sense."""
+        """Raise UserError, naming the flag, if a value is invalid."""
         rules = (
             (self.frames >= 2, "--frames", self.frames, "a scan needs at least 2 frames"),
             (self.resolution >= 16, "--resolution", self.resolution, "give at least 16 pixels"),

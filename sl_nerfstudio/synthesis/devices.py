@@ -1,4 +1,4 @@
-"""Intrinsics that suit a scene: the object fills the image, the pattern covers the object."""
+"""Intrinsics that fit a scene: the object fills the image, and the pattern covers the object."""
 
 from dataclasses import dataclass, replace
 
@@ -7,17 +7,17 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, DeviceKind, Intrinsics, project, unproject
-from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 
 Distortion = tuple[float, float, float, float]
-_CAMERA_FILL = 0.92  # of the image's half width, where the object reaches farthest out in any frame
+_CAMERA_FILL = 0.92  # of half the image, reached by the object in the frame where it extends farthest
 _PATTERN_FILL = 0.88
 
 
 @dataclass(frozen=True)
-class Pair:
+class DevicePair:
     """The camera and the projector of a scan."""
 
     camera: Device
@@ -26,7 +26,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """What may be chosen about both devices."""
+    """The options for both devices."""
 
     resolution: int = 400
     projector_model: DeviceKind = "OPENCV"
@@ -34,20 +34,20 @@ class DeviceOptions:
     projector_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
 
 
-def make_devices(scene: Scene, poses: Poses, pattern_size: tuple[int, int], options: DeviceOptions) -> Pair:
-    """A square camera and a projector of the pattern's (w, h), zoomed so that every frame holds the whole object."""
+def make_devices(scene: Scene, poses: DevicePoses, pattern_size: tuple[int, int], options: DeviceOptions) -> DevicePair:
+    """A square camera and a projector of the pattern's (w, h), zoomed so that the whole object is in every frame."""
     n, (w, h) = options.resolution, pattern_size
-    # principal points a little off the middle, as real devices have them
+    # principal points slightly off the middle, as in real devices
     camera = Device(n, n, 1.0, 1.0, 0.503 * n, 0.496 * n, *options.camera_distortion)
     projector = Device(w, h, 1.0, 1.0, 0.498 * w, 0.505 * h, *options.projector_distortion, options.projector_model)
-    return Pair(
+    return DevicePair(
         _zoomed(camera, scene, poses.T_world_camera, _CAMERA_FILL),
         _zoomed(projector, scene, poses.T_world_projector, _PATTERN_FILL),
     )
 
 
 def _zoomed(device: Device, scene: Scene, T_world_device: Float[ndarray, "n 4 4"], fill: float) -> Device:
-    """The device with the focal length at which the object reaches out to `fill` of the half image."""
+    """The device with the focal length at which the object extends to `fill` of half the image."""
     some = scene.vertices[:: max(1, len(scene.vertices) // 2000)]
     reach = 0.0
     for T in T_world_device:
@@ -65,7 +65,7 @@ def rays(device: Device, T_world_device: Float[ndarray, "4 4"], uv: Float[ndarra
 def pixels(
     device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "n 3"]
 ) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pixels of points in the world, and whether each lies in front of the device and inside its image."""
+    """Pixels of points in the world, and whether each is in front of the device and inside its image."""
     p_device = (p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]
     uv, in_front = project(Intrinsics.of(device, torch.float64), torch.from_numpy(p_device))
     x, y = uv.numpy().T

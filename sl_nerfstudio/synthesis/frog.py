@@ -1,11 +1,11 @@
-"""A sitting frog, about 120 x 99 x 68 mm: thin legs, deep folds, much that hides other parts."""
+"""A sitting frog, about 120 x 99 x 68 mm: thin legs, deep folds, many parts that hide others."""
 
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.sdf import Field, Triple, capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
 
 
 def frog(cell: float = 0.8) -> Scene:
-    """Looks along +y and stands on z = 0; a mesh of edges about `cell` long."""
+    """Looks along +y and stands on z = 0; a mesh with edges about `cell` long."""
     body = union(
         14.0,
         ellipsoid((0, -14, 30), (28, 36, 21), (22, 0, 0)),

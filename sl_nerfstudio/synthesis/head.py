@@ -1,4 +1,4 @@
-"""A head with neck, about 147 x 195 x 201 mm: large smooth parts with small features in them."""
+"""A head with neck, about 147 x 195 x 201 mm: large smooth parts with small features."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from sl_nerfstudio.synthesis.sdf import capsule, carve, ellipsoid, half_space, m
 
 
 def head(cell: float = 1.25) -> Scene:
-    """Looks along +y and stands on z = 0; a mesh of edges about `cell` long."""
+    """Looks along +y and stands on z = 0; a mesh with edges about `cell` long."""
     skull = union(
         26.0,
         ellipsoid((0, -10, 132), (62, 74, 60)),

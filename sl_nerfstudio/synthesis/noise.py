@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
-_LARGEST_SLIP = 5  # periods by which a wrong cell may be off
+_LARGEST_SLIP = 5  # periods by which a wrong cell may be shifted
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Cells:
 
 @dataclass(frozen=True)
 class CoordinateNoise:
-    """How a decoder errs."""
+    """The errors of a decoder."""
 
     sigma: float  # pattern pixels, each coordinate of each pixel
-    missing: float  # fraction of the cells seen that are not decoded
-    wrong: float  # fraction of the cells seen that are taken for others
+    missing: float  # fraction of the visible cells that are not decoded
+    wrong: float  # fraction of the visible cells that are mistaken for others
 
 
 def disturb_coords(
@@ -45,10 +45,10 @@ def disturb_coords(
     noise: CoordinateNoise,
     rng: np.random.Generator,
 ) -> Float32[ndarray, "h w 2"]:
-    """Coordinates as decoded: cells left out, cells off by whole periods, and jitter everywhere else.
+    """Coordinates as decoded: missing cells, cells shifted by whole periods, and jitter everywhere else.
 
-    Of the cells that the frame sees, exactly the asked fractions (rounded) are missing and wrong. Missing
-    cells gather in patches; wrong ones come alone or in small groups that share their slip of 1 to 5 periods.
+    Of the cells that the frame sees, exactly the given fractions (rounded) are missing and wrong. Missing cells are
+    clustered; wrong ones are single or in small groups that share their shift of 1 to 5 periods.
     """
     out = coords.astype(np.float64)
     index = cells.index(coords[mask])
@@ -57,7 +57,7 @@ def disturb_coords(
     slips = _wrong_cells(np.setdiff1d(seen, missing), cells, round(noise.wrong * len(seen)), rng)
     value = out[mask] + noise.sigma * rng.standard_normal((len(index), 2))
     value += slips[index] * cells.period
-    value = np.clip(value, 0, [cells.w, cells.h])  # no decoder leaves the pattern
+    value = np.clip(value, 0, [cells.w, cells.h])  # a decoder never gives coordinates outside the pattern
     value[np.isin(index, missing)] = np.nan
     out[mask] = value
     return out.astype(np.float32)
@@ -85,7 +85,7 @@ def _missing_cells(
 def _wrong_cells(
     candidates: Int64[ndarray, "n"], cells: Cells, count: int, rng: np.random.Generator
 ) -> Int64[ndarray, "all 2"]:
-    """Slip of every cell of the pattern in periods (x, y); zero for all but `count` of the candidates."""
+    """Shift of every cell of the pattern in periods (x, y); zero except for `count` of the candidates."""
     slips = np.zeros((cells.rows * cells.columns, 2), dtype=np.int64)
     free = set(candidates.tolist())
     while count > 0 and free:

@@ -1,37 +1,28 @@
-"""Where camera and projector stand in each frame: smooth, hand-held-like paths around the object."""
+"""Poses of camera and projector in each frame: smooth paths around the object, as if hand-held."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.synthesis.scene import Scene
 
 PathKind = Literal["hand-held", "rigid-rig", "static-projector"]
 DISTANCE = 4.5  # of the devices from the object, in sizes of the object
 _DISTANCE_SWING = 0.06
 _BASELINE = (0.75, 1.5)  # in sizes of the object
-_AIM_SWING = 0.03  # how far a device aims past the centre, in sizes of the object
+_AIM_SWING = 0.03  # how far a device aims off the centre, in sizes of the object
 _CAMERA_ROLL, _PROJECTOR_ROLL = np.radians(25.0), np.radians(35.0)
 _FRAMES_A_LAP = 30
 
 
-@dataclass(frozen=True)
-class Poses:
-    """Device-to-world poses of all frames, devices looking along -z with y up."""
-
-    T_world_camera: Float64[ndarray, "n 4 4"]
-    T_world_projector: Float64[ndarray, "n 4 4"]
-
-
-def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generator) -> Poses:
+def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generator) -> DevicePoses:
     """Poses of `frames` captures, in millimetres, about the scene's centre.
 
-    hand-held: both devices move on their own, so that their relative pose differs in every frame;
-    rigid-rig: one relative pose for all; static-projector: the projector stands still, the camera circles about
-    the projector's line of sight.
+    hand-held: both devices move independently, so their relative pose differs in every frame; rigid-rig: one relative
+    pose for all; static-projector: the projector does not move, the camera circles around the projector's axis.
     """
     t = np.arange(frames) / frames
     if kind == "static-projector":
@@ -39,17 +30,17 @@ def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generat
     camera = _around_the_object(scene, t, rng)
     if kind == "rigid-rig":
         T_camera_projector = _rig(scene)
-        return Poses(camera, camera @ T_camera_projector)
-    return Poses(camera, _beside(scene, camera, t, rng))
+        return DevicePoses(camera, camera @ T_camera_projector)
+    return DevicePoses(camera, _beside(scene, camera, t, rng))
 
 
 def look_at(
     position: Float[ndarray, "*n 3"], target: Float[ndarray, "*#n 3"], roll: Float[ndarray, "*n"]
 ) -> Float64[ndarray, "*n 4 4"]:
-    """Pose of a device at `position` that looks at `target`; `roll` (radian) turns it about its line of sight."""
+    """Pose of a device at `position` that looks at `target`; `roll` (radians) rotates it about its axis."""
     back = position - target
     back = back / np.linalg.norm(back, axis=-1, keepdims=True)
-    # straight up has no "right"; any horizontal direction does there
+    # looking straight up or down, any horizontal direction may be "up"
     up = np.where(np.abs(back[..., 2:]) > 0.999, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     right = np.cross(up, back)
     right = right / np.linalg.norm(right, axis=-1, keepdims=True)
@@ -65,7 +56,7 @@ def look_at(
 
 
 def wander(t: Float[ndarray, "n"], rng: np.random.Generator, cycles: float = 3.0) -> Float[ndarray, "n"]:
-    """A smooth random function of `t` in [0, 1], with values in [-1, 1] and up to about `cycles` swings."""
+    """A smooth random function of `t` in [0, 1], with values in [-1, 1] and up to about `cycles` oscillations."""
     k = np.arange(1, 5)
     frequency = cycles * k / 4
     phase = rng.uniform(0, 2 * np.pi, 4)
@@ -103,7 +94,7 @@ def _around_the_object(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Gene
 def _beside(
     scene: Scene, T_world_camera: Float64[ndarray, "n 4 4"], t: Float[ndarray, "n"], rng: np.random.Generator
 ) -> Float64[ndarray, "n 4 4"]:
-    """A projector in the other hand: its distance from the camera, and on which side it is, change all the time."""
+    """A projector in the other hand: its distance from the camera and its side change all the time."""
     offset = T_world_camera[:, :3, 3] - scene.centre
     camera_distance = np.linalg.norm(offset, axis=-1)
     distance = _distance(scene, t, rng)
@@ -128,7 +119,7 @@ def _tilt(
 
 
 def _rig(scene: Scene) -> Float64[ndarray, "4 4"]:
-    """Projector against camera: to the right and a little above, aimed at the object."""
+    """The projector relative to the camera: to the right and slightly above, aimed at the object."""
     distance = DISTANCE * scene.size
     position = np.array([1.0, 0.25, 0.0]) * scene.size
     T = np.eye(4)
@@ -141,8 +132,8 @@ def _rig(scene: Scene) -> Float64[ndarray, "4 4"]:
     return T
 
 
-def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> Poses:
-    """A projector that stands still, and a camera that circles about its line of sight, nearer and farther."""
+def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> DevicePoses:
+    """A projector that does not move, and a camera that circles around its axis, nearer and farther."""
     azimuth, elevation = np.array([rng.uniform(0, 2 * np.pi)]), np.radians([50.0])
     out = _direction(azimuth, elevation)
     projector = look_at(scene.centre + DISTANCE * scene.size * out, scene.centre, np.radians([rng.uniform(-20, 20)]))
@@ -152,4 +143,4 @@ def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Gene
     direction = _tilt(np.broadcast_to(out, (len(t), 3)), angle, bearing)
     position = scene.centre + _distance(scene, t, rng)[:, None] * direction
     camera = look_at(position, _aim(scene, t, rng), _CAMERA_ROLL * wander(t, rng, 4.0))
-    return Poses(camera, np.repeat(projector, len(t), axis=0))
+    return DevicePoses(camera, np.repeat(projector, len(t), axis=0))

@@ -1,9 +1,9 @@
-"""Errors of the starting poses, as auto-calibration and registration make them; nothing here renders.
+"""Errors of the starting poses, like those of auto-calibration and registration; nothing here renders.
 
-Auto-calibration errs in a projector's pose against its camera: rotation, direction and length of the baseline.
-The frame's triangulated points are then a little deformed and of a wrong size, and registration puts *them* onto
-the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. Registration's own error
-moves a frame as a whole, turning it about the object.
+Auto-calibration has errors in the pose of a projector relative to its camera: rotation, direction and length of the
+baseline. The frame's triangulated points are then slightly deformed and have a wrong size, and registration aligns
+*them* with the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. The error of
+registration itself moves a frame as a whole and rotates it about the object.
 """
 
 from dataclasses import dataclass
@@ -13,24 +13,24 @@ import torch
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.se3 import exp_so3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
-from sl_nerfstudio.synthesis.devices import Pair
-from sl_nerfstudio.synthesis.paths import Poses
+from sl_nerfstudio.synthesis.devices import DevicePair
 
-_FEWEST_POINTS = 20  # with fewer, a frame is not registered anew
+_FEWEST_POINTS = 20  # with fewer, a frame is not registered again
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Root mean squares over the frames; each is met exactly by every scan."""
+    """Root mean squares over the frames; every scan has exactly these values."""
 
     rotation_deg: float  # of a frame about the object
     translation: float  # of a frame, at the object, millimetres
-    relative_rotation_deg: float  # projector against camera
+    relative_rotation_deg: float  # projector relative to camera
     baseline_direction_deg: float
     baseline_length: float  # as a fraction
     first_baseline_exact: bool = True
@@ -42,13 +42,13 @@ class PoseNoise:
 
     @property
     def disturbs_relative(self) -> bool:
-        """Whether auto-calibration errs."""
+        """Whether auto-calibration has errors."""
         return bool(self.relative_rotation_deg or self.baseline_direction_deg or self.baseline_length)
 
 
 @dataclass(frozen=True)
-class Correspondences:
-    """Exact matches of one frame, to register its disturbed points by."""
+class ExactMatches:
+    """Exact matches of one frame, with which its disturbed points are registered."""
 
     uv_camera: Float[ndarray, "n 2"]
     uv_projector: Float[ndarray, "n 2"]
@@ -56,25 +56,24 @@ class Correspondences:
 
 
 def disturb_poses(
-    truth: Poses,
+    truth: DevicePoses,
     noise: PoseNoise,
     centre: Float[ndarray, "3"],
-    devices: Pair,
-    matches: list[Correspondences],
+    devices: DevicePair,
+    matches: list[ExactMatches],
     rng: np.random.Generator,
-) -> Poses:
-    """Starting poses: auto-calibration errors, registration of what they yield, registration errors."""
+) -> DevicePoses:
+    """Starting poses: errors of auto-calibration, registration of the resulting points, errors of registration."""
     if noise.is_zero:
         return truth
-    T_camera_projector = np.linalg.inv(truth.T_world_camera) @ truth.T_world_projector
-    calibrated = disturb_relative(T_camera_projector, noise, rng)
+    calibrated = disturb_relative(truth.T_camera_projector, noise, rng)
     camera = truth.T_world_camera.copy()
     if noise.disturbs_relative:
         for n, match in enumerate(matches):
             camera[n] = _registered(camera[n], calibrated[n], devices, match)
     motion = _motions_about(centre, len(camera), noise, rng)
     camera = motion @ camera
-    return Poses(camera, camera @ calibrated)
+    return DevicePoses(camera, camera @ calibrated)
 
 
 def disturb_relative(
@@ -86,7 +85,7 @@ def disturb_relative(
     turn = _rotations(np.radians(noise.relative_rotation_deg), n, rng)
     out[:, :3, :3] = T_camera_projector[:, :3, :3] @ turn
     baseline = T_camera_projector[:, :3, 3]
-    swing = np.cross(baseline, rng.standard_normal((n, 3)))  # an axis square to the baseline: only the direction turns
+    swing = np.cross(baseline, rng.standard_normal((n, 3)))  # about axes perpendicular to the baseline
     swing = swing / np.linalg.norm(swing, axis=1, keepdims=True) * np.abs(rng.standard_normal((n, 1)))
     swing = _with_rms(swing, np.radians(noise.baseline_direction_deg))
     length = np.exp(_log_lengths(n, noise, rng))
@@ -94,16 +93,15 @@ def disturb_relative(
     return out
 
 
-def pose_sigma(truth: Poses, start: Poses, centre: Float[ndarray, "3"]) -> PoseSigma | None:
+def pose_sigma(truth: DevicePoses, start: DevicePoses, centre: Float[ndarray, "3"]) -> PoseSigma | None:
     """Standard deviation along each axis (RMS length / sqrt(3)) of the errors that `start` really has.
 
-    "Camera" errors are those of the frame as a whole, turning about `centre`, where the translation is taken.
-    None where the poses are exact.
+    "Camera" errors are those of the frame as a whole: its rotation about `centre`, and the translation of `centre`.
+    None if the poses are exact.
     """
     moved = start.T_world_camera @ np.linalg.inv(truth.T_world_camera)
     shift = (moved[:, :3, :3] @ centre + moved[:, :3, 3]) - centre
-    relative = np.linalg.inv(truth.T_world_camera) @ truth.T_world_projector
-    relative_start = np.linalg.inv(start.T_world_camera) @ start.T_world_projector
+    relative, relative_start = truth.T_camera_projector, start.T_camera_projector
     turned = relative[:, :3, :3].transpose(0, 2, 1) @ relative_start[:, :3, :3]
     values = (
         _sigma(shift),
@@ -113,7 +111,7 @@ def pose_sigma(truth: Poses, start: Poses, centre: Float[ndarray, "3"]) -> PoseS
     )
     if max(values) < 1e-9:
         return None
-    # an error of zero is no statement of a prior; something far below what data can tell stands for it
+    # a prior cannot have a sigma of zero; a value far below what data can resolve takes its place
     floors = (1e-6 * np.linalg.norm(truth.T_world_camera[0, :3, 3] - centre), 1e-4) * 2
     return PoseSigma(*(float(max(value, floor)) for value, floor in zip(values, floors, strict=True)))
 
@@ -121,8 +119,8 @@ def pose_sigma(truth: Poses, start: Poses, centre: Float[ndarray, "3"]) -> PoseS
 def _registered(
     T_world_camera: Float64[ndarray, "4 4"],
     T_camera_projector: Float64[ndarray, "4 4"],
-    devices: Pair,
-    match: Correspondences,
+    devices: DevicePair,
+    match: ExactMatches,
 ) -> Float64[ndarray, "4 4"]:
     """The camera pose for which the points that the disturbed rig triangulates fit best onto the true ones."""
     start = T_world_camera, T_world_camera @ T_camera_projector
@@ -153,7 +151,7 @@ def _motions_about(
 
 
 def _log_lengths(n: int, noise: PoseNoise, rng: np.random.Generator) -> Float[ndarray, "n"]:
-    """Errors of the baselines' logarithms: mean zero, RMS as asked over the frames that have an error."""
+    """Errors of the baselines' logarithms: mean zero, the given RMS over the frames that have an error."""
     value = rng.standard_normal(n)
     free = np.ones(n, dtype=bool)
     free[0] = not noise.first_baseline_exact

@@ -1,4 +1,4 @@
-"""First hits of rays on a mesh: found by open3d in single precision, placed in double precision."""
+"""First hits of rays on a mesh: found by open3d in single precision, refined in double precision."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.synthesis.scene import Scene
 
-_SAME_POINT = 2e-5  # of the distance: a hit this near to a point is the point
+_SAME_POINT = 2e-5  # of the distance: a hit this close to a point is the point
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Hits:
     p_world: Float64[ndarray, "n 3"]
 
 
-class Caster:
+class RayCaster:
     """Casts rays at a scene; lengths in millimetres."""
 
     def __init__(self, scene: Scene) -> None:
@@ -34,9 +34,9 @@ class Caster:
         )
 
     def first_hits(self, origin: Float[ndarray, "3"], direction: Float[ndarray, "n 3"]) -> Hits:
-        """What unit rays from one place meet first.
+        """What unit rays from one place hit first.
 
-        open3d says which face; where on its plane is computed anew in double precision.
+        open3d finds the face; the point on its plane is computed in double precision.
         """
         face, _ = self._cast(origin, direction)
         p_world = np.full(direction.shape, np.nan)
@@ -50,7 +50,7 @@ class Caster:
     def sees(
         self, origin: Float[ndarray, "3"], p_world: Float[ndarray, "n 3"], face: Int[ndarray, "n"]
     ) -> Bool[ndarray, "n"]:
-        """Whether nothing lies between `origin` and points on the given faces."""
+        """Whether nothing is between `origin` and points on the given faces."""
         ray = p_world - origin
         distance = np.linalg.norm(ray, axis=-1)
         seen_face, seen_distance = self._cast(origin, ray / distance[:, None])

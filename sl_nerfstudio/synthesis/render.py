@@ -1,4 +1,4 @@
-"""What a camera sees of a scene under a projector: exact correspondences, and the light that comes back."""
+"""What a camera sees of a scene lit by a projector: exact correspondences, and the reflected light."""
 
 from dataclasses import dataclass
 
@@ -8,39 +8,39 @@ from numpy import ndarray
 
 from sl_nerfstudio.pattern.image import sample_bilinear
 from sl_nerfstudio.synthesis.appearance import Appearance
-from sl_nerfstudio.synthesis.devices import Pair, pixels, rays
-from sl_nerfstudio.synthesis.ray_casting import Caster
+from sl_nerfstudio.synthesis.devices import DevicePair, pixels, rays
+from sl_nerfstudio.synthesis.ray_casting import RayCaster
 from sl_nerfstudio.synthesis.scene import Scene
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What lies behind a set of camera pixels; points and pixels are NaN where the object is not hit."""
+class VisiblePoints:
+    """The surface points at some camera pixels; points and pattern pixels are NaN where the object is not hit."""
 
     hit: Bool[ndarray, "n"]
     face: Int64[ndarray, "n"]
     p_world: Float64[ndarray, "n 3"]
     uv_projector: Float64[ndarray, "n 2"]
-    lit: Bool[ndarray, "n"]  # hit, inside the pattern, and seen by the projector from the camera's side of the surface
+    lit: Bool[ndarray, "n"]  # hit, inside the pattern, and lit on the side that the camera sees
 
 
 @dataclass(frozen=True)
-class Capture:
+class RenderedCapture:
     """One rendered frame, without any noise."""
 
     coords: Float32[ndarray, "h w 2"]  # exact at pixel centres; NaN outside the mask
     mask: Bool[ndarray, "h w"]
-    radiance: Float32[ndarray, "h w"]  # 1 is a white, perpendicular surface in the full light of the projector
+    radiance: Float32[ndarray, "h w"]  # 1 is a white surface facing the projector, in its full light
 
 
-def look(
-    caster: Caster,
-    devices: Pair,
+def visible_points(
+    caster: RayCaster,
+    devices: DevicePair,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
     uv: Float[ndarray, "n 2"],
-) -> Sight:
-    """Cast camera pixels `uv` at the scene, and a shadow ray from the projector to every point found."""
+) -> VisiblePoints:
+    """Cast rays through camera pixels `uv` onto the scene, and a shadow ray from the projector to every point found."""
     hits = caster.first_hits(T_world_camera[:3, 3], rays(devices.camera, T_world_camera, uv))
     hit = hits.face >= 0
     uv_projector = np.full(uv.shape, np.nan)
@@ -52,25 +52,25 @@ def look(
     reached = inside & same_side
     reached[reached] = caster.sees(T_world_projector[:3, 3], p[reached], face[reached])
     lit[hit] = reached
-    return Sight(hit, hits.face, hits.p_world, uv_projector, lit)
+    return VisiblePoints(hit, hits.face, hits.p_world, uv_projector, lit)
 
 
-def capture(
-    caster: Caster,
-    devices: Pair,
+def render_capture(
+    caster: RayCaster,
+    devices: DevicePair,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
     pattern: Float32[ndarray, "ph pw"],
     appearance: Appearance,
     supersampling: int = 2,
-) -> Capture:
-    """Render a frame: correspondences at pixel centres, light as the mean of `supersampling`^2 rays a pixel."""
+) -> RenderedCapture:
+    """Render a frame: correspondences at pixel centres, light as the mean of `supersampling`^2 rays per pixel."""
     w, h = devices.camera.w, devices.camera.h
     corner = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
     coords = np.full((h * w, 2), np.nan, dtype=np.float32)
     mask, hit = np.zeros((2, h * w), dtype=bool)
     box = _box_of_the_object(caster.scene, devices, T_world_camera).reshape(-1)
-    at_centres = look(caster, devices, T_world_camera, T_world_projector, corner[box] + 0.5)
+    at_centres = visible_points(caster, devices, T_world_camera, T_world_projector, corner[box] + 0.5)
     mask[box], hit[box] = at_centres.lit, at_centres.hit
     coords[mask] = at_centres.uv_projector[at_centres.lit]
     radiance = np.full(h * w, appearance.background, dtype=np.float32)
@@ -79,58 +79,60 @@ def capture(
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
         for dx in step:
-            sight = look(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
-            light += _light(sight, caster.scene, devices, T_world_projector, pattern, appearance)
+            seen = visible_points(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
+            light += _light(seen, caster.scene, devices, T_world_projector, pattern, appearance)
     radiance[near] = light / supersampling**2
-    return Capture(coords.reshape(h, w, 2), mask.reshape(h, w), appearance.through_lens(radiance.reshape(h, w)))
+    return RenderedCapture(coords.reshape(h, w, 2), mask.reshape(h, w), appearance.through_lens(radiance.reshape(h, w)))
 
 
-def _box_of_the_object(scene: Scene, devices: Pair, T_world_camera: Float[ndarray, "4 4"]) -> Bool[ndarray, "h w"]:
-    """Pixels that may see the object: a rectangle around its vertices; the whole image if some lie behind."""
+def _box_of_the_object(
+    scene: Scene, devices: DevicePair, T_world_camera: Float[ndarray, "4 4"]
+) -> Bool[ndarray, "h w"]:
+    """Pixels that may see the object: a rectangle around its vertices, or all if some are behind the camera."""
     camera = devices.camera
     uv, _ = pixels(camera, T_world_camera, scene.vertices)
     depth = -(scene.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
     box = np.zeros((camera.h, camera.w), dtype=bool)
     if depth.min() <= 0 or camera.k1 or camera.k2 or camera.p1 or camera.p2:
-        return ~box  # behind the camera, or bent edges
+        return ~box  # behind the camera, or edges bent by distortion
     (x0, y0), (x1, y1) = np.clip(np.floor(uv.min(0)) - 1, 0, None).astype(int), np.ceil(uv.max(0)).astype(int) + 1
     box[y0:y1, x0:x1] = True
     return box
 
 
 def _near_the_object(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Pixels whose rays may meet the object although the one through the centre does not, and those that do."""
+    """Pixels with a ray that may hit the object, even if the ray through their centre does not."""
     padded = np.pad(hit, 1)
     h, w = hit.shape
     return np.logical_or.reduce([padded[i : i + h, j : j + w] for i in range(3) for j in range(3)])
 
 
 def _light(
-    sight: Sight,
+    seen: VisiblePoints,
     scene: Scene,
-    devices: Pair,
+    devices: DevicePair,
     T_world_projector: Float[ndarray, "4 4"],
     pattern: Float32[ndarray, "ph pw"],
     appearance: Appearance,
 ) -> Float32[ndarray, "n"]:
-    """Light of a matte surface: the projector's by the cosine and distance laws, and the room's."""
-    out = np.full(len(sight.hit), appearance.background, dtype=np.float32)
-    p = sight.p_world[sight.hit]
-    normal = _shading_normals(scene, sight.face[sight.hit], p).astype(np.float32)
+    """Light reflected by a matte surface: from the projector (cosine and inverse-square law) and from the room."""
+    out = np.full(len(seen.hit), appearance.background, dtype=np.float32)
+    p = seen.p_world[seen.hit]
+    normal = _shading_normals(scene, seen.face[seen.hit], p).astype(np.float32)
     light = appearance.ambient(normal)
-    lit = sight.lit[sight.hit]
-    uv = sight.uv_projector[sight.hit][lit]
+    lit = seen.lit[seen.hit]
+    uv = seen.uv_projector[seen.hit][lit]
     to_projector = T_world_projector[:3, 3] - p[lit]
     distance2 = (to_projector**2).sum(-1)
     cosine = np.abs((to_projector * normal[lit]).sum(-1)) / np.sqrt(distance2)
     strength = appearance.projector_fall_off(uv, devices.projector) * appearance.reference_distance**2 / distance2
     light[lit] += (appearance.projected(sample_bilinear(pattern, uv)) * cosine * strength).astype(np.float32)
-    out[sight.hit] = light * appearance.albedo(p)
+    out[seen.hit] = light * appearance.albedo(p)
     return out
 
 
 def _shading_normals(scene: Scene, face: Int64[ndarray, "n"], p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
-    """Normals interpolated between the vertices, where the scene has them; else those of the faces."""
+    """Normals interpolated between the vertices if the scene has them, else those of the faces."""
     if scene.vertex_normals is None:
         return scene.face_normals[face]
     corners = scene.faces[face]

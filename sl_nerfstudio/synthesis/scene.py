@@ -1,4 +1,4 @@
-"""A scene: a surface in millimetres with what rendering and paths need to know of it."""
+"""A scene: a surface in millimetres, with what rendering and paths need to know about it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,10 +10,10 @@ from numpy import ndarray
 
 @dataclass(frozen=True)
 class Scene:
-    """A triangle mesh; z is up, the object stands near the origin. All lengths in millimetres.
+    """A triangle mesh; z is up, and the object is near the origin. All lengths in millimetres.
 
-    `vertex_normals` (unit) smooth the shading; None shades flat. `elevation_deg` is the range of heights from
-    which cameras look at it.
+    `vertex_normals` (unit) make the shading smooth; with None it is flat. `elevation_deg` is the range of elevations
+    from which cameras look at it.
     """
 
     name: str
@@ -29,7 +29,7 @@ class Scene:
 
     @cached_property
     def radius(self) -> float:
-        """Radius of the sphere about `centre` that holds the object."""
+        """Radius of the sphere around `centre` that contains the object."""
         return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
 
     @cached_property

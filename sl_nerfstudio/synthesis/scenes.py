@@ -44,5 +44,5 @@ def _read_mesh(path: Path, file_unit: float) -> Scene:
     except Exception as error:  # trimesh's loaders raise whatever their parsers do
         raise UserError(f"--scene {path}: cannot be read as a mesh ({error}); export it again as PLY") from error
     if len(faces) == 0 or not np.isfinite(vertices).all() or np.ptp(vertices, axis=0).max() <= 0:
-        raise UserError(f"--scene {path}: holds no surface (no faces, or all in one place); a point cloud will not do")
+        raise UserError(f"--scene {path}: has no surface (no faces, or all in one place); a point cloud is not enough")
     return Scene(path.stem, vertices, faces)

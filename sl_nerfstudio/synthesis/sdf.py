@@ -1,7 +1,7 @@
-"""Building blocks of free-form objects: (nearly) signed distances, positive outside, and how to join them.
+"""Building blocks of free-form objects: (approximate) signed distances, positive outside, and how to join them.
 
-After Inigo Quilez' distance functions. The distance of an ellipsoid is a first-order one, so that a value says
-how far the surface is only nearby: enough to find the zero level, which is all that is asked here.
+After Inigo Quilez' distance functions. The distance of an ellipsoid is correct to first order, so its values are
+distances only near the surface; that is enough to find the zero level.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _BLOCK = 50_000  # points evaluated together
 
 
 def ellipsoid(centre: Triple, radii: Triple, turn_deg: Triple = (0.0, 0.0, 0.0)) -> Field:
-    """An ellipsoid, turned about its centre by angles about x, y and z in that order."""
+    """An ellipsoid, rotated about its centre by angles about x, y and z, in that order."""
     c, r = np.asarray(centre, dtype=np.float64), np.asarray(radii, dtype=np.float64)
     R = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
 
@@ -49,7 +49,7 @@ def capsule(a: Triple, b: Triple, radius_a: Number, radius_b: Number) -> Field:
 
 
 def ridges(solid: Field, height: float, wave: Field) -> Field:
-    """The solid with its surface raised and lowered by up to `height`, as `wave` (in radian) says."""
+    """The solid with its surface raised and lowered by up to `height`; `wave` gives the phase in radians."""
     return lambda p: solid(p) - height * np.sin(wave(p))
 
 
@@ -72,7 +72,7 @@ def union(blend: float, *fields: Field) -> Field:
 
 
 def carve(blend: float, solid: Field, *tools: Field) -> Field:
-    """The solid without what lies in the tools; edges rounded by about `blend`."""
+    """The solid without what is inside the tools; edges rounded by about `blend`."""
 
     def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         out = solid(p)
@@ -106,7 +106,7 @@ def mesh_of(
 
     Coarse to fine: only cells near the level are looked at closely. Raises ValueError if the surface leaves the box.
     """
-    # planes of the object must not be planes of the grid: marching cubes makes empty triangles of exact zeros
+    # planes of the object must not be planes of the grid: exact zeros make marching cubes produce empty triangles
     low = np.asarray(lower, dtype=np.float64) - np.array([0.31, 0.37, 0.41]) * cell
     count = np.ceil((np.asarray(upper) - low) / (4 * cell)).astype(int) * 4
     values = _sample_near_level(field, low, count, cell)
@@ -141,7 +141,7 @@ def _sample_near_level(
     for axis in range(3):
         fine = np.repeat(fine, step, axis)
     fine = fine[tuple(slice(0, n + 1) for n in count)]
-    # a coarse point this near to the level may have it in one of its cells; a little more, as values are inexact
+    # a coarse point this close to the level may have it in one of its cells (with a margin: values are inexact)
     near = np.abs(coarse) < 1.2 * np.sqrt(3) * step * cell
     index = np.argwhere(near)
     offset = np.stack(np.meshgrid(*[np.arange(-step + 1, step)] * 3, indexing="ij"), -1).reshape(-1, 3)

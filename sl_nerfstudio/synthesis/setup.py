@@ -1,4 +1,4 @@
-"""Everything that is settled before the first frame is rendered: scene, devices, paths and their errors."""
+"""Everything that is fixed before the first frame is rendered: scene, devices, paths and their errors."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -7,26 +7,27 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.pattern.files import read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
-from sl_nerfstudio.synthesis.devices import DeviceOptions, Pair, make_devices
+from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices
 from sl_nerfstudio.synthesis.noise import Cells
-from sl_nerfstudio.synthesis.paths import DISTANCE, Poses, make_paths
-from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, pose_sigma
-from sl_nerfstudio.synthesis.ray_casting import Caster
-from sl_nerfstudio.synthesis.render import Capture, capture, look
+from sl_nerfstudio.synthesis.paths import DISTANCE, make_paths
+from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, pose_sigma
+from sl_nerfstudio.synthesis.ray_casting import RayCaster
+from sl_nerfstudio.synthesis.render import RenderedCapture, render_capture, visible_points
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.scenes import make_scene
 
-_REGISTRATION_GRID = 28  # pixels a side that a frame's disturbed points are registered by
+_REGISTRATION_GRID = 28  # pixels per side of the grid with which a frame's disturbed points are registered
 
 
 class Stream(IntEnum):
-    """Every use of randomness has its own stream: changing one leaves the others as they were."""
+    """Every use of randomness has its own stream: a change in one does not affect the others."""
 
     PATHS = 1
     TEXTURE = 2
@@ -43,22 +44,22 @@ def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Genera
 
 @dataclass(frozen=True)
 class Setup:
-    """A scan before it is taken; lengths in millimetres, poses in the scene's axes."""
+    """A scan before it is rendered; lengths in millimetres, poses in the scene's axes."""
 
     scene: Scene
-    caster: Caster
-    devices: Pair
+    caster: RayCaster
+    devices: DevicePair
     pattern: Float32[ndarray, "h w"]
     layout: PatternLayout | None  # None: the pattern is a plain image
     cells: Cells
     appearance: Appearance
-    truth: Poses
-    start: Poses
+    truth: DevicePoses
+    start: DevicePoses
     sigma: PoseSigma | None
 
-    def render(self, frame: int, supersampling: int) -> Capture:
+    def render(self, frame: int, supersampling: int) -> RenderedCapture:
         """Frame number `frame`, without noise."""
-        return capture(
+        return render_capture(
             self.caster,
             self.devices,
             self.truth.T_world_camera[frame],
@@ -70,7 +71,7 @@ class Setup:
 
 
 def make_setup(config: SynthConfig) -> Setup:
-    """Scene, devices, paths and their errors, as the configuration says. Raises UserError for bad files."""
+    """Scene, devices, paths and their errors, as configured. Raises UserError for bad files."""
     scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
     pattern, layout = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
@@ -78,7 +79,7 @@ def make_setup(config: SynthConfig) -> Setup:
         config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
     )
     devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
-    caster = Caster(scene)
+    caster = RayCaster(scene)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
@@ -98,7 +99,7 @@ def make_setup(config: SynthConfig) -> Setup:
 
 
 def make_cells(pattern: Float32[ndarray, "h w"], lattice: Lattice | None) -> Cells:
-    """The cells around the nodes; a pattern without nodes counts as 40 cells along its longer side."""
+    """The cells around the nodes; a pattern without nodes is treated as 40 cells along its longer side."""
     h, w = pattern.shape
     if lattice is not None:
         return Cells(lattice.period, lattice.x0, lattice.y0, lattice.rows, lattice.columns, w, h)
@@ -114,10 +115,13 @@ def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], Pattern
 
 
 def _matches(
-    caster: Caster, devices: Pair, T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]
-) -> Correspondences:
+    caster: RayCaster,
+    devices: DevicePair,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+) -> ExactMatches:
     """Exact correspondences on a coarse grid of pixels."""
     place = (np.arange(_REGISTRATION_GRID) + 0.5) / _REGISTRATION_GRID
     uv = np.stack(np.meshgrid(place * devices.camera.w, place * devices.camera.h), -1).reshape(-1, 2)
-    sight = look(caster, devices, T_world_camera, T_world_projector, uv)
-    return Correspondences(uv[sight.lit], sight.uv_projector[sight.lit], sight.p_world[sight.lit])
+    seen = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    return ExactMatches(uv[seen.lit], seen.uv_projector[seen.lit], seen.p_world[seen.lit])

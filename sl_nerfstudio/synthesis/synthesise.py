@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.progress import track
@@ -20,12 +21,11 @@ from sl_nerfstudio.scan.writing import ScanWriter, device_fields, sigma_fields
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.mesh_file import encode_ply
 from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords, disturb_image
-from sl_nerfstudio.synthesis.paths import Poses
 from sl_nerfstudio.synthesis.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
-GAIN = 1.05  # exposure: a surface of mean albedo, perpendicular, in full light, comes to 0.82 of full scale
+GAIN = 1.05  # exposure: a surface of mean albedo that faces the lamp in full light has 0.82 of full scale
 _WINDOW = 0.8  # of local normalisation, in periods of the pattern
 
 
@@ -41,7 +41,7 @@ class SyntheticFrame:
 
 
 def synthesise(config: SynthConfig, output: Path) -> None:
-    """Make a scan folder at `output`, with its truth under ground_truth/.
+    """Make a scan folder at `output`, with the truth under ground_truth/.
 
     With `config.images_only`, `output` holds images, pattern and intrinsics, and ground_truth/ is a complete scan
     with exact coordinates and poses. Raises UserError for bad flags or files, or an output that is not empty.
@@ -75,7 +75,7 @@ def without_noise(config: SynthConfig) -> SynthConfig:
 
 
 def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
-    """How what is written lies to what is rendered: the unit, and a turn and shift of the world if asked for."""
+    """The map from the rendered scene to the written world: the unit, and a random rotation and shift on request."""
     scale = MILLIMETRES[config.units]
     if config.world_turn is None:
         return Similarity(scale, np.eye(3), np.zeros(3))
@@ -95,12 +95,16 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
         image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
         coords = disturb_coords(rendered.coords, rendered.mask, setup.cells, noise, decoder)
         pattern = _pattern_image(image, rendered.mask, setup)
-        yield SyntheticFrame(f"frame_{index:05d}", image, pattern, coords, rendered.mask)
+        yield SyntheticFrame(_frame_name(index), image, pattern, coords, rendered.mask)
+
+
+def _frame_name(index: int) -> str:
+    return f"frame_{index:05d}"
 
 
 def _pattern_image(image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
-    """The captured image with albedo, shading and fall-off taken out."""
-    # both devices are about equally far away, so focal lengths tell how large a period appears
+    """The captured image without albedo, shading and fall-off."""
+    # both devices are about equally far away, so the focal lengths give the apparent size of a period
     period = setup.cells.period * setup.devices.camera.fl_x / setup.devices.projector.fl_x
     mean, contrast = float(setup.pattern.mean()), float(setup.pattern.std())
     return _to_8_bit(normalise_locally(image / 255, mask, _WINDOW * period, mean, contrast))
@@ -114,7 +118,7 @@ def _scan_writer(config: SynthConfig, setup: Setup, root: Path) -> ScanWriter:
     extra: dict[str, Any] = {}
     if config.pose_sigma and setup.sigma is not None:
         extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
-    scale = Scale(True, "baseline of frame 0") if config.scale_known else Scale(False)
+    scale = Scale(True, "baseline of frame 0", _frame_name(0)) if config.scale_known else Scale(False)
     return ScanWriter(
         root,
         units=config.units,
@@ -134,8 +138,8 @@ def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
     )
 
 
-def _world_poses(config: SynthConfig, setup: Setup, poses: Poses, index: int) -> TwoPoses:
-    """Camera and projector of one frame in the axes and the unit that are written."""
+def _world_poses(config: SynthConfig, setup: Setup, poses: DevicePoses, index: int) -> TwoPoses:
+    """Camera and projector of one frame in the written axes and unit."""
     S_world_scene = world_from_scene(config, setup.scene)
     return S_world_scene.poses(poses.T_world_camera[index]), S_world_scene.poses(poses.T_world_projector[index])
 
@@ -162,7 +166,7 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, mesh: str)
 
 
 def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
-    """What a decoder starts from, and apart from it the scan that it should come to."""
+    """The images that a decoder starts from, and separately the scan that it should produce."""
     exact = replace(config, noise=0.0, missing=0.0, wrong=0.0, pose_sigma=False)
     with _scan_writer(exact, setup, output / "ground_truth") as truth:
         for index, frame in enumerate(_frames(exact, setup)):

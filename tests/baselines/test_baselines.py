@@ -8,9 +8,11 @@ import pytest
 from benchmarks.baselines.depth import drop_islands, triangulated_depth
 from benchmarks.baselines.icp_registration import register
 from benchmarks.baselines.tsdf import TsdfConfig, backprojected, fuse
-from sl_nerfstudio.evaluation.evaluate import Poses, mesh_reference, score_alignments
+from sl_nerfstudio.evaluation.evaluate import score_alignments
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.reference import mesh_reference
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -30,14 +32,14 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Scan:
     return read_scan(root)
 
 
-def true_poses(scan: Scan) -> Poses:
-    truth = read_ground_truth(scan)
-    assert truth.T_world_camera is not None and truth.T_world_projector is not None
-    return Poses(truth.T_world_camera, truth.T_world_projector)
+def true_poses(scan: Scan) -> DevicePoses:
+    poses = read_ground_truth(scan).poses
+    assert poses is not None
+    return poses
 
 
 def test_depth_maps_of_exact_coordinates_lie_on_the_truth(clean_scan: Path) -> None:
-    scan, truth = read_scan(clean_scan), Surface(FacetedScan().truth())
+    scan, truth = read_scan(clean_scan), IndexedMesh(FacetedScan().truth())
     for frame in scan.frames:
         depth = triangulated_depth(frame, scan, frame.T_world_camera, frame.T_world_projector)
         points = backprojected(depth)
@@ -58,7 +60,7 @@ def test_islands_are_dropped_and_slopes_kept() -> None:
 
 
 def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repairs_the_frames(disturbed: Scan) -> None:
-    true, initial = true_poses(disturbed), Poses(disturbed.T_world_camera, disturbed.T_world_projector)
+    true, initial = true_poses(disturbed), disturbed.poses
     registered = register(disturbed, initial)
     mesh_path = read_ground_truth(disturbed).mesh_path
     assert mesh_path is not None
@@ -66,15 +68,13 @@ def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repair
     config = TsdfConfig(voxel=1 / 120)
     rmse = {}
     for name, poses in (("initial", initial), ("registered", registered), ("true", true)):
-        surface = Surface(fuse(disturbed, poses, config))
+        surface = IndexedMesh(fuse(disturbed, poses, config))
         rmse[name] = score_alignments(surface, reference, poses, true, samples=20_000)["rigid"].accuracy.median
     assert rmse["true"] < 0.1
     assert rmse["registered"] < 3 * rmse["true"] < rmse["initial"]
 
-    def errors(poses: Poses) -> float:
-        found = compare_poses(
-            poses.T_world_camera, poses.T_world_projector, true.T_world_camera, true.T_world_projector
-        )
+    def errors(poses: DevicePoses) -> float:
+        found = compare_poses(poses, true)
         assert found.relative.rotation_rmse_deg < 1e-5  # frames move as a whole
         return found.camera.rotation_rmse_deg
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, known_baseline, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
@@ -82,16 +82,3 @@ def test_no_residual_changes():
     assert before.cross_valid.sum() > 30 and torch.equal(before.cross_valid, after.cross_valid)
     assert torch.allclose(before.own, after.own, atol=1e-9)
     assert torch.allclose(before.cross[before.cross_valid], after.cross[before.cross_valid], atol=1e-8)
-
-
-@pytest.mark.parametrize(
-    "source, frame",
-    [
-        ("baseline of frame 0", 0),
-        ("measured baseline of frame 12 (ruler)", 12),
-        ("baseline of frame 13", None),
-        ("", None),
-    ],
-)
-def test_the_frame_that_a_scale_names(source, frame):
-    assert known_baseline(source, 13) == frame

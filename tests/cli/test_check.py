@@ -33,7 +33,7 @@ def test_a_good_scan(good: Path) -> None:
     assert lines[1:5] == [
         "  frames              4, 72 x 60 pixels",
         "  projector           OPENCV, 128 x 96 pixels",
-        "  units               mm, scale not known",
+        "  units               mm, scale unknown",
         "  working distance    270.1 mm (median)",
     ]
     assert lines[6].startswith("  starting poses      epipolar residual ")
@@ -48,10 +48,10 @@ def test_a_faulty_scan(good: Path, tmp_path: Path) -> None:
     assert done.stderr == (
         f"error: 2 faults in {root}\n"
         "transforms.json: projector.fl_x: is 0\n"
-        "    cause:  not filled in, or the sign of OpenGL's projection\n"
-        "    remedy: give the focal length in pixels, a number above 0\n"
+        "    cause:  it was not filled in, or has the sign of OpenGL's projection\n"
+        "    remedy: give the focal length in pixels, a number greater than 0\n"
         "masks/frame_00001.png: is missing\n"
-        "    cause:  it was moved, renamed or never written; names differ in upper and lower case\n"
+        "    cause:  it was moved, renamed or never written, or its name differs in upper and lower case\n"
         "    remedy: restore it or correct the path\n"
     )
 

@@ -13,6 +13,7 @@ import tyro
 
 from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan, main
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
 from sl_nerfstudio.scan import read_scan, write_transforms
@@ -94,8 +95,8 @@ def test_the_poses_file_brings_its_intrinsics(scan: Path, untrue: Path, tmp_path
 
 def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: Path) -> None:
     known = read_scan(scan)
-    cameras = known.T_world_camera.copy()
-    cameras[1, :3, 3] += [3.0, 0.0, 0.0]
+    refined = DevicePoses(known.poses.T_world_camera, known.poses.T_world_projector)
+    refined.T_world_camera[1, :3, 3] += [3.0, 0.0, 0.0]
     (tmp_path / "refined").mkdir()
     sigma = {
         "camera_translation": 0.5,
@@ -106,8 +107,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
     write_transforms(
         tmp_path / "refined" / "transforms.json",
         known,
-        cameras,
-        known.T_world_projector,
+        refined,
         [{"sl_pose_sigma": sigma}] * 3,
     )
     curves = {"curves": {"step": [0, 1], "loss": [2.0, 1.0]}, "settings": {"seed": 42}, "versions": {"torch": "9.9"}}
@@ -177,7 +177,7 @@ def test_mesh_of_another_place(scan: Path, tmp_path: Path) -> None:
     truth = read_mesh(mesh_of(scan))
     write_mesh(tmp_path / "far.ply", Mesh(truth.vertices + 1e5, truth.faces))
     message = failure("--mesh", tmp_path / "far.ply", "--data", scan, "--json", tmp_path / "out.json")
-    assert "no camera ray through a masked pixel meets the mesh" in message and "mm" in message
+    assert "no camera ray through a masked pixel hits the mesh" in message and "mm" in message
     assert not (tmp_path / "out.json").exists()
 
 
@@ -213,7 +213,7 @@ def test_poses_of_another_scan(scan: Path, tmp_path: Path) -> None:
 def test_poses_file_that_is_missing_or_no_json(scan: Path, tmp_path: Path) -> None:
     assert "is missing" in failure("--mesh", mesh_of(scan), "--data", scan, "--poses", tmp_path / "none.json")
     (tmp_path / "cut.json").write_text('{"frames": [')
-    assert "cut short" in failure("--mesh", mesh_of(scan), "--data", scan, "--poses", tmp_path / "cut.json")
+    assert "is truncated" in failure("--mesh", mesh_of(scan), "--data", scan, "--poses", tmp_path / "cut.json")
 
 
 @pytest.mark.parametrize(
@@ -239,8 +239,8 @@ def test_reference_that_is_no_archive(scan: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--f-distances", "0.1", "-1"), "--f-distances: -1 is no distance"),
-        (("--f-distances", "nan"), "--f-distances: nan is no distance"),
+        (("--f-distances", "0.1", "-1"), "--f-distances: -1 is not a distance"),
+        (("--f-distances", "nan"), "--f-distances: nan is not a distance"),
         (("--samples", "10"), "--samples: 10 points are too few"),
         (("--seed", "-1"), "--seed: -1 is negative"),
         (("--reference", "points.npy"), ".npz file with the key xyz"),

@@ -4,82 +4,30 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_run
+from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.runs.run_record import plain
-from sl_nerfstudio.runs.trained_run import TrainedRun
 from sl_nerfstudio.scan import Scan, read_poses
-from tests.meshing.ray_cast_scan import pairs_around, scan_of
-
-CENTRE, RADIUS = np.array([3.0, -2.0, 5.0]), 40.0  # of the ball, mm
-S_SCENE_WORLD = Similarity(1 / 60, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.02, -0.03, 0.01]))
-
-
-@dataclass
-class BallModel:
-    """What sl-export asks of a model, for a ball."""
-
-    scan: Scan
-    sigma: np.ndarray | None = None
-    S_scene_world: Similarity = S_SCENE_WORLD
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-
-    def sdf(self, p_scene):
-        centre = torch.from_numpy(self.S_scene_world.points(CENTRE)).float()
-        return (p_scene - centre).norm(dim=-1) - RADIUS * self.S_scene_world.scale
-
-    def poses(self):
-        return self.scan.T_world_camera, self.scan.T_world_projector
-
-    def pose_sigma(self):
-        return self.sigma
-
-    def self_calibration(self):
-        return SelfCalibration(torch.full((6,), 0.01).double(), 1e-6 * torch.eye(6).double())
-
-    def history(self):
-        return {"step": [0.0, 5.0], "loss": [1.0, float("nan")]}
+from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> Scan:
-    low, high = ((float(c[0]), float(c[1]), float(c[2])) for c in (CENTRE - 44, CENTRE + 44))
-    ball = extract_mesh(lambda p: (p - torch.from_numpy(CENTRE).float()).norm(dim=-1) - RADIUS, 60, low, high)
-    return scan_of(ball, pairs_around(6, 40), tmp_path_factory.mktemp("export") / "scan")
-
-
-def run_of(scan: Scan, sigma: np.ndarray | None = None) -> TrainedRun:
-    settings = SimpleNamespace(
-        method_name="sl-neus",
-        max_num_iterations=10,
-        pipeline=SimpleNamespace(
-            datamanager=SimpleNamespace(
-                data=scan.root,
-                train_num_rays_per_batch=7,
-                dataparser=SimpleNamespace(intrinsics_change=scan.intrinsics_change),
-            ),
-            model={"lr": 1e-3, "where": Path("a")},
-        ),
-    )
-    return TrainedRun(BallModel(scan, sigma), settings, 10)
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return ball_scan(tmp_path_factory.mktemp("export") / "scan")
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
 def test_the_mesh_is_in_world_units_and_axes_and_cut(scan, tmp_path, suffix):
     config = ExportConfig(Path("config.yml"), tmp_path / f"mesh{suffix}", resolution=96)
-    text = export_run(run_of(scan), config)
+    text = export_trained(run_of(scan), config)
     mesh = read_mesh(config.output)
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTRE, axis=1), RADIUS, atol=5e-3)
     assert mesh.vertices[:, 2].min() > CENTRE[2] - 36  # the lower side is seen by nobody
@@ -89,18 +37,16 @@ def test_the_mesh_is_in_world_units_and_axes_and_cut(scan, tmp_path, suffix):
 
 def test_keep_unobserved_keeps_the_whole_ball(scan, tmp_path):
     config = ExportConfig(Path("config.yml"), tmp_path / "mesh.ply", resolution=64, keep_unobserved=True)
-    assert "nothing was cut" in export_run(run_of(scan), config)
+    assert "nothing was removed" in export_trained(run_of(scan), config)
     assert read_mesh(config.output).vertices[:, 2].min() == pytest.approx(CENTRE[2] - RADIUS, abs=0.1)
 
 
 def test_poses_come_in_the_format_of_the_scan_with_their_uncertainty(scan, tmp_path):
     sigma = np.arange(1, 25, dtype=float).reshape(6, 4) / 100
     config = ExportConfig(Path("c"), tmp_path / "mesh.ply", poses=tmp_path / "refined", resolution=48)
-    text = export_run(run_of(scan, sigma), config)
-    camera, projector = read_poses(tmp_path / "refined/transforms.json", scan)
-    assert camera is not None and projector is not None
-    np.testing.assert_allclose(camera, scan.T_world_camera, atol=1e-12)
-    np.testing.assert_allclose(projector, scan.T_world_projector, atol=1e-12)
+    text = export_trained(run_of(scan, sigma), config)
+    found = read_poses(tmp_path / "refined/transforms.json", scan)
+    np.testing.assert_allclose(found.stacked(), scan.poses.stacked(), atol=1e-12)
     document = json.loads((tmp_path / "refined/transforms.json").read_text())
     assert list(document["frames"][1]["sl_pose_sigma"].items()) == [
         ("camera_translation", 0.05),
@@ -108,12 +54,12 @@ def test_poses_come_in_the_format_of_the_scan_with_their_uncertainty(scan, tmp_p
         ("relative_translation", 0.07),
         ("relative_rotation_deg", 0.08),
     ]
-    assert "poses of 6 frames, camera good to 0.13 mm / 0.14 deg (1 sigma)" in text
+    assert "poses of 6 frames, camera known to 0.13 mm / 0.14 deg (1 sigma)" in text
     assert f"--poses {tmp_path}/refined/transforms.json" in text
 
 
 def test_training_record_is_json_with_settings_versions_and_curves(scan, tmp_path):
-    export_run(run_of(scan), ExportConfig(Path("c"), tmp_path / "m.ply", poses=tmp_path / "r", resolution=48))
+    export_trained(run_of(scan), ExportConfig(Path("c"), tmp_path / "m.ply", poses=tmp_path / "r", resolution=48))
     record = json.loads((tmp_path / "r/training.json").read_text())
     assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["model"] == {"lr": 1e-3, "where": "a"}
     assert record["versions"]["torch"] == torch.__version__ and "python" in record["versions"]
@@ -138,13 +84,13 @@ def test_the_scans_own_file_is_never_replaced(scan, tmp_path):
     config = ExportConfig(Path("c"), tmp_path / "m.ply", poses=scan.root, overwrite=True)
     before = (scan.root / "transforms.json").read_bytes()
     with pytest.raises(UserError, match=r"is the scan's own file"):
-        export_run(run_of(scan), config)
+        export_trained(run_of(scan), config)
     assert (scan.root / "transforms.json").read_bytes() == before and not config.output.exists()
 
 
 def test_poor_agreement_is_said(scan, tmp_path):
     shifted = replace(scan, projector=replace(scan.projector, cx=scan.projector.cx + 5.0))
-    text = export_run(run_of(shifted), ExportConfig(Path("c"), tmp_path / "m.ply", resolution=48))
+    text = export_trained(run_of(shifted), ExportConfig(Path("c"), tmp_path / "m.ply", resolution=48))
     stated = re.search(r"coordinates differ by ([\d.]+) px \(median\)", text)
     assert stated is not None and float(stated[1]) == pytest.approx(5, abs=0.2) and "warning" in text
 
@@ -159,12 +105,12 @@ def test_outputs_are_checked_before_anything_slow(tmp_path):
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(UserError, match=r"unknown kind of mesh file '.stp'(.|\n)*\.ply, \.obj, \.stl, \.glb"):
         check(tmp_path / "mesh.stp")
-    with pytest.raises(UserError, match=r"old.ply: exists already(.|\n)*--overwrite"):
+    with pytest.raises(UserError, match=r"old.ply: already exists(.|\n)*--overwrite"):
         check(tmp_path / "old.ply")
     check(tmp_path / "old.ply", overwrite=True)
-    with pytest.raises(UserError, match=r"training.json: exists already(.|\n)*--overwrite"):
+    with pytest.raises(UserError, match=r"training.json: already exists(.|\n)*--overwrite"):
         check(tmp_path / "new.ply", poses=tmp_path / "refined")
-    with pytest.raises(UserError, match=r"a folder stands there"):
+    with pytest.raises(UserError, match=r"folder.ply: is a folder"):
         check(tmp_path / "folder.ply", overwrite=True)
     with pytest.raises(UserError, match=r"old.ply is a file, not a folder"):
         check(tmp_path / "old.ply/deeper/mesh.ply")

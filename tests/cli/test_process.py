@@ -11,7 +11,7 @@ import torch
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.geometry.se3 import exp_se3
 from sl_nerfstudio.geometry.similarity import fit_similarity
-from sl_nerfstudio.scan import check_scan, read_scan
+from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import make_gray_scan
 
@@ -54,7 +54,7 @@ def test_photographs_become_a_metric_scan_and_a_second_run_decodes_nothing(monke
     assert "wrote 4 of 4 frames" in said and "processing.html" in said
     assert check_scan(out) == []
     scan = read_scan(out)
-    assert scan.units == "mm" and scan.scale.known and scan.scale.source == "baseline of frame 1 (pose 1)"
+    assert scan.units == "mm" and scan.scale.known and scan.scale == Scale(True, "baseline of frame pose 1", "pose 1")
     assert [f.name for f in scan.frames] == [f"pose {k}" for k in range(4)]
     for frame, exact in zip(scan.frames, captures.coords, strict=True):
         coords, mask = frame.read_coords(), frame.read_mask()
@@ -72,13 +72,13 @@ def test_photographs_become_a_metric_scan_and_a_second_run_decodes_nothing(monke
     _run(monkeypatch, *captures.flags, "--output", again, *flags)
     assert "(4 had been decoded before)" in capsys.readouterr().out
     second = read_scan(again)
-    np.testing.assert_array_equal(second.T_world_camera, scan.T_world_camera)
+    np.testing.assert_array_equal(second.poses.T_world_camera, scan.poses.T_world_camera)
     np.testing.assert_array_equal(second.frames[2].read_pattern(), scan.frames[2].read_pattern())
 
 
 def _assert_poses(scan, captures):
     """All devices lie as they truly do after one rigid motion: the length is known."""
-    found = np.concatenate([scan.T_world_camera, scan.T_world_projector])
+    found = np.concatenate([scan.poses.T_world_camera, scan.poses.T_world_projector])
     true = np.concatenate([captures.T_world_camera, captures.T_world_projector])
     S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
     assert S.scale == pytest.approx(1, abs=0.03)
@@ -132,7 +132,7 @@ def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path
         scan = read_scan(out)
         assert len(scan.frames) == 3 and check_scan(out) == []
         assert scan.frames[0].read_image().ndim == 3 and scan.frames[1].read_image().dtype == np.uint16
-        up = scan.T_world_camera[:, :3, 1]
+        up = scan.poses.T_world_camera[:, :3, 1]
         assert up[0] @ up[1] > 0.5
         assert up[0] @ up[2] < -0.5  # the third camera stands on its head
 
@@ -154,7 +154,7 @@ def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_fo
     scan = read_scan(tmp_path / "scan")
     assert scan.units == "mm" and scan.scale.source == "given camera poses"
     assert scan.projector.fl_x == pytest.approx(exact["projector"]["fl_x"], rel=0.01)
-    away = np.linalg.norm(scan.T_world_camera[:, :3, 3] - captures.T_world_camera[:, :3, 3], axis=1)
+    away = np.linalg.norm(scan.poses.T_world_camera[:, :3, 3] - captures.T_world_camera[:, :3, 3], axis=1)
     assert away.max() < 15  # as the mean of the rough ones, though no alignment was made here
 
 

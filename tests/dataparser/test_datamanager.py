@@ -168,7 +168,7 @@ def test_world_coordinates_come_back_through_nerfstudios_transform(datamanager: 
     poses = datamanager.train_dataparser_outputs.transform_poses_to_original_space(
         datamanager.train_dataset.cameras.camera_to_worlds, camera_convention="opengl"
     )
-    np.testing.assert_allclose(poses.numpy(), loaded.scan.T_world_camera[:, :3], atol=1e-3)
+    np.testing.assert_allclose(poses.numpy(), loaded.scan.poses.T_world_camera[:, :3], atol=1e-3)
 
 
 def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:

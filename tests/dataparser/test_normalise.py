@@ -53,7 +53,7 @@ def test_unit_and_world_frame_do_not_matter(
     composed = S @ S_world_mm
     np.testing.assert_allclose(composed.matrix(), S_reference.matrix(), rtol=0, atol=1e-9)
     np.testing.assert_allclose(
-        S.poses(scan.T_world_projector), S_reference.poses(reference.T_world_projector), rtol=0, atol=1e-9
+        S.poses(scan.poses.T_world_projector), S_reference.poses(reference.poses.T_world_projector), rtol=0, atol=1e-9
     )
 
 
@@ -61,10 +61,10 @@ def test_the_viewers_up_is_the_cameras_up(tiny_root: Path) -> None:
     # the cameras stand around the y axis and look down by 0.3 rad
     scan, S = normalise(tiny_root)
     y_scene = S.R @ [0.0, 1.0, 0.0]
-    ups = scan.T_world_camera[:, :3, 1]
+    ups = scan.poses.T_world_camera[:, :3, 1]
     np.testing.assert_allclose(S.R @ ups.mean(0) / np.linalg.norm(ups.mean(0)), [0, 0, 1], atol=1e-12)
     assert y_scene[2] > 0.95
-    right = S.poses(scan.T_world_camera)[0, :3, 0]
+    right = S.poses(scan.poses.T_world_camera)[0, :3, 0]
     assert right[0] > 0.9 and abs(right[1]) < 1e-12
 
 

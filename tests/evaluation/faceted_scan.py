@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
@@ -34,24 +35,25 @@ class FacetedScan:
         """The true surface in the world."""
         return Mesh(self.mesh.vertices * self.scale + np.array(self.offset), self.mesh.faces)
 
-    def true_poses(self) -> tuple[ndarray, ndarray]:
+    def true_poses(self) -> DevicePoses:
         """Camera and projector of all frames, to the world."""
         unit = self.scale / 40
         cameras = [looking_at_origin(270.0 * unit, 2.1 * i, 0.35 + 0.1 * i) for i in range(self.frames)]
         projectors = [looking_at_origin(240.0 * unit, 2.1 * i + 0.4, 0.2) for i in range(self.frames)]
         both = np.array([cameras, projectors])
         both[..., :3, 3] += np.array(self.offset)
-        return both[0], both[1]
+        return DevicePoses(both[0], both[1])
 
-    def start_poses(self) -> tuple[ndarray, ndarray]:
+    def start_poses(self) -> DevicePoses:
         """What transforms.json holds: the true ones, or frames turned about the world's origin, each its own way."""
         rng = np.random.default_rng(3)
-        cameras, projectors = (T.copy() for T in self.true_poses())
+        true = self.true_poses()
+        cameras, projectors = true.T_world_camera.copy(), true.T_world_projector.copy()
         for T_c, T_p in zip(cameras, projectors, strict=True):
             motion = np.eye(4)
             motion[:3, :3] = turn(tuple(rng.normal(size=3)), self.wrong_poses_deg)
             T_c[:], T_p[:] = motion @ T_c, motion @ T_p
-        return cameras, projectors
+        return DevicePoses(cameras, projectors)
 
     def write(self, root: Path) -> Path:
         """Write the scan folder and return it."""
@@ -62,7 +64,7 @@ class FacetedScan:
             root, units=self.units, scale=scale, projector=self.projector, pattern=pattern, camera=CAMERA
         ) as writer:
             for i in range(self.frames):
-                mask, coords = self.observe(true[0][i], true[1][i])
+                mask, coords = self.observe(true.T_world_camera[i], true.T_world_projector[i])
                 value = bilinear(pattern, coords)
                 writer.add_frame(
                     f"frame_{i:05d}",
@@ -70,9 +72,9 @@ class FacetedScan:
                     pattern=np.round(value).astype(np.uint8),
                     coords=coords.astype(np.float32),
                     mask=mask,
-                    T_world_camera=start[0][i],
-                    T_world_projector=start[1][i],
-                    true_poses=(true[0][i], true[1][i]) if self.with_truth else None,
+                    T_world_camera=start.T_world_camera[i],
+                    T_world_projector=start.T_world_projector[i],
+                    true_poses=(true.T_world_camera[i], true.T_world_projector[i]) if self.with_truth else None,
                 )
         if self.with_truth:
             write_mesh(root / "ground_truth" / "mesh.ply", self.truth())

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.evaluate import Evaluation, Poses, evaluate, mesh_reference
-from sl_nerfstudio.evaluation.reference import PointReference
+from sl_nerfstudio.evaluation.evaluate import Evaluation, evaluate
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.result_json import to_json
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
@@ -20,10 +21,10 @@ from .shapes import turn
 SAMPLES = 5000
 
 
-def evaluated(root: Path, mesh: Mesh, made: FacetedScan, poses: Poses | None = None) -> Evaluation:
-    scan, true = read_scan(root), Poses(*made.true_poses())
+def evaluated(root: Path, mesh: Mesh, made: FacetedScan, poses: DevicePoses | None = None) -> Evaluation:
+    scan, true = read_scan(root), made.true_poses()
     reference = mesh_reference(made.truth(), scan, true, SAMPLES)
-    start = Poses(scan.T_world_camera, scan.T_world_projector)
+    start = scan.poses
     return evaluate(mesh, scan, poses or start, reference, true, samples=SAMPLES)
 
 
@@ -31,8 +32,7 @@ def test_a_result_in_another_gauge_is_perfect_once_aligned(clean_scan: Path) -> 
     """The whole result, mesh and poses, lies far away, turned by 100 degrees and 3 % too large."""
     made = FacetedScan()
     S = Similarity(1.03, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
-    camera, projector = made.true_poses()
-    result = evaluated(clean_scan, made.truth().mapped(S), made, Poses(S.poses(camera), S.poses(projector)))
+    result = evaluated(clean_scan, made.truth().mapped(S), made, made.true_poses().mapped(S))
     similarity, rigid = result.surface["similarity"], result.surface["rigid"]
     assert similarity.scale == pytest.approx(1 / 1.03, rel=1e-6)
     assert similarity.accuracy.p95 < 1e-3 and similarity.completeness.p95 < 1e-3
@@ -43,15 +43,15 @@ def test_a_result_in_another_gauge_is_perfect_once_aligned(clean_scan: Path) -> 
     assert result.pose_errors.camera.translation_rmse < 1e-9
     assert result.pose_errors.scale_error == pytest.approx(0.03, rel=1e-9)
     assert result.initial_pose_errors.scale_error == pytest.approx(0.0, abs=1e-12)
-    assert result.fit.coordinate_px_median < 1e-2
+    assert result.agreement.coordinate_px_median < 1e-2
 
 
 def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_gauge(clean_scan: Path) -> None:
     """No true poses: the scan's own ones lead to the reference, though the result is 60 times smaller and far away."""
     made, scan = FacetedScan(), read_scan(clean_scan)
     S = Similarity(1 / 60, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
-    points = Surface(made.truth()).sample(20 * SAMPLES, 3)[0]
-    poses = Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
+    points = IndexedMesh(made.truth()).sample(20 * SAMPLES, 3)[0]
+    poses = scan.poses.mapped(S)
     result = evaluate(made.truth().mapped(S), scan, poses, PointReference(points, "points"), samples=SAMPLES)
     assert result.surface["similarity"].scale == pytest.approx(60, rel=1e-3)
     assert result.surface["similarity"].accuracy.p95 < 0.5  # distances between 100,000 points on 100 mm
@@ -79,10 +79,10 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path)
     made, scan = FacetedScan(), replace(read_scan(clean_scan), units="arbitrary")
     S = Similarity(1 / 60, np.eye(3), np.zeros(3))
     vertices = made.truth().vertices
-    poses = Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
+    poses = scan.poses.mapped(S)
     noisy = Mesh(vertices + np.random.default_rng(0).normal(0, 0.5, vertices.shape), made.truth().faces)
-    reference = mesh_reference(made.truth(), scan, Poses(*made.true_poses()), SAMPLES)
-    content = to_json(evaluate(noisy.mapped(S), scan, poses, reference, Poses(*made.true_poses()), samples=SAMPLES))
+    reference = mesh_reference(made.truth(), scan, made.true_poses(), SAMPLES)
+    content = to_json(evaluate(noisy.mapped(S), scan, poses, reference, made.true_poses(), samples=SAMPLES))
     assert (content["units"], content["truth_units"]) == ("arbitrary", "units of the truth")
     assert 0.1 < content["similarity"]["accuracy"]["rmse"] < 1.0
     assert content["camera"]["translation_rmse"] < 1e-6
@@ -90,7 +90,7 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path)
 
 def test_without_truth_only_the_fit_is_there(clean_scan: Path) -> None:
     scan = read_scan(clean_scan)
-    content = to_json(evaluate(FacetedScan().truth(), scan, Poses(scan.T_world_camera, scan.T_world_projector)))
+    content = to_json(evaluate(FacetedScan().truth(), scan, scan.poses))
     assert set(content) == {"format", "units", "fit"}
     assert content["fit"]["coordinate_px_median"] < 1e-3
 
@@ -129,9 +129,9 @@ def test_mesh_in_another_unit_is_refused_with_the_sizes(clean_scan: Path) -> Non
     scan = read_scan(clean_scan)
     far = Mesh(FacetedScan().truth().vertices / 1000 + 500.0, FacetedScan().truth().faces)
     with pytest.raises(
-        UserError, match=r"no camera ray .*\n.*mesh measures 0\.1\d*, and the cameras stand .*mm"
+        UserError, match=r"no camera ray .* hits the mesh\n.*mesh measures 0\.1\d*, and the cameras are .* away .*mm"
     ) as error:
-        evaluate(far, scan, Poses(scan.T_world_camera, scan.T_world_projector))
+        evaluate(far, scan, scan.poses)
     assert "remedy: give the mesh that was exported from this scan" in str(error.value)
 
 
@@ -139,4 +139,4 @@ def test_reference_inside_out_is_refused(clean_scan: Path) -> None:
     scan, truth = read_scan(clean_scan), FacetedScan().truth()
     turned = Mesh(truth.vertices, truth.faces[:, ::-1].copy())
     with pytest.raises(UserError, match="inside out"):
-        mesh_reference(turned, scan, Poses(scan.T_world_camera, scan.T_world_projector), SAMPLES)
+        mesh_reference(turned, scan, scan.poses, SAMPLES)

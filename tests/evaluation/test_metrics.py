@@ -1,20 +1,20 @@
 import numpy as np
 import pytest
 
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import DistanceStats, default_f_distances, score_surface
 from sl_nerfstudio.evaluation.reference import MeshReference, PointReference
-from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.similarity import Similarity
 
 from .shapes import blob, known_similarity, sphere
 
 
-def whole(surface: Surface) -> MeshReference:
+def whole(surface: IndexedMesh) -> MeshReference:
     return MeshReference(surface, surface.sample(20_000, 9)[0], "all of it")
 
 
 def test_a_sphere_that_is_larger_by_a_known_amount_has_exactly_that_distance_everywhere() -> None:
-    result, truth = Surface(sphere(10.25, 200)), Surface(sphere(10.0, 200))
+    result, truth = IndexedMesh(sphere(10.25, 200)), IndexedMesh(sphere(10.0, 200))
     score = score_surface(result, result.sample(20_000, 0)[0], whole(truth), Similarity.identity(), (0.2, 0.3))
     sagitta = 10.25 * (np.pi / 200) ** 2  # facets cut this much off, at most
     for stats in (score.accuracy, score.completeness):
@@ -28,16 +28,18 @@ def test_a_sphere_that_is_larger_by_a_known_amount_has_exactly_that_distance_eve
 def test_half_of_a_truth_missing_leaves_accuracy_and_halves_recall() -> None:
     truth = sphere(10.0, 100)
     half = truth.with_faces(truth.vertices[truth.faces].mean(1)[:, 2] > 0)
-    result = Surface(half)
-    score = score_surface(result, result.sample(20_000, 0)[0], whole(Surface(truth)), Similarity.identity(), (0.01,))
+    result = IndexedMesh(half)
+    score = score_surface(
+        result, result.sample(20_000, 0)[0], whole(IndexedMesh(truth)), Similarity.identity(), (0.01,)
+    )
     assert score.accuracy.p95 < 1e-6
     assert score.completeness.p95 > 5
     assert score.f_score[0.01] == pytest.approx(2 / 3, abs=0.01)  # precision 1, recall 1/2
 
 
 def test_a_mesh_moved_by_a_known_similarity_is_perfect_again_and_its_scale_is_found() -> None:
-    truth, S = Surface(blob()), known_similarity()
-    result = Surface(blob().mapped(S.inverse()))
+    truth, S = IndexedMesh(blob()), known_similarity()
+    result = IndexedMesh(blob().mapped(S.inverse()))
     samples = result.sample(20_000, 0)[0]
     reference = whole(truth)
     found = reference.align(result, samples, Similarity.identity(), with_scale=True)
@@ -48,8 +50,8 @@ def test_a_mesh_moved_by_a_known_similarity_is_perfect_again_and_its_scale_is_fo
 
 
 def test_distances_of_a_scaled_result_are_in_the_truths_unit() -> None:
-    truth = Surface(sphere(10.0, 150))
-    result = Surface(sphere(5.125, 150))  # times two: 10.25
+    truth = IndexedMesh(sphere(10.0, 150))
+    result = IndexedMesh(sphere(5.125, 150))  # times two: 10.25
     score = score_surface(
         result, result.sample(5000, 0)[0], whole(truth), Similarity(2.0, np.eye(3), np.zeros(3)), (0.1,)
     )
@@ -58,10 +60,10 @@ def test_distances_of_a_scaled_result_are_in_the_truths_unit() -> None:
 
 
 def test_reference_points_are_compared_and_aligned_too() -> None:
-    truth, S = Surface(blob()), known_similarity()
+    truth, S = IndexedMesh(blob()), known_similarity()
     points = truth.sample(30_000, 2)[0]
     reference = PointReference(points, "points")
-    result = Surface(blob().mapped(S.inverse()))
+    result = IndexedMesh(blob().mapped(S.inverse()))
     samples = result.sample(20_000, 0)[0]
     found = reference.align(result, samples, Similarity.identity(), with_scale=True)
     score = score_surface(result, samples, reference, found.S_target_source, (0.05,))
@@ -79,7 +81,7 @@ def test_statistics_are_what_they_say() -> None:
 
 
 def test_signed_distance_is_negative_inside() -> None:
-    reference = whole(Surface(sphere(10.0, 100)))
+    reference = whole(IndexedMesh(sphere(10.0, 100)))
     np.testing.assert_allclose(
         reference.signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]])), [1, -1, -0.5], atol=0.01
     )

@@ -1,7 +1,7 @@
 import numpy as np
 
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.observed import observable
-from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 
@@ -12,7 +12,7 @@ DEVICE = Device(w=100, h=100, fl_x=400.0, fl_y=400.0, cx=50.0, cy=50.0)
 
 
 def test_of_a_sphere_exactly_what_faces_both_devices_is_observable() -> None:
-    surface = Surface(sphere(10.0, 120))
+    surface = IndexedMesh(sphere(10.0, 120))
     points, normals = surface.sample(4000, 0)
     camera, projector = looking_at_origin(400.0, 0.0, 0.0), looking_at_origin(500.0, 1.0, 0.0)
     seen = observable(points, normals, surface, [(DEVICE, camera, DEVICE, projector)])
@@ -23,7 +23,7 @@ def test_of_a_sphere_exactly_what_faces_both_devices_is_observable() -> None:
 
 
 def test_frames_add_up_but_camera_and_projector_must_belong_to_one_frame() -> None:
-    surface = Surface(sphere(10.0, 60))
+    surface = IndexedMesh(sphere(10.0, 60))
     points, normals = surface.sample(2000, 0)
     front, back = looking_at_origin(400.0, 0.0, 0.0), looking_at_origin(400.0, np.pi, 0.0)
     both_front = observable(points, normals, surface, [(DEVICE, front, DEVICE, front)])
@@ -37,15 +37,15 @@ def test_frames_add_up_but_camera_and_projector_must_belong_to_one_frame() -> No
 def test_what_is_hidden_or_out_of_the_picture_is_not_observed() -> None:
     ball = sphere(10.0, 60)
     shield = np.array([[30.0, -50, -50], [30.0, 50, -50], [30.0, 0, 80]])  # between the ball and the devices at +x
-    both = Surface(
+    both = IndexedMesh(
         Mesh(
             np.concatenate([ball.vertices, shield]),
             np.concatenate([ball.faces, [[0, 1, 2] + np.array(len(ball.vertices))]]),
         )
     )
-    points, normals = Surface(ball).sample(500, 0)
+    points, normals = IndexedMesh(ball).sample(500, 0)
     T = looking_at_origin(400.0, 0.0, 0.0)
     assert not observable(points, normals, both, [(DEVICE, T, DEVICE, T)]).any()
     aside = T.copy()
     aside[:3, 3] += 200 * T[:3, 0]
-    assert not observable(points, normals, Surface(ball), [(DEVICE, T, DEVICE, aside)]).any()
+    assert not observable(points, normals, IndexedMesh(ball), [(DEVICE, T, DEVICE, aside)]).any()

@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.evaluate import Poses, evaluate, mesh_reference
-from sl_nerfstudio.evaluation.reference import PointReference
+from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.inputs import EvaluationInputs
+from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.report.charts import nice_limit
-from sl_nerfstudio.evaluation.report.pictures import ColourScale, View, pixel_map, render, views_of
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, OrthographicView, camera_views, pixel_map, render
 from sl_nerfstudio.evaluation.report.plot3d import decimated
 from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
-from sl_nerfstudio.evaluation.report.thumbnails import ThumbnailCollector
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
 from .faceted_scan import FacetedScan
@@ -47,7 +49,7 @@ class Page(HTMLParser):
         self.loaded: list[str] = []
         self.ids: list[str] = []
         self.anchors: list[str] = []
-        self.silent: list[str] = []
+        self.undescribed: list[str] = []
         self.text: list[str] = []
         self._skip = False
         self.feed(text)
@@ -64,7 +66,7 @@ class Page(HTMLParser):
         if "id" in given:
             self.ids.append(given["id"])
         if (tag == "img" and not given.get("alt")) or (tag == "svg" and not given.get("aria-label")):
-            self.silent.append(str(attrs)[:80])
+            self.undescribed.append(str(attrs)[:80])
 
     def handle_endtag(self, tag: str) -> None:
         self._skip = False
@@ -78,26 +80,17 @@ class Page(HTMLParser):
 def full_report(clean_scan: Path) -> str:
     """A report with every section filled."""
     scan, made = read_scan(clean_scan), FacetedScan()
-    true = Poses(*made.true_poses())
-    moved = Poses(true.T_world_camera.copy(), true.T_world_projector)
+    true = made.true_poses()
+    moved = DevicePoses(true.T_world_camera.copy(), true.T_world_projector)
     moved.T_world_camera[1, :3, 3] += 0.5
-    thumbnails = ThumbnailCollector()
-    evaluation = evaluate(
-        made.truth(),
-        scan,
-        moved,
-        mesh_reference(made.truth(), scan, true, 5000),
-        true,
-        samples=5000,
-        on_frame=thumbnails,
-    )
+    thumbnails = ResidualThumbnails()
+    reference = mesh_reference(made.truth(), scan, true, 5000)
+    evaluation = evaluate(made.truth(), scan, moved, reference, true, samples=5000, on_frame=thumbnails)
     sigma = PoseSigma(0.11, 0.022, 0.033, 0.044)
-    return render_report(
-        ReportInput(
-            evaluation, scan, made.truth(), moved, thumbnails.frames, "<mesh & co>.ply", "refined/transforms.json",
-            [sigma, None, sigma], TRAINING, datetime(2026, 1, 2, 3, 4),
-        )
-    )  # fmt: skip
+    path = Path("refined/transforms.json")
+    inputs = EvaluationInputs(made.truth(), scan, moved, true, reference, path, [sigma, None, sigma], TRAINING)
+    made_at = datetime(2026, 1, 2, 3, 4)
+    return render_report(ReportInput(evaluation, inputs, thumbnails.frames, "<mesh & co>.ply", made_at))
 
 
 def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) -> None:
@@ -113,7 +106,7 @@ def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) 
 
 def test_report_is_accessible_and_its_links_lead_somewhere(full_report: str) -> None:
     page = Page(full_report)
-    assert page.silent == []
+    assert page.undescribed == []
     assert len(page.ids) == len(set(page.ids))
     assert set(page.anchors) <= set(page.ids)
     assert '<html lang="en">' in full_report
@@ -143,32 +136,34 @@ def test_interactive_surface_is_complete(full_report: str) -> None:
 
 def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:
     scan, made = read_scan(clean_scan), FacetedScan()
-    poses = Poses(scan.T_world_camera, scan.T_world_projector)
-    thumbnails = ThumbnailCollector()
+    poses = scan.poses
+    thumbnails = ResidualThumbnails()
     evaluation = evaluate(made.truth(), scan, poses, on_frame=thumbnails)
-    page = render_report(ReportInput(evaluation, scan, made.truth(), poses, thumbnails.frames, "mesh.ply", ""))
+    inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
+    page = render_report(ReportInput(evaluation, inputs, thumbnails.frames, "mesh.ply"))
     text = " ".join(" ".join(Page(page).text).split())
     assert "No truth or reference is known for this scan" in text
     assert "The scan's own poses were evaluated" in text
-    assert "No training.json lies beside the poses file" in text
+    assert "There is no training.json next to the poses file" in text
     assert "Accuracy" not in text
 
 
 def test_report_with_reference_points_shows_signed_offsets(clean_scan: Path) -> None:
     scan, made = read_scan(clean_scan), FacetedScan()
-    points = Surface(made.truth()).sample(5000, 0)[0]
-    poses = Poses(scan.T_world_camera, scan.T_world_projector)
-    thumbnails = ThumbnailCollector()
+    points = IndexedMesh(made.truth()).sample(5000, 0)[0]
+    poses = scan.poses
+    thumbnails = ResidualThumbnails()
     evaluation = evaluate(
         made.truth(), scan, poses, PointReference(points, "some points"), samples=5000, on_frame=thumbnails
     )
-    page = render_report(ReportInput(evaluation, scan, made.truth(), poses, thumbnails.frames, "mesh.ply", ""))
+    inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
+    page = render_report(ReportInput(evaluation, inputs, thumbnails.frames, "mesh.ply"))
     text = " ".join(" ".join(Page(page).text).split())
     assert "Distance from reference" in text and "some points" in text
 
 
 def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
-    truth, result = Surface(sphere(10.0, 100)), Surface(sphere(10.25, 100))
+    truth, result = IndexedMesh(sphere(10.0, 100)), IndexedMesh(sphere(10.25, 100))
     reference = PointReference(truth.sample(3000, 0)[0], "")
     from sl_nerfstudio.geometry.similarity import Similarity
 
@@ -177,9 +172,11 @@ def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
 
 
 def test_picture_shows_the_near_side_upright_and_in_colour() -> None:
-    surface = Surface(sphere(10.0, 40))
+    surface = IndexedMesh(sphere(10.0, 40))
     red_top = np.where(surface.vertices[:, 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    picture = render(surface, View(np.array([0.0, -1, 0]), np.array([0.0, 0, 1])), red_top, height=60, width=80)
+    picture = render(
+        surface, OrthographicView(np.array([0.0, -1, 0]), np.array([0.0, 0, 1])), red_top, height=60, width=80
+    )
     assert picture.shape == (60, 80, 3)
     np.testing.assert_array_equal(picture[0, 0], 1.0)  # white outside
     assert picture[15, 40, 0] > 0.3 and picture[15, 40, 2] < 0.05
@@ -189,8 +186,8 @@ def test_picture_shows_the_near_side_upright_and_in_colour() -> None:
 
 
 def test_views_are_the_most_different_cameras() -> None:
-    poses = FacetedScan(frames=9).true_poses()[0]
-    views = views_of(poses, np.zeros(3))
+    poses = FacetedScan(frames=9).true_poses().T_world_camera
+    views = camera_views(poses, np.zeros(3))
     towards = np.array([v.towards_viewer for v in views])
     assert len(views) == 3 and (towards @ towards.T - np.eye(3)).max() < 0.5
 
@@ -212,7 +209,7 @@ def test_decimation_keeps_the_shape() -> None:
     mesh = blob(120)
     small, nearest = decimated(mesh, 2000)
     assert len(small.faces) <= 2000 and len(nearest) == len(small.vertices)
-    assert Surface(mesh).distance(small.vertices).max() < 0.01
+    assert IndexedMesh(mesh).distance(small.vertices).max() < 0.01
     assert np.linalg.norm(mesh.vertices[nearest] - small.vertices, axis=1).max() < 0.1
     same, index = decimated(blob(8), 2000)
     assert same.faces.shape == blob(8).faces.shape and index[-1] == len(blob(8).vertices) - 1

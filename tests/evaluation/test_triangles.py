@@ -1,7 +1,7 @@
 import numpy as np
 import trimesh
 
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.triangles import nearest_on_triangle, neighbours, thin
 from sl_nerfstudio.meshing.mesh import Mesh
 
@@ -49,7 +49,7 @@ def test_points_on_the_long_thin_triangles_of_a_cylinder_have_distance_zero() ->
     low, high = np.arange(500), np.arange(500) + 500
     after = np.roll(low, -1)
     faces = np.concatenate([np.stack([low, after, after + 500], 1), np.stack([low, after + 500, high], 1)])
-    surface = Surface(Mesh(np.concatenate([ring, ring + [0, 0, 60.0]]), faces))
+    surface = IndexedMesh(Mesh(np.concatenate([ring, ring + [0, 0, 60.0]]), faces))
     points, normals = surface.sample(5000, 0)
     assert surface.distance(points).max() < 1e-12
     np.testing.assert_allclose(surface.distance(points + 0.02 * normals), 0.02, rtol=1e-3)

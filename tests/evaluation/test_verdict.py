@@ -2,25 +2,27 @@ from dataclasses import replace
 
 import pytest
 
-from sl_nerfstudio.evaluation.capture_fit import CaptureFit, FrameFit
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.verdict import judge
 
-FRAME = FrameFit("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
-FIT = CaptureFit(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
-GOOD = Evaluation("mm", FIT, None, {}, None, None, starting_poses=True)
+FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
+AGREEMENT = CaptureAgreement(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
+GOOD = Evaluation("mm", AGREEMENT, None, {}, None, None, starting_poses=True)
 
 
-def test_a_good_fit_is_good_and_asks_for_nothing() -> None:
+def test_good_agreement_is_good_and_needs_nothing() -> None:
     verdict = judge(GOOD)
     assert verdict.band == "good"
-    assert {check.band for check in verdict.checks} == {"good"}
+    assert {figure.band for figure in verdict.figures} == {"good"}
     assert verdict.next_steps == []
     assert "no truth is known" in verdict.sentence  # and does not pretend to know more
 
 
-def test_doubts_of_the_intrinsics_come_first() -> None:
-    poor = judge(replace(GOOD, starting_poses=False, fit=replace(FIT, hit_share=0.5)), "The camera is too long")
+def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
+    poor = judge(
+        replace(GOOD, starting_poses=False, agreement=replace(AGREEMENT, hit_share=0.5)), "The camera is too long"
+    )
     assert poor.next_steps[0] == "The camera is too long" and poor.next_steps[1].startswith("Coverage")
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
@@ -40,8 +42,8 @@ def test_doubts_of_the_intrinsics_come_first() -> None:
     ],
 )
 def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, band: str) -> None:
-    verdict = judge(replace(GOOD, fit=replace(FIT, **change)))
-    judged = {c.name: c for c in verdict.checks}
+    verdict = judge(replace(GOOD, agreement=replace(AGREEMENT, **change)))
+    judged = {c.name: c for c in verdict.figures}
     assert judged[check].band == band
     if band == "unknown":
         assert judged[check].text == "none"
@@ -53,7 +55,7 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
         assert "frame_00007" in judged[check].text and "frame_00007" in judged[check].advice
 
 
-def test_without_a_unit_the_scale_is_no_error() -> None:
+def test_without_a_unit_the_scale_is_not_an_error() -> None:
     assert GOOD.alignment == "rigid"
     unknown = replace(GOOD, units="arbitrary")
     assert unknown.alignment == "similarity"

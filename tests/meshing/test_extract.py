@@ -130,8 +130,12 @@ def test_a_box_that_is_no_cube_and_not_centred():
 def test_a_surface_that_leaves_the_box_is_open_there_only():
     mesh = extract_mesh(lambda p: p[:, 2] - 0.1 * torch.sin(3 * p[:, 0]), 40)
     border = mesh.vertices[_border_vertices(mesh)]
-    assert len(border) > 100
     np.testing.assert_allclose(np.abs(border[:, :2]).max(1), 1.0)
+    for axis, wall in ((0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)):  # and all along each of the four walls
+        along = np.sort(border[np.isclose(border[:, axis], wall), 1 - axis])
+        np.testing.assert_allclose(along[[0, -1]], (-1, 1), atol=1e-9)
+        assert np.diff(along).max() < 2 / 40 + 1e-9
+    assert solid(mesh).euler_number == 1  # one sheet without holes
 
 
 def _border_vertices(mesh: Mesh) -> np.ndarray:
@@ -174,7 +178,7 @@ def test_not_a_number_says_so():
 
 def test_a_field_that_is_zero_everywhere_is_refused_before_memory_runs_out(monkeypatch):
     monkeypatch.setattr(sparse_grid, "MAX_LEAVES", 100_000)
-    with pytest.raises(UserError, match=r"is no surface yet.*--resolution"):
+    with pytest.raises(UserError, match=r"is not a surface yet.*--resolution"):
         extract_mesh(lambda p: 1e-3 * torch.sin(500 * p).prod(-1), 256)
 
 

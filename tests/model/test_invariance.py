@@ -40,7 +40,9 @@ def surface(folder: Path) -> np.ndarray:
     model = SLModel(config, box, len(loaded.scan.frames), metadata=metadata)
     model.train()
     model.start(loaded.samples)
-    rays = SceneRays(loaded.scan, torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.T_world_camera)).float())
+    rays = SceneRays(
+        loaded.scan, torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.poses.T_world_camera)).float()
+    )
     optimizer = torch.optim.Adam([p for group in model.get_param_groups().values() for p in group], lr=2e-3)
     for step in range(STEPS):
         torch.manual_seed(step)
@@ -54,7 +56,7 @@ def surface(folder: Path) -> np.ndarray:
         optimizer.step()
     mesh = extract_mesh(model.sdf, 64)
     world = Mesh(loaded.S_scene_world.inverse().points(mesh.vertices), mesh.faces)
-    return trim_to_observed(world, loaded.scan, *model.poses()).mesh.vertices
+    return trim_to_observed(world, loaded.scan, model.poses()).mesh.vertices
 
 
 @pytest.fixture(scope="module")
@@ -79,5 +81,6 @@ def test_a_turned_and_shifted_world_does_not_matter(in_mm, tmp_path):
     folder = small_scan(tmp_path / "turned", world_turn=5)
     turned = surface(folder)
     truth, start = (read_ground_truth(load_scan(f).scan) for f in (folder, small_scan(tmp_path / "plain")))
-    back = start.T_world_camera[0] @ np.linalg.inv(truth.T_world_camera[0])
+    assert start.poses is not None and truth.poses is not None
+    back = start.poses.T_world_camera[0] @ np.linalg.inv(truth.poses.T_world_camera[0])
     assert share_apart(in_mm, turned @ back[:3, :3].T + back[:3, 3]) < 0.01

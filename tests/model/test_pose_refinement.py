@@ -12,8 +12,9 @@ import torch
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.dataparser.samples import build_samples
+from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.methods import sl_neus
@@ -31,7 +32,16 @@ from sl_nerfstudio.model.pose_refinement import (
     sigmas_in_scan_units,
 )
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, read_scan
+from sl_nerfstudio.scan import (
+    PickedPixel,
+    PoseSigma,
+    Scale,
+    ScaleBar,
+    Scan,
+    ScanWriter,
+    measured_length,
+    read_scan,
+)
 
 from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
 
@@ -64,7 +74,7 @@ def scan(true, tmp_path_factory) -> Scan:
     with ScanWriter(
         root,
         units="mm",
-        scale=Scale(True, "baseline of frame 1"),
+        scale=Scale(True, "baseline of frame 1", baseline_of="frame_00001"),
         projector=PROJECTORS["pinhole"],
         pattern=np.tile(np.arange(0, 200, dtype=np.uint8), (400, 2)),
         camera=camera_of(SIZE),
@@ -96,9 +106,16 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
     assert (apart[0] - apart[1]).abs().max() < 0.5 * (apart[2] - apart[1]).abs().max()
 
 
+def adjusted_poses(scan: Scan, samples: PixelSamples) -> Found:
+    """What the adjustment finds, whatever held-out pixels say of it."""
+    maps, _ = maps_and_held_out(scan, samples, QUICK)
+    prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
+    return adjusted(scan, S_SCENE_WORLD, scene_rig(scan, S_SCENE_WORLD), maps, "free", prior, QUICK)
+
+
 @pytest.mark.parametrize(
     "scale, size",
-    [(Scale(True, "given camera poses"), 1.0), (Scale(True, "baseline of frame 1"), 1.02)],
+    [(Scale(True, "given camera poses"), 1.0), (Scale(True, "a ruler", baseline_of="frame_00001"), 1.02)],
 )
 def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
     """Cameras stand where they are said to stand; all baselines are said to be 2 % longer than they are."""
@@ -107,11 +124,40 @@ def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
     sigma = PoseSigma(0.05, 0.05, 1.0, 0.3)
     said = with_poses(scan, start)
     said = replace(said, scale=scale, frames=tuple(replace(f, pose_sigma=sigma) for f in said.frames))
-    maps, _ = maps_and_held_out(said, build_samples(scan), QUICK)
-    rig = scene_rig(said, S_SCENE_WORLD)
-    found = adjusted(said, rig, maps, "free", pose_prior(said, S_SCENE_WORLD, PriorConfig()), QUICK)
+    found = adjusted_poses(said, build_samples(scan))
     apart = [torch.cdist(T[:, :3, 3], T[:, :3, 3]).sum() for T in (found.rig.T_world_camera, true.T_world_camera)]
     assert float(apart[0] / apart[1]) == pytest.approx(size, abs=5e-3)
+
+
+def in_world(found: Found) -> DevicePoses:
+    """The adjusted poses in the scan's world and unit."""
+    return found.rig.poses(S_SCENE_WORLD.inverse())
+
+
+def test_without_an_earlier_frame_the_same_baseline_is_kept(scan, true):
+    """The scan names the frame, so the second of six frames stays the one that counts when the first is removed."""
+    start = with_poses(scan, disturbed(true, 1, relative=1.0))
+    fewer = replace(start, frames=start.frames[1:])
+    found = adjusted_poses(fewer, build_samples(fewer))
+    assert fewer.scale.baseline_of == fewer.frames[0].name == "frame_00001"
+    change = in_world(found).baseline / fewer.poses.baseline - 1
+    assert abs(change[0]) < 1e-12 and np.abs(change[1:]).min() > 1e-4
+
+
+def test_a_scale_bar_has_its_length_after_the_adjustment(scan, true):
+    """The starting poses are 3 % too small, and the bar says so."""
+    ends = (PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0)))
+    length = measured_length(scan, ScaleBar(ends, 1.0), scan.poses)
+    bar = ScaleBar(ends, length)
+    small = disturbed(true, 1)
+    small.T_world_camera[:, :3, 3] *= 0.97
+    small.T_camera_projector[:, :3, 3] *= 0.97
+    start = replace(with_poses(scan, small), scale=Scale(True, "a ruler", bar=bar))
+    found = adjusted_poses(start, build_samples(scan))
+    assert measured_length(start, bar, in_world(found)) == pytest.approx(length, rel=1e-9)
+    assert abs(measured_length(start, bar, start.poses) / length - 1) > 0.01
+    apart = [torch.cdist(T[:, :3, 3], T[:, :3, 3]).sum() for T in (found.rig.T_world_camera, true.T_world_camera)]
+    assert float(apart[0] / apart[1]) == pytest.approx(1, abs=5e-3)
 
 
 def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):

@@ -76,5 +76,5 @@ def test_no_folder_at_all(tmp_path):
 def test_when_nothing_can_be_read_the_first_reason_is_given(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(100))
-    with pytest.raises(UserError, match=r"a\.png: is no image that can be read"):
+    with pytest.raises(UserError, match=r"a\.png: is not an image that can be read"):
         find_captures(tmp_path, sequences=False)

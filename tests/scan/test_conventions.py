@@ -13,7 +13,12 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at
 from sl_nerfstudio.scan import check_scan
 from sl_nerfstudio.scan.check.conventions import convention_problems
 from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
-from sl_nerfstudio.scan.check.readings import Reading, apply_reading, fit_reading, other_readings
+from sl_nerfstudio.scan.check.interpretations import (
+    Interpretation,
+    apply_interpretation,
+    fit_geometry,
+    other_interpretations,
+)
 
 OPENCV = np.diag([1.0, -1, -1, 1])
 KEYS = ("transform_matrix", "projector_transform_matrix")
@@ -71,8 +76,8 @@ def disturbed(
     return out
 
 
-def undo(reading: Reading, frame: Correspondences) -> Correspondences:
-    """The frame as a user with that mix-up would have written it."""
+def undo(interpretation: Interpretation, frame: Correspondences) -> Correspondences:
+    """The frame as a user with that mistake would have written it."""
     mixed = {
         "as given": lambda T: T,
         "inverted": np.linalg.inv,
@@ -80,23 +85,23 @@ def undo(reading: Reading, frame: Correspondences) -> Correspondences:
         "inverted, OpenCV axes": lambda T: np.linalg.inv(T @ OPENCV),
     }
     T_world_projector = frame.T_world_projector.copy()
-    T_world_projector[:3, 3] /= reading.projector_unit
+    T_world_projector[:3, 3] /= interpretation.projector_unit
     x, y = frame.uv_projector.T
-    x, y = (PROJECTOR.w - x if reading.mirrored_x else x), (PROJECTOR.h - y if reading.mirrored_y else y)
+    x, y = (PROJECTOR.w - x if interpretation.mirrored_x else x), (PROJECTOR.h - y if interpretation.mirrored_y else y)
     return replace(
         frame,
-        T_world_camera=mixed[reading.camera](frame.T_world_camera),
-        T_world_projector=mixed[reading.projector](T_world_projector),
-        uv_projector=np.stack([y, x] if reading.exchanged else [x, y], -1),
+        T_world_camera=mixed[interpretation.camera](frame.T_world_camera),
+        T_world_projector=mixed[interpretation.projector](T_world_projector),
+        uv_projector=np.stack([y, x] if interpretation.swapped else [x, y], -1),
     )
 
 
-def test_readings_undo_what_users_do() -> None:
+def test_interpretations_undo_what_users_do() -> None:
     frame = frames_of(poses())[1]
-    readings = list(other_readings())
-    assert len(readings) == len(set(readings)) == 15 + 7 + 2
-    for reading in readings:
-        back = apply_reading(reading, undo(reading, frame), PROJECTOR)
+    interpretations = list(other_interpretations())
+    assert len(interpretations) == len(set(interpretations)) == 15 + 7 + 2
+    for interpretation in interpretations:
+        back = apply_interpretation(interpretation, undo(interpretation, frame), PROJECTOR)
         assert np.allclose(back.T_world_camera, frame.T_world_camera, atol=1e-9)
         assert np.allclose(back.T_world_projector, frame.T_world_projector, atol=1e-9)
         assert np.allclose(back.uv_projector, frame.uv_projector)
@@ -104,15 +109,15 @@ def test_readings_undo_what_users_do() -> None:
 
 @pytest.mark.parametrize("scene", [poses, rigid_rig])
 @pytest.mark.parametrize(("degrees", "mm", "relative"), [(0, 0, 0), (10, 30, 0.3)])
-def test_every_mix_up_is_named(scene: Any, degrees: float, mm: float, relative: float) -> None:
+def test_every_known_mistake_is_named(scene: Any, degrees: float, mm: float, relative: float) -> None:
     honest = disturbed(frames_of(scene()), degrees, mm, relative, seed=1)
     assert list(convention_problems(honest, PROJECTOR, 1e-3)) == []
-    for reading in other_readings():
-        found = list(convention_problems([undo(reading, frame) for frame in honest], PROJECTOR, None))
-        assert len(found) == 1, reading
+    for interpretation in other_interpretations():
+        found = list(convention_problems([undo(interpretation, frame) for frame in honest], PROJECTOR, None))
+        assert len(found) == 1, interpretation
         frame, key, problem = found[0]
         assert frame is None
-        coords = reading.exchanged or reading.mirrored_x or reading.mirrored_y
+        coords = interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y
         assert key in (("sl_coords_path",) if coords else KEYS)
         words = problem.cause
         for how, text in (
@@ -120,11 +125,11 @@ def test_every_mix_up_is_named(scene: Any, degrees: float, mm: float, relative: 
             ("OpenCV axes", "have OpenCV's device axes (y down, looking along +z)"),
             ("inverted, OpenCV axes", "are OpenCV extrinsics (world to device, y down, looking along +z)"),
         ):
-            assert (text in words) == (how in (reading.camera, reading.projector))
-        assert ("x and y exchanged" in words) == reading.exchanged
-        assert ("x counted from the right" in words) == reading.mirrored_x
-        assert ("y counted from below" in words) == reading.mirrored_y
-        assert ("in another unit" in words) == (reading.projector_unit != 1)
+            assert (text in words) == (how in (interpretation.camera, interpretation.projector))
+        assert ("x and y swapped" in words) == interpretation.swapped
+        assert ("x counted from the right" in words) == interpretation.mirrored_x
+        assert ("y counted from below" in words) == interpretation.mirrored_y
+        assert ("in another unit" in words) == (interpretation.projector_unit != 1)
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])
@@ -146,7 +151,7 @@ def test_one_frame_with_other_conventions_than_the_rest(how: Any) -> None:
     assert "does not fit the coordinates in this frame" in found[0][2].problem
 
 
-def test_poses_that_no_mix_up_explains() -> None:
+def test_poses_that_no_known_mistake_explains() -> None:
     frames = frames_of(poses())
     random = Rotation.random(len(frames), random_state=np.random.RandomState(4)).as_matrix()
     lost = []
@@ -157,7 +162,7 @@ def test_poses_that_no_mix_up_explains() -> None:
     found = list(convention_problems(lost, PROJECTOR, 1e-3))
     assert [(frame, key) for frame, key, _ in found] == [(None, "transform_matrix")]
     assert "does not fit the coordinates in 4 of 4 frames" in found[0][2].problem
-    assert "no single mix-up explains it" in found[0][2].cause
+    assert "no single known mistake explains it" in found[0][2].cause
 
 
 @pytest.mark.parametrize(
@@ -166,12 +171,12 @@ def test_poses_that_no_mix_up_explains() -> None:
 def test_units_that_cannot_be(metres: float | None, words: str) -> None:
     found = list(convention_problems(frames_of(poses()), PROJECTOR, metres))
     assert [key for _, key, _ in found] == (["units"] if words else [])
-    assert all(words in problem.problem and "m and mm exchanged" in problem.cause for _, _, problem in found)
+    assert all(words in problem.problem and "m and mm mixed up" in problem.cause for _, _, problem in found)
 
 
 def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
     frames = frames_of(poses())
-    fit = fit_reading(frames, PROJECTOR)
+    fit = fit_geometry(frames, PROJECTOR)
     assert fit.typical_px < 0.5
     assert np.median(np.linalg.norm(fit.clouds[0], axis=1)) == pytest.approx(40, abs=0.5)
     apart = [
@@ -180,7 +185,7 @@ def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
     for index, frame in enumerate(apart):
         frame.T_world_camera[0, 3] += 1e4 * index
         frame.T_world_projector[0, 3] += 1e4 * index
-    assert np.allclose(fit_reading(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
+    assert np.allclose(fit_geometry(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
 
 
 def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:
@@ -194,7 +199,7 @@ def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "transform_matrix")
     assert fault.problem.startswith("does not fit the coordinates in all frames: ")
     assert fault.cause == (
-        "camera and projector matrices map world to device instead of device to world: read that way they fit"
+        "camera and projector matrices map world to device instead of device to world: interpreted that way they fit"
     )
     assert fault.remedy == "store device to world in OpenGL axes (camera and projector matrices: invert them)"
 

@@ -20,17 +20,17 @@ def test_a_valid_scan_has_no_faults(sphere: Path) -> None:
     ("content", "problem", "cause"),
     [
         (b"", "is empty (0 bytes)", "full disk"),
-        (b" \n", "is empty (white space only)", "broken off"),
-        (b'{"sl_format": 1, "frames": [', "Expecting value", "cut short"),
-        (b'{"sl_format": 1, "uni', "Unterminated string", "cut short"),
-        (b'{"sl_format": 1,}', "is no valid JSON", "comma"),
+        (b" \n", "is empty (white space only)", "interrupted"),
+        (b'{"sl_format": 1, "frames": [', "Expecting value", "truncated"),
+        (b'{"sl_format": 1, "uni', "Unterminated string", "truncated"),
+        (b'{"sl_format": 1,}', "is not valid JSON", "comma"),
         (b'\xef\xbb\xbf{"sl_format": 1}', "byte-order mark", "UTF-8 with BOM"),
         ('{"a": "ä"}'.encode("latin-1"), "is not UTF-8 (byte 7)", "another encoding"),
         ('{"a": 1}'.encode("utf-16"), "is not UTF-8", "UTF-16"),
         (b"[1, 2]", "holds a list instead of an object", "another kind"),
         (b"null", "holds null instead of an object", "another kind"),
-        (b"[" * 100_000, "nested too deeply", "not a description"),
-        (b'{"a": 1' + b"0" * 5000 + b"}", "is no valid JSON", "damaged number"),
+        (b"[" * 100_000, "nested too deeply", "does not describe"),
+        (b'{"a": 1' + b"0" * 5000 + b"}", "is not valid JSON", "damaged number"),
     ],
 )
 def test_unreadable_text(sphere: Path, content: bytes, problem: str, cause: str) -> None:
@@ -65,7 +65,7 @@ def test_numbers_that_are_none(sphere: Path, number: str) -> None:
     path.write_text(json.dumps(document).replace('"@"', number))
     fault = only_fault(sphere)
     assert (fault.frame, fault.field) == (NAMES[2], "transform_matrix")
-    assert fault.problem == f"holds {float(number.replace('1e999', 'inf'))}, which is no number"
+    assert fault.problem == f"holds {float(number.replace('1e999', 'inf'))}, which is not a number"
     assert "registration or calibration failed" in fault.cause
 
 
@@ -83,8 +83,8 @@ def test_keys_given_twice(sphere: Path) -> None:
     )
     faults = check_scan(sphere)
     assert [(f.frame, f.field, f.problem) for f in faults] == [
-        (None, "units", "stands there more than once"),
-        (NAMES[1], "file_path", "stands there more than once"),
+        (None, "units", "occurs more than once"),
+        (NAMES[1], "file_path", "occurs more than once"),
     ]
 
 
@@ -126,11 +126,11 @@ def set_key(key: str, value: Any) -> Any:
         ("fl_x", KeyError, "is missing"),
         ("fl_x", [150], "is [150] instead of a number"),
         ("projector.fl_y", "12", "is '12' instead of a number"),
-        ("w", 72.5, "is 72.5, not a whole number above 0"),
-        ("h", -60, "is -60, not a whole number above 0"),
+        ("w", 72.5, "is 72.5, not a whole number greater than 0"),
+        ("h", -60, "is -60, not a whole number greater than 0"),
         ("k3", 0.1, "is not 0"),
-        ("frames", KeyError, "is missing or is no list"),
-        ("frames", {"0": 1}, "is missing or is no list"),
+        ("frames", KeyError, "is missing or is not a list"),
+        ("frames", {"0": 1}, "is missing or is not a list"),
         ("sl_pose_sigma", {"camera_translation": 1}, "is missing"),
     ],
 )
@@ -167,7 +167,7 @@ def test_wrong_or_missing_values_of_a_frame(sphere: Path, key: str, value: Any, 
     assert problem in fault.problem
 
 
-@pytest.mark.parametrize(("count", "problem"), [(0, "is empty"), (1, "holds one frame only")])
+@pytest.mark.parametrize(("count", "problem"), [(0, "is empty"), (1, "holds only one frame")])
 def test_too_few_frames(sphere: Path, count: int, problem: str) -> None:
     edit(sphere, lambda document: document.update(frames=document["frames"][:count]))
     fault = only_fault(sphere)
@@ -178,7 +178,7 @@ def test_too_few_frames(sphere: Path, count: int, problem: str) -> None:
 def test_a_frame_that_is_no_object(sphere: Path) -> None:
     edit(sphere, lambda document: document["frames"].append("frame"))
     fault = only_fault(sphere)
-    assert (fault.frame, fault.problem) == ("#4", "is no object { .. }")
+    assert (fault.frame, fault.problem) == ("#4", "is not an object { .. }")
 
 
 def test_a_misspelt_key_is_not_passed_over(sphere: Path) -> None:
@@ -230,7 +230,7 @@ def test_what_a_message_looks_like(sphere: Path) -> None:
     edit(sphere, set_key("frames.2.transform_matrix", KeyError))
     assert str(only_fault(sphere)) == (
         "transforms.json: frame frame_00002: transform_matrix: is missing\n"
-        "    cause:  written by a program that does not know this format, or removed\n"
+        "    cause:  it was removed, or the program that wrote the file does not know this format\n"
         "    remedy: add it"
     )
 

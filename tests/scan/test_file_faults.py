@@ -28,8 +28,8 @@ IMAGE = f"images/{NAMES[1]}.png"
         ("images/../../scan/images/frame_00001.png", "leaves the scan folder"),
         ("images\\..\\..\\x.png", "leaves the scan folder"),
         ("images\\frame_00001.png", "has backslashes"),
-        ("images/a\0b.png", "characters that no file name has"),
-        ("images/\ud800.png", "characters that no file name has"),
+        ("images/a\0b.png", "characters that no file name can have"),
+        ("images/\ud800.png", "characters that no file name can have"),
         ("images/frame_00000.png/x.png", "cannot be followed"),
         ("x" * 300, "cannot be followed"),
     ],
@@ -81,8 +81,8 @@ def test_missing_empty_truncated_foreign(sphere: Path, file: str) -> None:
         (b"", "is empty (0 bytes)"),
         (content[: len(content) // 2], "cannot be decoded"),
         (content[:80], "cannot be decoded"),
-        (content[:20], "is no image that can be read"),
-        (b"%PDF-1.4 nothing like it", "is no image that can be read"),
+        (content[:20], "is not an image that can be read"),
+        (b"%PDF-1.4 nothing like it", "is not an image that can be read"),
     ):
         (sphere / file).unlink()
         if damaged is not None:
@@ -109,12 +109,12 @@ def save(path: Path, mode: str, size: tuple[int, int] = (CAMERA.w, CAMERA.h), **
 
 @pytest.mark.parametrize(
     ("mode", "kind"),
-    [("P", "a colour palette"), ("RGBA", "transparency"), ("LA", "transparency"), ("1", "one bit a pixel")],
+    [("P", "a colour palette"), ("RGBA", "transparency"), ("LA", "transparency"), ("1", "one bit per pixel")],
 )
 def test_kinds_of_image_that_are_refused(sphere: Path, mode: str, kind: str) -> None:
     save(sphere / IMAGE, mode)
     fault = only_fault(sphere)
-    assert fault.problem == f"is of a kind that a scan may not hold ({kind})"
+    assert fault.problem == f"is of a kind that a scan must not hold ({kind})"
     assert "grey or RGB" in fault.remedy
 
 
@@ -132,7 +132,7 @@ def test_colour_is_for_images_only(sphere: Path) -> None:
 
 @pytest.mark.parametrize(
     ("size", "cause"),
-    [((60, 72), "exchanged"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")],
+    [((60, 72), "swapped"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")],
 )
 @pytest.mark.parametrize("folder", ["images", "patterns", "masks"])
 def test_wrong_size(sphere: Path, size: tuple[int, int], cause: str, folder: str) -> None:
@@ -159,7 +159,7 @@ def test_exif_rotation_is_refused(sphere: Path, orientation: int, kind: str) -> 
     image = Image.open(sphere / IMAGE).copy()
     image.save(sphere / IMAGE, format=kind, exif=exif)
     fault = only_fault(sphere)
-    assert fault.problem == f"is to be turned before it is shown (EXIF orientation {orientation})"
+    assert fault.problem == f"must be rotated before it is shown (EXIF orientation {orientation})"
 
 
 def test_exif_rotation_behind_the_pixels_of_a_png(sphere: Path) -> None:
@@ -198,13 +198,13 @@ def test_decompression_bombs_are_not_unpacked(sphere: Path) -> None:
 def test_an_animation_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tiff"
     Image.new("L", (4, 4)).save(path, save_all=True, append_images=[Image.new("L", (4, 4))])
-    with pytest.raises(FileError, match="holds several pictures"):
+    with pytest.raises(FileError, match="holds several images"):
         read_image(path)
 
 
 def test_formats_beyond_the_list_are_refused(tmp_path: Path) -> None:
     Image.new("L", (4, 4)).save(tmp_path / "a.png", format="GIF")
-    with pytest.raises(FileError, match="is no image that can be read"):
+    with pytest.raises(FileError, match="is not an image that can be read"):
         read_image(tmp_path / "a.png")
 
 
@@ -246,5 +246,5 @@ def test_a_damaged_image_found_late_names_file_cause_and_remedy(tmp_path: Path) 
     with pytest.raises(FileError) as error:
         read_image(tmp_path / "a.jpg")
     assert str(error.value).startswith(f"{tmp_path / 'a.jpg'}: cannot be decoded (image file is truncated")
-    assert "    cause:  the file is cut short or damaged" in str(error.value)
+    assert "    cause:  the file is truncated or damaged" in str(error.value)
     assert "    remedy: copy or export this image again" in str(error.value)

@@ -14,7 +14,7 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, edit_co
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
-from sl_nerfstudio.scan.check.examination import examine
+from sl_nerfstudio.scan.check.folder import check_folder
 from sl_nerfstudio.scan.coordinates import read_coords, read_coords_size
 
 NAME = NAMES[1]
@@ -65,9 +65,9 @@ class Mine:
         (zipped(arr_0=GOOD), "must hold exactly one array called 'coords', but holds 'arr_0'"),
         (zipped(), "but holds nothing"),
         (zipped(**{f"a{i}": b"" for i in range(100)}), "holds 100 members"),
-        (zipped(coords=GOOD[:-100]), "bytes where its head asks for"),
-        (zipped(coords=GOOD + b"\0" * 8), "bytes where its head asks for"),
-        (zipped(coords=GOOD.replace(b"(60, 72, 2)", b"(60000, 72000, 2)", 1)), "bytes where its head asks for"),
+        (zipped(coords=GOOD[:-100]), "bytes, but its header says"),
+        (zipped(coords=GOOD + b"\0" * 8), "bytes, but its header says"),
+        (zipped(coords=GOOD.replace(b"(60, 72, 2)", b"(60000, 72000, 2)", 1)), "bytes, but its header says"),
         (zipped(coords=b"no array"), "cannot be read"),
         (zipped(coords=GOOD)[:200], "cannot be read"),
         (b"no archive", "cannot be read"),
@@ -150,12 +150,12 @@ def lose_x(coords: ndarray) -> ndarray:
         (placed(0), "has the value (0, 0) at 576 pixels", "stands for 'not decoded'", "write NaN"),
         (lambda c: np.nan_to_num(c, nan=-7), "has the value (-7, -7) at", "placeholder", "write NaN"),
         (lambda c: c * 0 + 50, "has the value (50, 50) at", "placeholder", "write NaN"),
-        (lose_x, "has only one of x_p and y_p at 100 pixels", "decoded apart", "NaN for both"),
+        (lose_x, "has only one of x_p and y_p at 100 pixels", "decoded separately", "NaN for both"),
         (np.floor, "holds whole numbers only", "Gray-code", "add 0.5"),
         (scale(1 / PROJECTOR.w, 1 / PROJECTOR.h), "lies between -1 and 1", "normalised", "multiply"),
         (scale(4, 4), "outside the pattern", "another size", "pixels of pattern.png"),
-        (one_pixel(-9999), "puts 1 pixels outside the pattern", "marker", "NaN where not decoded"),
-        (one_pixel(1e30), "puts 1 pixels outside the pattern", "ran away", "NaN where not decoded"),
+        (one_pixel(-9999), "puts 1 pixel outside the pattern", "marker", "NaN where not decoded"),
+        (one_pixel(1e30), "puts 1 pixel outside the pattern", "diverged", "NaN where not decoded"),
     ],
 )
 def test_coordinates(sphere: Path, change: Callable[[ndarray], ndarray], problem: str, cause: str, remedy: str) -> None:
@@ -167,14 +167,14 @@ def test_coordinates(sphere: Path, change: Callable[[ndarray], ndarray], problem
     assert remedy in fault.remedy
 
 
-def test_exchanged_coordinates_on_an_oblong_pattern(sphere: Path) -> None:
+def test_swapped_coordinates_on_an_oblong_pattern(sphere: Path) -> None:
     def exchange(coords: ndarray) -> ndarray:
         return np.ascontiguousarray(coords[..., ::-1]) + np.array([0, 40], np.float32)
 
     edit_coords(sphere, NAME, exchange)
     fault = only_fault(sphere)
     assert "outside the pattern" in fault.problem
-    assert "x and y are exchanged" in fault.cause
+    assert "x and y are swapped" in fault.cause
 
 
 def test_a_few_wrong_decodings_outside_the_pattern_are_no_fault(sphere: Path) -> None:
@@ -195,13 +195,13 @@ def test_coordinates_half_a_pixel_off_are_seen_in_the_pattern(tmp_path: Path) ->
             edit_coords(root, name, lambda coords, sign=sign: coords + np.float32(sign))
         fault = only_fault(root)
         assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "sl_coords_path")
-        assert fault.problem == "are shifted against the pattern by half a pixel in x and y, in 4 of 4 frames"
+        assert fault.problem == "are shifted relative to the pattern by half a pixel in x and y, in 4 of 4 frames"
         assert words[0] in fault.cause
         assert words[1] in fault.remedy
 
 
 def test_no_shift_is_seen_where_there_is_none_nor_in_one_frame_alone(sphere: Path) -> None:
-    for content in examine(sphere).contents:
+    for content in check_folder(sphere).contents:
         assert content.shift is not None
         assert np.abs(content.shift).max() < 0.03
     edit_coords(sphere, NAME, lambda coords: coords - np.float32(0.5))
@@ -213,8 +213,8 @@ def test_no_shift_is_seen_where_there_is_none_nor_in_one_frame_alone(sphere: Pat
     [
         (lambda m: m * 0, "is 0 everywhere", "leave the frame out"),
         (lambda m: m // 255, "has 0 and 1 instead of 0 and 255", "multiply it by 255"),
-        (lambda m: m // 2, "has grey levels between black and white (127)", "0 and 255 alone"),
-        (lambda m: 255 - m, "leaves out every pixel that has coordinates", "255 where the pattern falls"),
+        (lambda m: m // 2, "has grey levels between black and white (127)", "0 and 255 only"),
+        (lambda m: 255 - m, "excludes every pixel that has coordinates", "255 where the pattern falls"),
     ],
 )
 def test_masks(sphere: Path, change: Callable[[ndarray], ndarray], problem: str, remedy: str) -> None:
@@ -240,7 +240,7 @@ def test_pictures_of_nothing(sphere: Path) -> None:
     Image.new("L", (CAMERA.w, CAMERA.h), 7).save(sphere / "patterns" / f"{NAME}.png")
     fault = only_fault(sphere)
     assert fault.file == f"patterns/{NAME}.png"
-    assert "one and the same value" in fault.problem
+    assert "the same value everywhere" in fault.problem
     edit(sphere, lambda document: document["frames"][1].pop("sl_pattern_path"))
     assert check_scan(sphere) == []  # then the image is compared with the pattern
     Image.new("L", (CAMERA.w, CAMERA.h), 7).save(sphere / "images" / f"{NAME}.png")
@@ -250,7 +250,7 @@ def test_pictures_of_nothing(sphere: Path) -> None:
 def test_a_pattern_without_a_pattern(sphere: Path) -> None:
     Image.new("L", (PROJECTOR.w, PROJECTOR.h), 200).save(sphere / "pattern.png")
     fault = only_fault(sphere)
-    assert (fault.file, fault.problem) == ("pattern.png", "has one and the same value everywhere in the pattern")
+    assert (fault.file, fault.problem) == ("pattern.png", "has the same value everywhere in the pattern")
 
 
 def test_a_frame_copied_under_another_name(sphere: Path) -> None:
@@ -264,10 +264,10 @@ def test_a_frame_copied_under_another_name(sphere: Path) -> None:
     edit(sphere, copy)
     fault = only_fault(sphere)
     assert fault.frame == "copy"
-    assert fault.problem == f"has the very image and coordinates of frame {NAMES[0]}"
+    assert fault.problem == f"has the same image and coordinates as frame {NAMES[0]}"
     edit(sphere, lambda document: document["frames"].__setitem__(4, document["frames"][0]))
     fault = only_fault(sphere)
-    assert (fault.frame, fault.problem) == (NAMES[0], "is there more than once")
+    assert (fault.frame, fault.problem) == (NAMES[0], "occurs more than once")
 
 
 def test_doe_coordinates_beyond_the_horizon(tmp_path: Path) -> None:
@@ -275,12 +275,12 @@ def test_doe_coordinates_beyond_the_horizon(tmp_path: Path) -> None:
     root = write_sphere(tmp_path / "scan", projector=steep)
     faults = [fault for fault in check_scan(root) if fault.file.startswith("coords/")]
     assert len(faults) == len(NAMES)
-    assert all("beyond 90 degrees" in fault.problem for fault in faults)
+    assert all("pixels more than 90 degrees from the axis" in fault.problem for fault in faults)
 
 
 def test_the_factory_is_right(sphere: Path) -> None:
     for frame, pose in zip(read_scan(sphere).frames, poses(), strict=True):
         assert np.array_equal(frame.read_coords(), correspondences(*pose), equal_nan=True)
-    fit = examine(sphere).fit
+    fit = check_folder(sphere).fit
     assert fit is not None
     assert fit.typical_px < 1e-4

@@ -41,10 +41,14 @@ def last_row(*row: float) -> Callable[[ndarray], ndarray]:
 @pytest.mark.parametrize(
     ("change", "problem", "words"),
     [
-        (lambda T: T @ np.diag([-1.0, 1, 1, 1]), "mirrors (the determinant of its rotation is -1)", "left-handed"),
+        (
+            lambda T: T @ np.diag([-1.0, 1, 1, 1]),
+            "is a reflection (the determinant of its rotation is -1)",
+            "left-handed",
+        ),
         (lambda T: T @ np.diag([2.0, 2, 2, 1]), "is scaled: its rotation is 2 times a rotation", "similarity"),
         (lambda T: T @ np.diag([1e-3, 1e-3, 1e-3, 1]), "is scaled: its rotation is 0.001 times a rotation", "unit"),
-        (lambda T: T @ np.diag([-2.0, -2, -2, 1]), "is scaled: its rotation is 2 times a mirroring", "divide"),
+        (lambda T: T @ np.diag([-2.0, -2, -2, 1]), "is scaled: its rotation is 2 times a reflection", "divide"),
         (lambda T: T @ np.diag([1.0, 1, 0, 1]), "has no rotation in its upper left 3 x 3 block", "six digits"),
         (sheared, "has no rotation in its upper left 3 x 3 block", "sheared"),
         (lambda T: T * 0, "has the last row 0, 0, 0, 0 instead of 0, 0, 0, 1", "rigid motion"),
@@ -83,7 +87,7 @@ def test_projector_in_the_camera_s_place(sphere: Path) -> None:
     edit(sphere, copy)
     faults = check_scan(sphere)
     assert faults[0].field == "projector_transform_matrix"
-    assert faults[0].problem == "stands in the very place of the camera"
+    assert faults[0].problem == "has exactly the position of the camera"
 
 
 def test_all_poses_equal(sphere: Path) -> None:
@@ -103,8 +107,8 @@ def test_all_poses_equal(sphere: Path) -> None:
     [
         (Device(72, 60, 0.0, 150.0, 36.0, 30.0), "fl_x", "is 0"),
         (Device(72, 60, 150.0, -150.0, 36.0, 30.0), "fl_y", "is -150"),
-        (Device(72, 60, 4.2, 150.0, 36.0, 30.0), "fl_x", "is 4.2 pixels, which no lens has"),
-        (Device(72, 60, 150.0, 15000.0, 36.0, 30.0), "fl_y", "is 15000 pixels, which no lens has"),
+        (Device(72, 60, 4.2, 150.0, 36.0, 30.0), "fl_x", "is 4.2 pixels, which is impossible"),
+        (Device(72, 60, 150.0, 15000.0, 36.0, 30.0), "fl_y", "is 15000 pixels, which is impossible"),
         (Device(72, 60, 150.0, 150.0, 960.0, 30.0), "cx", "is 960, far outside an image of 72 pixels"),
         (Device(72, 60, 150.0, 150.0, 36.0, -540.0), "cy", "is -540, far outside an image of 60 pixels"),
         (Device(72, 60, 60.0, 60.0, 36.0, 30.0, k1=-1.5), "k1", "fold the image over itself"),
@@ -214,5 +218,5 @@ def test_an_uncertainty_is_above_zero(sphere: Path, value: float) -> None:
 
 def test_poses_arrive_as_they_are_written(sphere: Path) -> None:
     scan = read_scan(sphere)
-    assert np.array_equal(scan.T_world_camera, [camera for camera, _ in poses()])
-    assert np.array_equal(scan.T_world_projector, [projector for _, projector in poses()])
+    assert np.array_equal(scan.poses.T_world_camera, [camera for camera, _ in poses()])
+    assert np.array_equal(scan.poses.T_world_projector, [projector for _, projector in poses()])

@@ -12,8 +12,8 @@ from test_conventions import disturbed, undo
 
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.check.conventions import convention_problems
-from sl_nerfstudio.scan.check.examination import Examination, examine
-from sl_nerfstudio.scan.check.readings import Reading
+from sl_nerfstudio.scan.check.folder import FolderCheck, check_folder
+from sl_nerfstudio.scan.check.interpretations import Interpretation
 
 DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
@@ -25,18 +25,18 @@ def folder(name: str) -> Path:
 
 
 @pytest.fixture(scope="module", params=["elephant", "house"])
-def examined(request: pytest.FixtureRequest) -> Examination:
-    return examine(folder(request.param))
+def examined(request: pytest.FixtureRequest) -> FolderCheck:
+    return check_folder(folder(request.param))
 
 
-def test_real_captures_are_clean(examined: Examination) -> None:
+def test_real_captures_are_clean(examined: FolderCheck) -> None:
     assert examined.faults == ()
     assert examined.fit is not None and examined.scan is not None
     assert examined.fit.typical_px < 0.3
     assert examined.fit.typical_spread < 0.05
 
 
-def test_real_captures_with_rough_poses_are_clean(examined: Examination) -> None:
+def test_real_captures_with_rough_poses_are_clean(examined: FolderCheck) -> None:
     assert examined.scan is not None
     frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
     size = 30.0 if examined.scan.units == "mm" else 0.3
@@ -46,14 +46,14 @@ def test_real_captures_with_rough_poses_are_clean(examined: Examination) -> None
 
 
 @pytest.mark.parametrize("how", ["inverted", "OpenCV axes", "inverted, OpenCV axes"])
-def test_mixed_up_real_captures_are_named(examined: Examination, how: str) -> None:
+def test_mixed_up_real_captures_are_named(examined: FolderCheck, how: str) -> None:
     assert examined.scan is not None
     frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
-    reading = Reading(camera=how, projector=how)  # type: ignore[arg-type]
+    interpretation = Interpretation(camera=how, projector=how)  # type: ignore[arg-type]
     projector = examined.scan.projector
     for relative in (0.0, 0.5):
         rough = disturbed(frames, 5, 10 if examined.scan.units == "mm" else 0.1, relative, 1)
-        mixed = [replace(undo(reading, frame)) for frame in rough]
+        mixed = [replace(undo(interpretation, frame)) for frame in rough]
         found = list(convention_problems(mixed, projector, None))
         assert [(frame, key) for frame, key, _ in found] == [(None, "transform_matrix")]
         assert found[0][2].cause.startswith("camera and projector matrices ")
@@ -68,7 +68,7 @@ def test_faults_planted_in_real_captures(tmp_path: Path) -> None:
     np.savez_compressed(root / "coords" / "frame_00006.npz", coords=np.nan_to_num(coords, nan=-1))
     edit(root, lambda document: document["frames"][5]["transform_matrix"][0].__setitem__(0, float("nan")))
     edit(root, lambda document: document["frames"].append({**document["frames"][7]}))
-    found = {(fault.file, fault.frame, fault.field) for fault in examine(root).faults}
+    found = {(fault.file, fault.frame, fault.field) for fault in check_folder(root).faults}
     assert found == {
         ("images/frame_00003.png", "frame_00003", None),
         ("coords/frame_00004.npz", "frame_00004", None),
@@ -78,7 +78,7 @@ def test_faults_planted_in_real_captures(tmp_path: Path) -> None:
     }
 
 
-def test_reading_takes_little_memory(tmp_path: Path) -> None:
+def test_interpretation_takes_little_memory(tmp_path: Path) -> None:
     """The check holds one frame at a time: its peak does not grow with the number of frames."""
     import tracemalloc
 
@@ -89,7 +89,7 @@ def test_reading_takes_little_memory(tmp_path: Path) -> None:
         shutil.copytree(scan.root, root)
         edit(root, lambda document, count=count: document.update(frames=document["frames"][:count]))
         tracemalloc.start()
-        assert examine(root).faults == ()
+        assert check_folder(root).faults == ()
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     one_frame = 960 * 540 * (8 + 3)

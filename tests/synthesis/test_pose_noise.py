@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
 from sl_nerfstudio.synthesis.devices import DeviceOptions, make_devices
-from sl_nerfstudio.synthesis.paths import Poses, make_paths
-from sl_nerfstudio.synthesis.pose_noise import Correspondences, PoseNoise, disturb_poses, disturb_relative, pose_sigma
+from sl_nerfstudio.synthesis.paths import make_paths
+from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, disturb_relative, pose_sigma
 
 _FRAMES = 24
 
@@ -30,7 +31,7 @@ def rig(scene, truth):
     p = scene.centre + rng.uniform(-1, 1, (150, 3)) * np.ptp(scene.vertices, axis=0) / 2
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     return devices, [
-        Correspondences(_pixel(devices.camera, T_c, p), _pixel(devices.projector, T_p, p), p) for T_c, T_p in pairs
+        ExactMatches(_pixel(devices.camera, T_c, p), _pixel(devices.projector, T_p, p), p) for T_c, T_p in pairs
     ]
 
 
@@ -160,7 +161,9 @@ def test_sigma_is_the_error_along_each_axis(scene, truth):
     motion[:, :3, 3] = scene.centre - motion[:, :3, :3] @ scene.centre + 2.0 * rng.standard_normal((n, 3))
     relative[:, :3, :3] = Rotation.from_rotvec(np.radians(0.1) * rng.standard_normal((n, 3))).as_matrix()
     relative[:, :3, 3] = 0.5 * rng.standard_normal((n, 3))
-    sigma = pose_sigma(Poses(camera, projector), Poses(motion @ camera, motion @ projector @ relative), scene.centre)
+    sigma = pose_sigma(
+        DevicePoses(camera, projector), DevicePoses(motion @ camera, motion @ projector @ relative), scene.centre
+    )
     assert sigma.camera_translation == pytest.approx(2.0, rel=0.05)
     assert sigma.camera_rotation_deg == pytest.approx(0.7, rel=0.05)
     assert sigma.relative_translation == pytest.approx(0.5, rel=0.05)

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.scan import read_ground_truth, read_scan
-from sl_nerfstudio.scan.check.examination import check_scan
+from sl_nerfstudio.scan import Scale, read_ground_truth, read_scan
+from sl_nerfstudio.scan.check.folder import check_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 
@@ -49,10 +49,11 @@ def test_a_scan_is_faultless_and_complete(make):
     scan = read_scan(root)
     truth = read_ground_truth(scan)
     assert len(scan.frames) == 4 and scan.units == "mm"
-    assert (scan.scale.known, scan.scale.source) == (True, "baseline of frame 0")
+    assert scan.scale == Scale(True, "baseline of frame 0", baseline_of="frame_00000")
     assert truth.mesh_path == root / "ground_truth/mesh.ply"
     assert (root / "pattern.json").is_file()
-    assert np.abs(truth.T_world_camera - scan.T_world_camera).max() > 0.1
+    assert truth.poses is not None
+    assert np.abs(truth.poses.T_world_camera - scan.poses.T_world_camera).max() > 0.1
 
 
 def test_same_flags_same_bytes(make, tmp_path):
@@ -128,8 +129,8 @@ def test_the_first_baseline_is_exact_only_where_the_scale_is_known(make):
         length, true_length = (
             np.linalg.norm((np.linalg.inv(c) @ p)[:, :3, 3], axis=1)
             for c, p in (
-                (start.T_world_camera, start.T_world_projector),
-                (truth.T_world_camera, truth.T_world_projector),
+                (start.poses.T_world_camera, start.poses.T_world_projector),
+                (truth.poses.T_world_camera, truth.poses.T_world_projector),
             )
         )
         ratio = np.log(length / true_length)
@@ -143,7 +144,7 @@ def test_what_is_said_of_the_poses_is_so(make):
     scan = read_scan(make())
     truth = read_ground_truth(scan)
     centre = trimesh.load(truth.mesh_path, process=False).bounds.mean(0)
-    moved = scan.T_world_camera @ np.linalg.inv(truth.T_world_camera)
+    moved = scan.poses.T_world_camera @ np.linalg.inv(truth.poses.T_world_camera)
     shift = moved[:, :3, :3] @ centre + moved[:, :3, 3] - centre
     assert scan.frames[0].pose_sigma.camera_translation == pytest.approx(np.sqrt((shift**2).mean()), rel=1e-6)
     assert "sl_pose_sigma" not in _document(make(pose_sigma=False))
@@ -188,7 +189,7 @@ def test_a_mesh_file_in_metres(tmp_path):
     synthesise(config, tmp_path / "scan")
     mesh = trimesh.load(tmp_path / "scan/ground_truth/mesh.ply", process=False)
     np.testing.assert_allclose(mesh.extents, 0.8, atol=1e-6)
-    assert 4 * 0.8 < np.linalg.norm(read_scan(tmp_path / "scan").T_world_camera[0, :3, 3]) < 5 * 0.8
+    assert 4 * 0.8 < np.linalg.norm(read_scan(tmp_path / "scan").poses.T_world_camera[0, :3, 3]) < 5 * 0.8
     assert check_scan(tmp_path / "scan") == []
 
 

@@ -1,8 +1,9 @@
-"""Small charts as inline SVG: sharp in print, no script."""
+"""Small charts as inline SVG: sharp in print, without scripts."""
 
 import io
 import math
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,14 +32,14 @@ _RC = {
 
 @dataclass(frozen=True)
 class Bars:
-    """One series of a bar chart by frame."""
+    """One series of a bar chart with one bar per frame."""
 
     label: str
     values: Sequence[float]
 
 
 def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False) -> str:
-    """Bars per frame, several series side by side; `wide` fills the page."""
+    """Bars per frame, several series side by side; `wide` fills the width of the page."""
     import matplotlib
 
     with matplotlib.rc_context(_RC):
@@ -59,7 +60,7 @@ def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False
 
 
 def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, upper: float) -> str:
-    """Share of the values by bin between two ends; what lies outside is counted in the end bins."""
+    """Share of the values in each bin between two limits; values outside count in the outermost bins."""
     import matplotlib
 
     with matplotlib.rc_context(_RC):
@@ -113,28 +114,21 @@ def _svg(figure: Figure, title: str) -> str:
     from markupsafe import escape
 
     buffer = io.StringIO()
-    # A salt of its own per chart: ids of several charts in one page must differ, and runs must repeat.
+    # One salt per chart: the ids of several charts on one page must differ, and every run must give the same.
     with matplotlib.rc_context({"svg.hashsalt": title}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
-    prefix = "c" + format(abs(hash_of(title)), "x") + "-"
+    prefix = "c" + format(zlib.crc32(title.encode()), "x") + "-"
     text = re.sub(r'\bid="', f'id="{prefix}', text)
     text = re.sub(r'(xlink:href="#|url\(#)', lambda m: m.group(1) + prefix, text)
     head = f'<svg role="img" aria-label="{escape(title)}" class="chart"'
     return text.replace("<svg", head, 1)
 
 
-def hash_of(text: str) -> int:
-    """A hash that is the same in every run."""
-    import zlib
-
-    return zlib.crc32(text.encode())
-
-
 def nice_limit(value: float) -> float:
-    """The next larger number with one digit out of 1, 2, 5."""
+    """The smallest number of 1, 2, 5 times a power of ten that is at least `value`."""
     if not math.isfinite(value) or value <= 0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

@@ -1,4 +1,4 @@
-"""Captured against rendered pattern of a few frames, side by side."""
+"""Captured and rendered pattern of a few frames, side by side."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.capture_fit import CaptureFit, FramePixels, frame_pixels
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FramePixels, frame_pixels
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.pictures import (
     NO_SURFACE,
     NO_VALUE,
@@ -18,7 +19,7 @@ from sl_nerfstudio.evaluation.report.pictures import (
     shrink,
 )
 from sl_nerfstudio.evaluation.report.thumbnails import brightness_ratio
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.scan import Scan
 
 _SIDE = 420
@@ -26,7 +27,7 @@ _SIDE = 420
 
 @dataclass(frozen=True)
 class Comparison:
-    """Data addresses of one frame's pictures, cropped alike."""
+    """One frame's pictures as data addresses, all cropped in the same way."""
 
     name: str
     why: str  # why this frame is shown
@@ -37,27 +38,28 @@ class Comparison:
 
 
 def compare_frames(
-    surface: Surface,
+    surface: IndexedMesh,
     scan: Scan,
-    fit: CaptureFit,
-    T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
+    agreement: CaptureAgreement,
+    poses: DevicePoses,
 ) -> list[Comparison]:
     """The frames with the best, the median and the worst pattern agreement."""
     pattern = scan.read_pattern()
     shown = []
-    for index, why in _chosen(fit):
+    for index, why in _chosen(agreement):
         frame = scan.frames[index]
-        pixels = frame_pixels(surface, frame, scan, pattern, T_world_camera[index], T_world_projector[index])
-        shown.append(_compare(frame.name, why, fit.frames[index].pattern_cosine, pixels))
+        pixels = frame_pixels(
+            surface, frame, scan, pattern, poses.T_world_camera[index], poses.T_world_projector[index]
+        )
+        shown.append(_compare(frame.name, why, agreement.frames[index].pattern_cosine, pixels))
     return shown
 
 
-def _chosen(fit: CaptureFit) -> list[tuple[int, str]]:
+def _chosen(agreement: CaptureAgreement) -> list[tuple[int, str]]:
     """Indices of frames, and why."""
     order = sorted(
-        (i for i, f in enumerate(fit.frames) if math.isfinite(f.pattern_cosine)),
-        key=lambda i: -fit.frames[i].pattern_cosine,
+        (i for i, f in enumerate(agreement.frames) if math.isfinite(f.pattern_cosine)),
+        key=lambda i: -agreement.frames[i].pattern_cosine,
     )
     picks: dict[int, str] = {}
     for place, why in ((0, "best agreement"), (len(order) // 2, "median"), (-1, "worst agreement")):

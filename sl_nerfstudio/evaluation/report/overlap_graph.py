@@ -1,4 +1,4 @@
-"""Which frames were registered with which, as a drawing."""
+"""A drawing of which frames were registered with which."""
 
 import math
 from collections.abc import Sequence
@@ -9,11 +9,11 @@ from sl_nerfstudio.evaluation.report.charts import BLUE, INK, MUTED, ORANGE
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
 
 _SIZE, _RADIUS = 460.0, 185.0
-_WEAK = 0.7  # fitness below which an edge is drawn as a weak one
+_WEAK = 0.7  # fitness below which an edge is drawn as weak
 
 
 def draw_overlaps(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]) -> str:
-    """An <svg> of frames on a circle in their order; thick lines share much, dashed ones were not believed."""
+    """An <svg> of the frames on a circle, in order; thick lines mean large overlap, dashed ones were rejected."""
     place = {f.name: _place(k, len(frames)) for k, f in enumerate(frames)}
     lines = [_line(place, edge) for edge in sorted(edges, key=lambda e: e.used) if set(edge.frames) <= place.keys()]
     nodes = [_node(frame, place[frame.name], str(k)) for k, frame in enumerate(frames)]

@@ -1,11 +1,11 @@
-"""Where the reports' pages come from."""
+"""Filling in the HTML templates of the reports."""
 
 from collections.abc import Callable
 from typing import Any
 
 
 def page(name: str, filters: dict[str, Callable[..., str]], values: dict[str, Any]) -> str:
-    """The template `name` of this package, filled in; an unknown value in it raises."""
+    """The template `name` of this package, filled in. Raises if the template uses an unknown value."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -1,4 +1,4 @@
-"""Pictures for the report: colour-coded maps, shaded views of a mesh, all embedded as data."""
+"""Pictures for the report: colour-coded maps and shaded views of a mesh, all embedded as data."""
 
 import base64
 import io
@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 
 CLAY = (0.80, 0.78, 0.74)
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class ColourScale:
     upper: float
 
     def __call__(self, values: Float[ndarray, "*n"]) -> Float[ndarray, "*n 3"]:
-        """RGB in 0..1; values beyond the ends take the end colours."""
+        """RGB in 0..1; values beyond the limits get the colours of the limits."""
         span = self.upper - self.lower
         return np.asarray(matplotlib.colormaps[self.colours](np.clip((values - self.lower) / span, 0, 1)))[..., :3]
 
@@ -56,34 +55,36 @@ def shrink(rgb: Float[ndarray, "h w 3"], longest: int) -> Float[ndarray, "h2 w2 
 
 
 @dataclass(frozen=True)
-class View:
-    """An orthographic view: from where, and what is up."""
+class OrthographicView:
+    """The direction from which a mesh is drawn, and which direction is up."""
 
     towards_viewer: Float[ndarray, "3"]
     up: Float[ndarray, "3"]
 
 
-def views_of(T_world_camera: Float[ndarray, "n 4 4"], centre: Float[ndarray, "3"], count: int = 3) -> list[View]:
-    """Views from where cameras stood, as different from each other as possible: sides the scan really saw."""
+def camera_views(
+    T_world_camera: Float[ndarray, "n 4 4"], centre: Float[ndarray, "3"], count: int = 3
+) -> list[OrthographicView]:
+    """Views from camera positions, as different from each other as possible: sides that the scan really saw."""
     towards = T_world_camera[:, :3, 3] - centre
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
     common_up = T_world_camera[:, :3, 1].mean(0)
     chosen = [int(np.argmax(towards @ towards.mean(0)))]
     while len(chosen) < min(count, len(towards)):
         chosen.append(int(np.argmin((towards @ towards[chosen].T).max(1))))
-    rolled = np.linalg.norm(common_up) < 0.3  # cameras held every way up have no common up: take each one's own
-    return [View(towards[i], T_world_camera[i, :3, 1] if rolled else common_up) for i in chosen]
+    rolled = np.linalg.norm(common_up) < 0.3  # if cameras were held in every orientation, use the up direction of each
+    return [OrthographicView(towards[i], T_world_camera[i, :3, 1] if rolled else common_up) for i in chosen]
 
 
 def render(
-    surface: Surface,
-    view: View,
+    surface: IndexedMesh,
+    view: OrthographicView,
     colours: Float[ndarray, "v 3"] | None = None,
     height: int = 420,
     width: int = 420,
     supersampling: int = 2,
 ) -> Float[ndarray, "h w 3"]:
-    """Shaded orthographic picture on white; `colours` are per vertex, clay where None."""
+    """A shaded orthographic picture on white; `colours` are per vertex, None draws it in clay."""
     right, up, back = _view_axes(view)
     h, w = height * supersampling, width * supersampling
     used = surface.vertices[np.unique(surface.faces)] - surface.centre
@@ -99,7 +100,7 @@ def render(
     return picture.reshape(height, supersampling, width, supersampling, 3).mean((1, 3))
 
 
-def _view_axes(view: View) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], Float[ndarray, "3"]]:
+def _view_axes(view: OrthographicView) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], Float[ndarray, "3"]]:
     back = view.towards_viewer / np.linalg.norm(view.towards_viewer)
     right = np.cross(view.up, back)
     if np.linalg.norm(right) < 1e-3 * max(np.linalg.norm(view.up), 1e-300):  # looking along "up"
@@ -109,7 +110,7 @@ def _view_axes(view: View) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"], Fl
 
 
 def _shade(
-    surface: Surface,
+    surface: IndexedMesh,
     face: ndarray,
     p: Float[ndarray, "n 3"],
     colours: Float[ndarray, "v 3"] | None,
@@ -127,11 +128,11 @@ def _shade(
     light = np.abs(normal @ lamp)
     base = np.array(CLAY) if colours is None else (colours[corners] * weights[..., None]).sum(1)
     brightness = 0.38 + 0.66 * light
-    brightness = np.where(outside, brightness, 0.55 * brightness)  # inner sides are darker
+    brightness = np.where(outside, brightness, 0.55 * brightness)  # the inside is darker
     return np.clip(base * brightness[:, None], 0, 1)
 
 
-def _barycentric(surface: Surface, face: ndarray, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+def _barycentric(surface: IndexedMesh, face: ndarray, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
     a, b, c = (surface.vertices[surface.faces[face, k]] for k in range(3))
     normal = surface.face_cross[face]
     norm2 = np.maximum((normal**2).sum(1), 1e-300)
@@ -155,7 +156,7 @@ def residual_colours(
     scale: ColourScale,
     no_surface: Bool[ndarray, "n"],
 ) -> Float[ndarray, "n 3"]:
-    """Colours of residuals; grey where there is no value, blue where there is no surface at all."""
+    """Colours of residuals; grey where there is no value, blue where there is no surface."""
     rgb = scale(np.nan_to_num(values))
     rgb[np.isnan(values)] = NO_VALUE
     rgb[no_surface] = NO_SURFACE

@@ -10,15 +10,16 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.pictures import CLAY, ColourScale
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 
 MOST_TRIANGLES = 40_000  # about 1 MB in the page
 
 
 def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
-    """The mesh with at most about `most` triangles, and for each of its vertices the nearest one of the original."""
+    """The mesh reduced to about `most` triangles, and for each of its vertices the nearest one of the original."""
     if len(mesh.faces) <= most:
         return mesh, np.arange(len(mesh.vertices))
     centre = mesh.vertices.mean(0)
@@ -27,8 +28,8 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
         o3d.utility.Vector3dVector((mesh.vertices - centre) / size),
         o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
     )
-    if len(mesh.faces) > 5 * most:  # a quick coarse pass: the good decimation takes 10 s for a million triangles
-        cell = float(np.sqrt(Surface(mesh).area / (2 * most))) / size
+    if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
+        cell = float(np.sqrt(IndexedMesh(mesh).area / (2 * most))) / size
         plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Quadric)
     small = plain.simplify_quadric_decimation(most)
     vertices = np.asarray(small.vertices) * size + centre
@@ -42,8 +43,7 @@ def mesh_figure(
     values: Float[ndarray, "v"] | None,
     scale: ColourScale | None,
     units: str,
-    T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
+    poses: DevicePoses,
 ) -> str:
     """Plotly figure (JSON): the surface, coloured by `values` if given, with cameras and projectors as dots."""
     import plotly.graph_objects as go
@@ -74,8 +74,8 @@ def mesh_figure(
         )
     )  # fmt: skip
     for name, T, colour, symbol in (
-        ("cameras", T_world_camera, "#2563a8", "circle"),
-        ("projectors", T_world_projector, "#c2571a", "diamond"),
+        ("cameras", poses.T_world_camera, "#2563a8", "circle"),
+        ("projectors", poses.T_world_projector, "#c2571a", "diamond"),
     ):
         cx, cy, cz = T[:, :3, 3].T
         labels = [f"{name[:-1]} of frame {index}" for index in range(len(T))]
@@ -83,8 +83,8 @@ def mesh_figure(
             x=cx, y=cy, z=cz, mode="markers", name=name, visible="legendonly", text=labels, hoverinfo="text",
             marker={"size": 3, "color": colour, "symbol": symbol},
         )  # fmt: skip
-    up = T_world_camera[:, :3, 1].mean(0)
-    eye = T_world_camera[0, :3, 3] - small.vertices.mean(0)
+    up = poses.T_world_camera[:, :3, 1].mean(0)
+    eye = poses.T_world_camera[0, :3, 3] - small.vertices.mean(0)
     axis = {"visible": False}
     figure.update_layout(
         template="none", height=560, margin={"l": 0, "r": 0, "t": 0, "b": 0},
@@ -95,7 +95,7 @@ def mesh_figure(
         legend={"orientation": "h", "x": 0, "y": 0},
         font={"family": "inherit", "size": 12},
     )  # fmt: skip
-    return str(figure.to_json()).replace("<", "\\u003c")  # it will stand in a <script> element
+    return str(figure.to_json()).replace("<", "\\u003c")  # it goes into a <script> element
 
 
 def _xyz(v: Float[ndarray, "3"]) -> dict[str, float]:
@@ -104,7 +104,7 @@ def _xyz(v: Float[ndarray, "3"]) -> dict[str, float]:
 
 
 def compressed_script() -> str:
-    """Plotly's JavaScript, gzipped, in base64: a third of its size; the page unpacks it."""
+    """Plotly's JavaScript, gzipped, in base64: a third of its size; the page decompresses it."""
     from plotly.offline import get_plotlyjs
 
     return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 9, mtime=0)).decode()

@@ -1,4 +1,4 @@
-"""The report: one HTML file by which a person can judge a scan, without a network."""
+"""The report: one HTML file with which a person can judge a scan, without a network."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,38 +9,39 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.evaluate import Evaluation, Poses
+from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
 from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
 from sl_nerfstudio.evaluation.report.pages import page
-from sl_nerfstudio.evaluation.report.pictures import ColourScale, data_uri, render, views_of
+from sl_nerfstudio.evaluation.report.pictures import ColourScale, camera_views, data_uri, render
 from sl_nerfstudio.evaluation.report.plot3d import compressed_script, mesh_figure
 from sl_nerfstudio.evaluation.report.thumbnails import COORDINATE, EPIPOLAR, PATTERN, FrameThumbnails
-from sl_nerfstudio.evaluation.surface import Surface
 from sl_nerfstudio.evaluation.verdict import judge
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan import PoseSigma, Scan
+from sl_nerfstudio.scan import PoseSigma
 
 _TEMPLATE = "report.html.j2"
 
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What the report is made of."""
+    """What the report is made from."""
 
     evaluation: Evaluation
-    scan: Scan
-    mesh: Mesh
-    poses: Poses
+    inputs: EvaluationInputs
     thumbnails: list[FrameThumbnails]
     mesh_name: str
-    poses_name: str  # "" where the scan's own poses were evaluated
-    pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # posterior, one per frame, or empty
-    training: dict[str, Any] | None = None  # settings, versions and curves of the run, and doubts of the intrinsics
     made_at: datetime = field(default_factory=datetime.now)
+
+    @property
+    def poses_name(self) -> str:
+        """Folder and file of the evaluated poses; "" if they are the scan's own."""
+        path = self.inputs.poses_path
+        return "" if path is None else f"{path.parent.name}/{path.name}"
 
 
 @dataclass(frozen=True)
@@ -55,41 +56,39 @@ class SurfacePictures:
 
 def render_report(report: ReportInput) -> str:
     """The page as text."""
-    evaluation, scan = report.evaluation, report.scan
-    surface = Surface(report.mesh)
-    comparisons: list[Comparison] = compare_frames(
-        surface, scan, evaluation.fit, report.poses.T_world_camera, report.poses.T_world_projector
-    )
+    evaluation, scan = report.evaluation, report.inputs.scan
+    surface = IndexedMesh(report.inputs.mesh)
+    comparisons: list[Comparison] = compare_frames(surface, scan, evaluation.agreement, report.inputs.poses)
     values = {
         "report": report,
         "evaluation": evaluation,
         "scan": scan,
-        "fit": evaluation.fit,
+        "agreement": evaluation.agreement,
         "units": evaluation.units,
         "truth_units": evaluation.truth_units,
-        "verdict": judge(evaluation, intrinsics_hint(report.training, report.scan)),
+        "verdict": judge(evaluation, intrinsics_hint(report.inputs.training, report.inputs.scan)),
         "surface": _surface_pictures(report, surface),
         "comparisons": comparisons,
         "coordinate_scale": COORDINATE,
         "epipolar_scale": EPIPOLAR,
         "pattern_scale": PATTERN,
-        "fit_chart": _fit_chart(evaluation),
+        "residual_chart": _residual_chart(evaluation),
         "outliers": _outliers(evaluation),
         "changes": _pose_changes(report),
         "truth": _truth_rows(evaluation),
-        "training": _training(report.training),
+        "training": _training(report.inputs.training),
         "summary": _summary(report),
         "plotly": compressed_script(),
     }
     return page(_TEMPLATE, {"number": _number, "percent": _percent, "fixed": _fixed}, values)
 
 
-def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
+def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictures:
     values, scale = _errors(report, surface, surface.vertices)
     colours = None if values is None or scale is None else scale(values)
-    views = views_of(report.poses.T_world_camera, surface.centre)
+    views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
-    figure = mesh_figure(report.mesh, values, scale, units, report.poses.T_world_camera, report.poses.T_world_projector)
+    figure = mesh_figure(report.inputs.mesh, values, scale, units, report.inputs.poses)
     histogram = ""
     if scale is not None:
         errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])
@@ -100,7 +99,7 @@ def _surface_pictures(report: ReportInput, surface: Surface) -> SurfacePictures:
 
 
 def _errors(
-    report: ReportInput, surface: Surface, points: Float[ndarray, "n 3"]
+    report: ReportInput, surface: IndexedMesh, points: Float[ndarray, "n 3"]
 ) -> tuple[Float[ndarray, "n"] | None, ColourScale | None]:
     """Signed errors of points of the result after alignment, and their colour scale; None without reference."""
     reference = report.evaluation.reference
@@ -112,8 +111,8 @@ def _errors(
     return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
 
 
-def _fit_chart(evaluation: Evaluation) -> str:
-    frames = evaluation.fit.frames
+def _residual_chart(evaluation: Evaluation) -> str:
+    frames = evaluation.agreement.frames
     return charts.frame_bars(
         "Median residuals by frame",
         "pattern px",
@@ -127,13 +126,13 @@ def _fit_chart(evaluation: Evaluation) -> str:
 
 def _outliers(evaluation: Evaluation) -> set[str]:
     """Frames whose coordinate residual is more than twice the scan's."""
-    limit = 2 * evaluation.fit.coordinate_px_median
-    return {f.name for f in evaluation.fit.frames if not f.coordinate_px_median <= limit}
+    limit = 2 * evaluation.agreement.coordinate_px_median
+    return {f.name for f in evaluation.agreement.frames if not f.coordinate_px_median <= limit}
 
 
 @dataclass(frozen=True)
 class PoseChanges:
-    """How far the evaluated poses lie from the scan's own, and how well they are known."""
+    """How far the evaluated poses are from the scan's own, and how certain they are."""
 
     change: PoseErrors
     sigma: list[PoseSigma | None]
@@ -144,9 +143,9 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
     """None where the scan's own poses were evaluated."""
     if not report.poses_name:
         return None
-    scan, poses = report.scan, report.poses
-    change = compare_poses(poses.T_world_camera, poses.T_world_projector, scan.T_world_camera, scan.T_world_projector)
-    sigma = report.pose_sigma if any(s is not None for s in report.pose_sigma) else []
+    scan = report.inputs.scan
+    change = compare_poses(report.inputs.poses, scan.poses)
+    sigma = report.inputs.pose_sigma if any(s is not None for s in report.inputs.pose_sigma) else []
     camera, projector = change.camera, change.projector
     figures = [
         charts.frame_bars(title, unit, [charts.Bars("camera", list(c)), charts.Bars("projector", list(p))])
@@ -160,7 +159,7 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
             ("Uncertainty of position (1 sigma) by frame", scan.units, ("camera_translation", "relative_translation")),
             ("Uncertainty of rotation (1 sigma) by frame", "degrees", ("camera_rotation_deg", "relative_rotation_deg")),
         ):
-            labels = ("frame in the world", "projector against camera")
+            labels = ("frame in the world", "projector relative to camera")
             series = [
                 charts.Bars(label, [getattr(s, key) if s else math.nan for s in sigma])
                 for key, label in zip(keys, labels, strict=True)
@@ -209,25 +208,26 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 
 def _summary(report: ReportInput) -> list[tuple[str, str]]:
-    scan, fit, poses = report.scan, report.evaluation.fit, report.poses
-    baseline = np.linalg.norm(poses.T_world_camera[:, :3, 3] - poses.T_world_projector[:, :3, 3], axis=1)
-    centre = (report.mesh.vertices.min(0) + report.mesh.vertices.max(0)) / 2
+    scan, poses = report.inputs.scan, report.inputs.poses
+    frames, baseline = report.evaluation.agreement.frames, poses.baseline
+    centre = (report.inputs.mesh.vertices.min(0) + report.inputs.mesh.vertices.max(0)) / 2
     distance = np.linalg.norm(poses.T_world_camera[:, :3, 3] - centre, axis=1)
-    size = np.ptp(report.mesh.vertices, axis=0)
+    mesh = report.inputs.mesh
+    size = np.ptp(mesh.vertices, axis=0)
     cameras = sorted({f"{f.camera.w} × {f.camera.h}" for f in scan.frames})
-    decoded = np.mean([f.decoded_share for f in fit.frames])
-    scale = f"known ({scan.scale.source})" if scan.scale.known else "not known: all lengths are relative"
+    decoded = np.mean([f.decoded_share for f in frames])
+    scale = f"known ({scan.scale.source})" if scan.scale.known else "unknown: all lengths are relative"
     return [
         ("Frames", str(len(scan.frames))),
         ("Image size", ", ".join(cameras) + " pixels"),
         ("Projector", f"{scan.projector.w} × {scan.projector.h} pixels, model {scan.projector.model}"),
         ("Unit", scan.units),
         ("Scale", scale if scan.scale.source or not scan.scale.known else "known"),
-        ("Pixels with pattern", f"{sum(f.pixels for f in fit.frames):,}, of which {decoded:.0%} were decoded"),
+        ("Pixels with pattern", f"{sum(f.pixels for f in frames):,}, of which {decoded:.0%} were decoded"),
         ("Distance of the cameras", f"{np.median(distance):.4g} {scan.units} (median)"),
         ("Camera to projector", f"{np.median(baseline):.4g} {scan.units} (median), "
          f"{np.min(baseline):.4g} to {np.max(baseline):.4g}"),
-        ("Mesh", f"{len(report.mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
+        ("Mesh", f"{len(mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
     ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Residual maps of every frame, small, collected while the frames stream past."""
+"""Small residual maps of every frame, made while the frames are evaluated one by one."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.capture_fit import FrameFit, FramePixels
+from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement, FramePixels
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, data_uri, pixel_map, residual_colours, shrink
 from sl_nerfstudio.scan import Frame
 
@@ -18,23 +18,23 @@ _SIDE = 150
 
 @dataclass(frozen=True)
 class FrameThumbnails:
-    """Data addresses of one frame's maps."""
+    """One frame's maps as data addresses."""
 
     name: str
-    figures: FrameFit
+    figures: FrameAgreement
     coordinate: str
     epipolar: str
     pattern: str
 
 
-class ThumbnailCollector:
-    """Makes the small maps of each frame it is shown; usable as `evaluate`'s `on_frame`."""
+class ResidualThumbnails:
+    """Makes the small maps of each frame it gets; meant as the `on_frame` of `evaluate`."""
 
     def __init__(self) -> None:
         self.frames: list[FrameThumbnails] = []
 
-    def __call__(self, frame: Frame, figures: FrameFit, pixels: FramePixels) -> None:
-        """Take one frame in."""
+    def __call__(self, frame: Frame, figures: FrameAgreement, pixels: FramePixels) -> None:
+        """Add one frame."""
         missed = ~pixels.hit
         difference = np.abs(pixels.captured - pixels.rendered * brightness_ratio(pixels))
         self.frames.append(
@@ -49,7 +49,7 @@ class ThumbnailCollector:
 
 
 def brightness_ratio(pixels: FramePixels) -> float:
-    """Factor that brings the rendered pattern to the captured one's brightness, in least squares."""
+    """Least-squares factor from the brightness of the rendered to that of the captured pattern."""
     known = pixels.lit & np.isfinite(pixels.rendered)
     a, b = pixels.captured[known], pixels.rendered[known]
     return float(a @ b / (b @ b)) if (b @ b) > 0 else 1.0

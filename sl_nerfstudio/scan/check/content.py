@@ -1,4 +1,4 @@
-"""Pixels of a scan: coordinates, masks, pattern images. One frame in memory at a time."""
+"""The pixels of a scan: coordinates, masks, pattern images. One frame in memory at a time."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from sl_nerfstudio.scan.problem import Faults, Problem
 
 @dataclass(frozen=True)
 class FrameContent:
-    """What is remembered of a frame after its pixels were looked at."""
+    """What is kept of a frame after its pixels were checked."""
 
     name: str
     digest: bytes | None  # of image and coordinates; None if either could not be read
@@ -32,49 +32,49 @@ class FrameContent:
     shift: Float64[ndarray, "2"] | None  # what to add to the coordinates for the pattern to fit; None if unclear
 
 
-def check_pattern(draft: PartialScan, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
+def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
     """The projected pattern in [0, 1]; None after adding a fault."""
-    if draft.pattern_path is None or draft.pattern_path not in good:
+    if partial.pattern_path is None or partial.pattern_path not in good:
         return None
-    pattern = _read_image(draft.pattern_path, draft, None, faults)
+    pattern = _read_image(partial.pattern_path, partial, None, faults)
     if pattern is None:
         return None
     if pattern.min() == pattern.max():
-        faults.add(_nothing_in_it("the pattern"), relative(draft.pattern_path, draft.root))
+        faults.add(_nothing_in_it("the pattern"), relative(partial.pattern_path, partial.root))
         return None
     return as_grey(pattern)
 
 
 def check_content(
     frame: PartialFrame,
-    draft: PartialScan,
+    partial: PartialScan,
     pattern: Float32[ndarray, "rows columns"] | None,
     good: set[Path],
     faults: Faults,
 ) -> FrameContent:
-    """Decode all files of a frame that are in `good`, and add what is wrong with their pixels."""
+    """Decode all files of a frame that are in `good`, and report what is wrong with their pixels."""
     image_path, pattern_path, coords_path, mask_path = (
         path if (path := frame.paths.get(key)) in good else None
         for key in ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path")
     )
-    coords = None if coords_path is None else _check_coords(coords_path, frame, draft, faults)
-    mask = None if mask_path is None else _check_mask(mask_path, frame, draft, faults)
+    coords = None if coords_path is None else _check_coords(coords_path, frame, partial, faults)
+    mask = None if mask_path is None else _check_mask(mask_path, frame, partial, faults)
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
     both = None if decoded is None else (decoded if mask is None else decoded & mask)
     if mask_path and coords_path and mask is not None and decoded is not None:
         for problem in _together_problems(mask, decoded):
-            faults.add(problem, relative(mask_path, draft.root), frame.name)
-    image = None if image_path is None else _read_image(image_path, draft, frame.name, faults)
+            faults.add(problem, relative(mask_path, partial.root), frame.name)
+    image = None if image_path is None else _read_image(image_path, partial, frame.name, faults)
     shown, shown_path = image, image_path
     if "sl_pattern_path" in frame.paths:
         shown_path = pattern_path
-        shown = None if pattern_path is None else _read_image(pattern_path, draft, frame.name, faults)
+        shown = None if pattern_path is None else _read_image(pattern_path, partial, frame.name, faults)
     compared = where if both is None else both
     if shown is not None and shown_path is not None and compared is not None and compared.shape == shown.shape[:2]:
         inside = shown[compared]
         if inside.size and inside.min() == inside.max():
-            faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, draft.root), frame.name)
+            faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, partial.root), frame.name)
     digest = None if image is None or coords is None else _digest(image, coords)
     shift = None
     if coords is not None and both is not None and shown is not None and pattern is not None:
@@ -84,7 +84,7 @@ def check_content(
         digest,
         0.0 if where is None else float(where.mean()),
         0.0 if both is None or where is None or not where.any() else float(both.sum() / where.sum()),
-        _correspondences(frame, draft, coords, both),
+        _correspondences(frame, partial, coords, both),
         shift,
     )
 
@@ -100,30 +100,30 @@ def duplicate_problems(contents: list[FrameContent]) -> Iterator[tuple[str, Prob
             yield (
                 content.name,
                 Problem(
-                    f"has the very image and coordinates of frame {first}",
+                    f"has the same image and coordinates as frame {first}",
                     "a frame was copied under another name",
-                    "remove the copy; a frame counted twice weighs twice and makes uncertainties look too small",
+                    "remove the copy; a frame counted twice makes uncertainties look too small",
                 ),
             )
 
 
 def _check_coords(
-    path: Path, frame: PartialFrame, draft: PartialScan, faults: Faults
+    path: Path, frame: PartialFrame, partial: PartialScan, faults: Faults
 ) -> Float32[ndarray, "h w 2"] | None:
-    name = relative(path, draft.root)
+    name = relative(path, partial.root)
     try:
         coords = read_coords(path)
     except FileError as error:
         faults.add(error, name, frame.name)
         return None
-    problems = list(coordinate_problems(coords, draft.projector))
+    problems = list(coordinate_problems(coords, partial.projector))
     for problem in problems:
         faults.add(problem, name, frame.name)
     return None if problems else coords
 
 
-def _check_mask(path: Path, frame: PartialFrame, draft: PartialScan, faults: Faults) -> Bool[ndarray, "h w"] | None:
-    mask = _read_image(path, draft, frame.name, faults)
+def _check_mask(path: Path, frame: PartialFrame, partial: PartialScan, faults: Faults) -> Bool[ndarray, "h w"] | None:
+    mask = _read_image(path, partial, frame.name, faults)
     if mask is None:
         return None
     full = np.iinfo(mask.dtype).max
@@ -136,44 +136,42 @@ def _check_mask(path: Path, frame: PartialFrame, draft: PartialScan, faults: Fau
             "mark the pixels where the pattern falls on the object with 255, or leave the frame out",
         )
     elif values.max() == 1:
-        problem = Problem(
-            "has 0 and 1 instead of 0 and 255", "truth values were saved as they are", "multiply it by 255"
-        )
+        problem = Problem("has 0 and 1 instead of 0 and 255", "booleans were saved unchanged", "multiply it by 255")
     elif not set(values.tolist()) <= {0, full}:
         between = [value for value in values.tolist() if value not in (0, full)]
         problem = Problem(
             f"has grey levels between black and white ({between[0]}{', ..' if len(between) > 1 else ''})",
-            "it was resized or saved with loss, or is another kind of image",
-            f"save it with 0 and {full} alone, without loss",
+            "it was resized or saved with lossy compression, or is another kind of image",
+            f"save it with 0 and {full} only, without lossy compression",
         )
     if problem is None:
         return mask == full
-    faults.add(problem, relative(path, draft.root), frame.name)
+    faults.add(problem, relative(path, partial.root), frame.name)
     return None
 
 
 def _together_problems(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "h w"]) -> Iterator[Problem]:
     if mask.shape == decoded.shape and decoded.any() and not (mask & decoded).any():
         yield Problem(
-            "leaves out every pixel that has coordinates",
-            "it is inverted, or belongs to another frame",
+            "excludes every pixel that has coordinates",
+            "it is inverted, or is the mask of another frame",
             "mark with 255 where the pattern falls on the object, with 0 elsewhere",
         )
 
 
-def _read_image(path: Path, draft: PartialScan, frame: str | None, faults: Faults) -> ndarray | None:
+def _read_image(path: Path, partial: PartialScan, frame: str | None, faults: Faults) -> ndarray | None:
     try:
         return read_image(path)
     except FileError as error:
-        faults.add(error, relative(path, draft.root), frame)
+        faults.add(error, relative(path, partial.root), frame)
         return None
 
 
 def _nothing_in_it(what: str) -> Problem:
     return Problem(
-        f"has one and the same value everywhere in {what}",
+        f"has the same value everywhere in {what}",
         "an empty export, a covered lens, or a projector that was off",
-        "give the picture of the pattern; without contrast nothing can be compared with it",
+        "give an image of the pattern; without contrast nothing can be compared with it",
     )
 
 
@@ -185,11 +183,11 @@ def _digest(image: ndarray, coords: Float32[ndarray, "h w 2"]) -> bytes:
 
 def _correspondences(
     frame: PartialFrame,
-    draft: PartialScan,
+    partial: PartialScan,
     coords: Float32[ndarray, "h w 2"] | None,
     where: Bool[ndarray, "h w"] | None,
 ) -> Correspondences | None:
-    if coords is None or where is None or not where.any() or draft.projector is None:
+    if coords is None or where is None or not where.any() or partial.projector is None:
         return None
     if frame.camera is None or frame.T_world_camera is None or frame.T_world_projector is None:
         return None

@@ -1,8 +1,8 @@
-"""Do poses and coordinates mean what this format says? Decided by triangulating correspondences.
+"""Do poses and coordinates follow the conventions of this format? Decided by triangulating correspondences.
 
-Starting poses may be rough: frames out of place by 10 degrees, relative poses by a few. A mix-up is therefore reported
-only where the poses as given fit badly *and* one known mix-up, undone, makes them fit several times better; or where
-nearly all frames are beyond what any calibration error can do.
+Starting poses may be rough: frames wrong by 10 degrees, relative poses by a few. A mistake is therefore reported only
+if the poses as given fit badly *and* undoing one known mistake makes them fit several times better; or if nearly all
+frames are worse than any calibration error can make them.
 """
 
 from collections.abc import Iterable, Sequence
@@ -10,40 +10,40 @@ from collections.abc import Iterable, Sequence
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.check.convention_words import APART, describe, hopeless, key_of, wrong_unit
 from sl_nerfstudio.scan.check.correspondences import Correspondences
-from sl_nerfstudio.scan.check.readings import (
-    Reading,
-    ReadingFit,
-    apply_reading,
+from sl_nerfstudio.scan.check.interpretations import (
+    GeometricFit,
+    Interpretation,
+    apply_interpretation,
     distance_to_others,
-    fit_reading,
-    other_readings,
+    fit_geometry,
+    other_interpretations,
 )
 from sl_nerfstudio.scan.problem import Problem
 
-# Epipolar residuals as fractions of the projector's focal length: angles in radian.
+# Epipolar residuals as fractions of the projector's focal length: angles in radians.
 _SUSPECT = 0.01  # 0.6 degrees: worse than auto-calibration usually is
 _SUSPECT_FRAME = 0.05  # of one frame among good ones
-_FITS = 0.05  # the most that a reading which "fits" may leave
-_HOPELESS = 0.35  # 19 degrees: no error of a calibration
-_MUCH_BETTER = 0.2  # factor by which the right reading must lower the residual
-_MUCH_CLOSER = 0.4  # factor by which the right reading must lower that distance
-_ONE_SURFACE = 0.1  # the most it may leave, in working distances, with frames out of place by 10 degrees
+_FITS = 0.05  # the largest residual of an interpretation that "fits"
+_HOPELESS = 0.35  # 19 degrees: no calibration is that wrong
+_MUCH_BETTER = 0.2  # factor by which the right interpretation must lower the residual
+_MUCH_CLOSER = 0.4  # factor by which the right interpretation must lower the distance between surfaces
+_ONE_SURFACE = 0.1  # the largest distance it may leave, in working distances, with frames wrong by 10 degrees
 _MOST = 0.9  # share of hopeless frames that makes a scan hopeless
-_NEAREST, _FARTHEST = 1e-3, 100.0  # metres; working distances outside are a unit's mistake
+_NEAREST, _FARTHEST = 1e-3, 100.0  # metres; working distances outside this range mean a wrong unit
 
 
 def convention_problems(
     frames: Sequence[Correspondences], projector: Device, metres: float | None
 ) -> Iterable[tuple[str | None, str, Problem]]:
-    """(frame or None, key, problem) of poses, coordinates and units that cannot be meant as they stand.
+    """(frame or None, key, problem) of poses, coordinates and units that cannot be right as they are.
 
-    `metres` is the length of the scan's unit, None if not known.
+    `metres` is the length of the scan's unit, None if unknown.
     """
-    given = fit_reading(frames, projector)
+    given = fit_geometry(frames, projector)
     focal = (projector.fl_x + projector.fl_y) / 2
-    reading = _better_reading(frames, projector, given, focal)
-    if reading is not None:
-        yield None, key_of(reading), describe(reading, given)
+    interpretation = _better_interpretation(frames, projector, given, focal)
+    if interpretation is not None:
+        yield None, key_of(interpretation), describe(interpretation, given)
         return
     lost = given.residual_px > _HOPELESS * focal
     if lost.mean() >= _MOST:
@@ -51,57 +51,57 @@ def convention_problems(
         return
     if len(frames) > 2:
         for index, frame in enumerate(frames):
-            own = _better_reading_of_frame(frames, index, projector, given, focal)
+            own = _better_interpretation_of_frame(frames, index, projector, given, focal)
             if own is not None:
                 yield frame.name, key_of(own), describe(own, given, index)
     if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
         yield None, "units", wrong_unit(given.depth * metres)
 
 
-def _better_reading(
-    frames: Sequence[Correspondences], projector: Device, given: ReadingFit, focal: float
-) -> Reading | None:
-    """The mix-up that, undone, makes the whole scan fit; None if it fits as it is or nothing helps."""
+def _better_interpretation(
+    frames: Sequence[Correspondences], projector: Device, given: GeometricFit, focal: float
+) -> Interpretation | None:
+    """The interpretation under which the whole scan fits; None if it fits as it is, or nothing helps."""
     if given.typical_px <= _SUSPECT * focal and given.typical_spread <= APART:
         return None
-    found: list[tuple[float, Reading]] = []
-    for reading in other_readings():
-        fit = fit_reading([apply_reading(reading, frame, projector) for frame in frames], projector)
+    found: list[tuple[float, Interpretation]] = []
+    for interpretation in other_interpretations():
+        fit = fit_geometry([apply_interpretation(interpretation, frame, projector) for frame in frames], projector)
         if _explains(given.typical_px, given.typical_spread, fit.typical_px, fit.typical_spread, focal):
-            found.append((_badness(fit.typical_px, fit.typical_spread, focal), reading))
+            found.append((_badness(fit.typical_px, fit.typical_spread, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None
 
 
-def _better_reading_of_frame(
-    frames: Sequence[Correspondences], index: int, projector: Device, given: ReadingFit, focal: float
-) -> Reading | None:
-    """The mix-up that, undone in one frame alone, makes it fit the others."""
+def _better_interpretation_of_frame(
+    frames: Sequence[Correspondences], index: int, projector: Device, given: GeometricFit, focal: float
+) -> Interpretation | None:
+    """The interpretation of one frame alone under which it fits the others."""
     residual, spread = float(given.residual_px[index]), float(given.spread[index])
     if given.depth == 0 or (residual <= _SUSPECT_FRAME * focal and spread <= APART):
         return None
-    found: list[tuple[float, Reading]] = []
-    for reading in other_readings():
-        alone = fit_reading([apply_reading(reading, frames[index], projector)], projector)
+    found: list[tuple[float, Interpretation]] = []
+    for interpretation in other_interpretations():
+        alone = fit_geometry([apply_interpretation(interpretation, frames[index], projector)], projector)
         px, cloud = alone.typical_px, alone.clouds[0]
         if px > _FITS * focal:
             continue
         apart = distance_to_others(cloud, given.clouds, index) / given.depth
         if apart < APART and _explains(residual, spread, px, apart, focal):
-            found.append((_badness(px, apart, focal), reading))
+            found.append((_badness(px, apart, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None
 
 
 def _explains(px_before: float, spread_before: float, px: float, spread: float, focal: float) -> bool:
-    """Whether a reading fits, and so much better than the one before that chance is out of the question."""
+    """Whether an interpretation fits, and so much better than the one before that it cannot be chance."""
     if px > _FITS * focal:
         return False
     if px_before > _SUSPECT * focal and px < _MUCH_BETTER * px_before:
         return px < _SUSPECT * focal or spread <= max(APART, spread_before)
-    # The rays meet as well in either reading: only the agreement of the frames tells. Views that never overlap
-    # (a room seen from its middle) may come nearer to each other in a wrong reading, but not to one surface.
+    # The rays meet equally well in both: only the agreement of the frames decides. Views that never overlap
+    # (a room seen from its middle) may come closer to each other when misinterpreted, but not to one surface.
     return spread_before > APART and spread < min(_MUCH_CLOSER * spread_before, _ONE_SURFACE) and px < 2 * px_before + 1
 
 
 def _badness(px: float, spread: float, focal: float) -> float:
-    """Orders readings that fit: both parts are about 0.01 where a good scan is read rightly."""
+    """Orders interpretations that fit: both parts are about 0.01 for a good scan interpreted correctly."""
     return px / focal + min(spread, 1.0)

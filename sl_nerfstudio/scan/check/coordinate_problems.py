@@ -10,17 +10,17 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
 from sl_nerfstudio.scan.problem import Problem
 
-_OUTSIDE = 0.05  # of the pattern's size: this far beyond its border a decoder may extrapolate
-_MANY_OUTSIDE = 0.05  # share of the pixels that may lie farther out: wrong decodings
-_ABSURD = 4.0  # pattern sizes beyond the border where no decoder puts a pixel
+_OUTSIDE = 0.05  # of the pattern's size: a decoder may extrapolate this far beyond the border
+_MANY_OUTSIDE = 0.05  # share of the pixels that may be farther out: wrong decodings
+_ABSURD = 4.0  # pattern sizes: no decoder puts a pixel this far beyond the border
 _SENTINELS = ((-1.0, -1.0), (0.0, 0.0))
-_MANY_EQUAL = 0.02  # share of the decoded pixels with one value: neighbours may share a coordinate, not these
+_MANY_EQUAL = 0.02  # share of the decoded pixels with one value; neighbours may share a coordinate, but not so many
 _FEW = 20
 
 
 def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | None) -> Iterator[Problem]:
-    """Everything that is wrong with one frame's coordinates; without a projector what can be said without one."""
-    x, y = coords[..., 0], coords[..., 1]  # apart: numpy is slow along an axis of two
+    """Everything that is wrong with one frame's coordinates; fewer checks if the projector is None."""
+    x, y = coords[..., 0], coords[..., 1]  # separately: numpy is slow along an axis of two
     infinite = int((np.isinf(x) | np.isinf(y)).sum())
     if infinite:
         yield Problem(
@@ -34,7 +34,7 @@ def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | N
     if half:
         yield Problem(
             f"has only one of x_p and y_p at {half} pixels",
-            "the two were decoded apart and not brought together",
+            "the two were decoded separately and not combined",
             "write NaN for both where either is missing",
         )
     values = coords[has_x & has_y]
@@ -52,7 +52,7 @@ def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | N
     if (values == np.floor(values)).all():
         yield Problem(
             "holds whole numbers only",
-            "numbers of pixels, as Gray-code decoders give them; here the centre of a pixel is at .5",
+            "they are pixel indices, as Gray-code decoders give them; here the centre of a pixel is at .5",
             "add 0.5 to both coordinates",
         )
     if projector is not None:
@@ -82,14 +82,16 @@ def _range_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Itera
     if (size > 8).all() and (low >= -1.01).all() and (high <= 1.01).all():
         yield Problem(
             f"lies between -1 and 1 ({span})",
-            "normalised coordinates",
+            "the coordinates are normalised",
             "store pattern pixels: multiply by the pattern's size, x to the right and y down",
         )
         return
     outside, absurd = _beyond(values, size, _OUTSIDE), _beyond(values, size, _ABSURD)
     if outside.mean() > _MANY_OUTSIDE or absurd.any():
         many = bool(outside.mean() > _MANY_OUTSIDE)
-        share = f"{100 * outside.mean():.0f} % of the pixels" if many else f"{absurd.sum()} pixels"
+        count = int(absurd.sum())
+        some = "1 pixel" if count == 1 else f"{count} pixels"
+        share = f"{100 * outside.mean():.0f} % of the pixels" if many else some
         yield Problem(
             f"puts {share} outside the pattern ({span})",
             _outside_cause(values, size, many),
@@ -107,10 +109,10 @@ def _beyond(values: Float32[ndarray, "n 2"], size: Float32[ndarray, "2"], margin
 
 def _outside_cause(values: Float32[ndarray, "n 2"], size: Float32[ndarray, "2"], many: bool) -> str:
     if not many:
-        return "a marker for 'not decoded', or a decoder that ran away"
+        return "a marker for 'not decoded', or a decoder that diverged"
     if _beyond(values, size[::-1], _OUTSIDE).mean() <= _MANY_OUTSIDE:
-        return "x and y are exchanged: the other way round they fit the pattern"
-    return "coordinates of a pattern of another size, or in another unit"
+        return "x and y are swapped: the other way round they fit the pattern"
+    return "they are coordinates of a pattern of another size, or in another unit"
 
 
 def _doe_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Iterator[Problem]:
@@ -118,7 +120,7 @@ def _doe_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Iterato
     beyond = int((~directions.isfinite().all(-1)).sum())
     if beyond:
         yield Problem(
-            f"has {beyond} pixels to which the DOE projector sends no light: beyond 90 degrees from its axis",
-            "the focal lengths of the projector are too small, or it is no DOE",
+            f"has {beyond} pixels more than 90 degrees from the axis of the DOE projector, where it sends no light",
+            "the focal lengths of the projector are too small, or it is not a DOE",
             "check fl_x, fl_y and model of the projector",
         )

@@ -1,4 +1,4 @@
-"""A few hundred correspondences of each frame, kept while the frames stream past."""
+"""A few hundred correspondences of each frame, kept while the frames are read one by one."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 
-SAMPLES = 400  # a frame; enough for a median, little enough to try dozens of readings of the poses
+SAMPLES = 400  # per frame; enough for a median, few enough to try dozens of interpretations
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Camera pixels and pattern coordinates of one frame, with all that is needed to triangulate them."""
+    """Camera pixels and pattern coordinates of one frame, with everything needed to triangulate them."""
 
     name: str
     camera: Device

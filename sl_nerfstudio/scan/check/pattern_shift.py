@@ -1,7 +1,7 @@
-"""Are coordinates shifted against the pattern, as by counting pixels from their centres instead of their corners?
+"""Are coordinates shifted relative to the pattern, for example because pixels are counted from their centres?
 
-The pattern, looked up at the coordinates, must resemble the captured pattern; by how much the coordinates should be
-moved to resemble it most is read off the correlation at five places. Poses play no part in it.
+The pattern, looked up at the coordinates, must resemble the captured pattern. The shift that makes the two most alike
+is estimated from the correlation at five places. Poses are not used.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,10 @@ from numpy import ndarray
 from sl_nerfstudio.scan.problem import Problem
 
 _STEP = 1.0  # px
-_PIXELS = 20000  # of a frame that are looked at
+_PIXELS = 20000  # of a frame that are used
 _FEWEST = 500
-_ALIKE = 0.6  # correlation below which the pattern is not recognised well enough to tell
-_FLAT = 0.002  # fall of the correlation over a step below which an axis is not determined (stripes)
+_ALIKE = 0.6  # correlation below which the pattern is not recognised well enough
+_FLAT = 0.002  # change of the correlation over a step below which an axis is undetermined (stripes)
 _HALF, _TOLERANCE, _TOLERANCE_FRAME = 0.5, 0.12, 0.25
 _MOST = 0.8  # share of the frames that must show the same shift
 _FEWEST_FRAMES = 2
@@ -28,7 +28,7 @@ def pattern_shift(
     captured: Float32[ndarray, "h w"],
     pattern: Float32[ndarray, "rows columns"],
 ) -> Float64[ndarray, "2"] | None:
-    """What to add to the coordinates of one frame, in pattern pixels, for the best resemblance; None if unclear."""
+    """What to add to the coordinates of one frame, in pattern pixels, for the best match; None if unclear."""
     chosen = np.flatnonzero(where)
     chosen = chosen[:: max(1, len(chosen) // _PIXELS)]
     if len(chosen) < _FEWEST:
@@ -47,20 +47,20 @@ def pattern_shift(
 
 
 def shift_problems(shifts: Sequence[Float64[ndarray, "2"] | None]) -> Iterator[Problem]:
-    """A shift by half a pixel, the same in all frames: another convention, no error of decoding."""
+    """A shift by half a pixel, the same in all frames: another convention, not a decoding error."""
     known = [shift for shift in shifts if shift is not None]
     if len(known) < _FEWEST_FRAMES:
         return
     middle = np.median(known, axis=0)
-    sign = np.sign(middle[0])
+    sign = np.copysign(1.0, middle[0])  # np.sign would call a shift of exactly 0 half a pixel
     half = sign * _HALF
     same = np.abs(np.array(known) - half).max(1) < _TOLERANCE_FRAME
     if np.abs(middle - half).max() < _TOLERANCE and same.mean() >= _MOST:
         yield Problem(
-            f"are shifted against the pattern by half a pixel in x and y, in {same.sum()} of {len(known)} frames",
-            "pixel centres at whole numbers (OpenCV) instead of at .5"
+            f"are shifted relative to the pattern by half a pixel in x and y, in {same.sum()} of {len(known)} frames",
+            "pixel centres are at whole numbers (OpenCV) instead of at .5"
             if sign > 0
-            else "half a pixel was added although it was there already",
+            else "half a pixel was added although it was already there",
             f"{'add 0.5 to' if sign > 0 else 'subtract 0.5 from'} both coordinates everywhere",
         )
 
@@ -73,7 +73,7 @@ def _correlation(
 
 
 def _look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n"]:
-    """Bilinear, the border's value outside."""
+    """Bilinear interpolation; outside, the value at the border."""
     rows, columns = pattern.shape
     x, y = np.clip(uv[:, 0] - 0.5, 0, columns - 1), np.clip(uv[:, 1] - 0.5, 0, rows - 1)
     x0, y0 = np.minimum(x.astype(np.int64), max(columns - 2, 0)), np.minimum(y.astype(np.int64), max(rows - 2, 0))

@@ -1,4 +1,4 @@
-"""What the frames say about every vertex of a mesh: seen and confirmed, seen only, seen and denied, or not seen."""
+"""For every vertex of a mesh, how many frames see it, and how many of them confirm or contradict it."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from scipy.ndimage import binary_dilation
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, transform
@@ -18,45 +19,46 @@ from sl_nerfstudio.scan.types import Frame, Scan
 
 LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
-LEAST_PX (decoding noise stays below it) and MOST_PX (beyond, the poses are too bad to confirm anything)."""
+LEAST_PX (decoding noise is smaller) and MOST_PX (with larger errors, the poses are too wrong to confirm anything)."""
 
 OFF_MASK_PX = 3
-"""Farther than this beside the mask, in camera pixels, a vertex that should be lit is none of the object's. Nearer,
-poses and the mask's border may be to blame, and a frame's word against the vertex counts half."""
+"""A vertex that should be lit but projects farther than this outside the mask, in camera pixels, is not on the object.
+If it is closer, the poses or the border of the mask may be slightly wrong, and the contradiction counts half."""
 
-ENOUGH = 3  # confirmations more than denials: further frames are not asked about the vertex
+ENOUGH = 3  # a vertex with this many more confirmations than contradictions is not checked in further frames
 
 
 @dataclass(frozen=True)
-class Votes:
-    """Number of frames that should see and light each vertex, by what they decoded there."""
+class FrameCounts:
+    """Number of frames that should see and light each vertex, by what was decoded there."""
 
     confirmed: Int64[ndarray, "v"]  # the decoded coordinate is the one that the vertex predicts
-    silent: Int64[ndarray, "v"]  # the pattern falls there, but what was decoded nearby, if anything, proves nothing
-    denied: Int64[ndarray, "v"]  # another coordinate was decoded, or the pattern does not fall there although it should
-    beside: Int64[ndarray, "v"]  # the pattern does not fall there, but it does within OFF_MASK_PX
+    inconclusive: Int64[ndarray, "v"]  # in the mask, but what was decoded nearby, if anything, proves nothing
+    contradicted: Int64[ndarray, "v"]  # another coordinate was decoded, or the vertex is outside the mask
+    near_mask: Int64[ndarray, "v"]  # the vertex is outside the mask, but within OFF_MASK_PX of it
     residual_px: Float[ndarray, "n"]  # median of each frame; NaN where nothing was decoded on the mesh
 
     @property
     def against(self) -> Float[ndarray, "v"]:
-        """What speaks against each vertex, in denials.
+        """Weighted number of contradictions of each vertex; frames that see it just outside the mask count half.
 
-        Frames that look along a surface cannot tell how far it reaches: at the lower edge of a plate they confirm what
-        lies a pixel below it, which is a millimetre there, while those that face it see the vertex beside the mask.
+        A frame that looks along a surface cannot show where the surface ends. At the lower edge of a plate it confirms
+        what is a pixel below, which is a millimetre there, while frames that face the plate see the vertex just outside
+        the mask.
         """
-        return self.denied + 0.5 * self.beside
+        return self.contradicted + 0.5 * self.near_mask
 
     @property
-    def settled(self) -> Bool[ndarray, "v"]:
-        """Vertices about which no further frame is asked."""
+    def decided(self) -> Bool[ndarray, "v"]:
+        """Vertices that need not be checked in further frames."""
         return self.confirmed - self.against >= ENOUGH
 
 
 class Occluder:
-    """Tells whether a mesh stands between its own vertices and a device."""
+    """Finds out whether a mesh hides its own vertices from a device."""
 
     def __init__(self, mesh: Mesh) -> None:
-        """`mesh` may be open; both of its sides hide what lies behind them."""
+        """`mesh` may be open; both of its sides hide what is behind them."""
         import open3d as o3d
 
         self._o3d = o3d
@@ -70,9 +72,10 @@ class Occluder:
     def hidden(
         self, points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]
     ) -> Bool[ndarray, "n"]:
-        """Whether the mesh stands between points on it, facing `eye`, and `eye`.
+        """Whether the mesh is between `eye` and points on the mesh that face `eye`.
 
-        Rays start two edge lengths off the surface, along the normal and towards the eye, so that none hits its own.
+        Rays start two edge lengths away from the surface, along the normal and towards the eye, so that they do not hit
+        the triangles they start from.
         """
         way = eye - points
         distance = np.sqrt(_dot(way, way))[:, None]
@@ -81,68 +84,60 @@ class Occluder:
         return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
-def collect_votes(
-    mesh: Mesh,
-    occluder: Occluder,
-    scan: Scan,
-    T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
-    before: Votes | None = None,
-) -> Votes:
-    """Ask every frame about every vertex that is not settled; one frame's mask and coordinates are in memory at a time.
+def count_frames(
+    mesh: Mesh, occluder: Occluder, scan: Scan, poses: DevicePoses, before: FrameCounts | None = None
+) -> FrameCounts:
+    """Check every undecided vertex in every frame; one frame's mask and coordinates are in memory at a time.
 
-    `before`: votes with more occluders. What was settled then stays so, the others are asked anew.
+    `before` are the counts with more occluders: vertices decided there stay as they are, the others are counted again.
     """
-    votes = _begin(mesh, before)
-    confirmed, silent, denied, beside = votes.confirmed, votes.silent, votes.denied, votes.beside
+    counts = _begin(mesh, before)
     normals = mesh.vertex_normals()
     medians: list[float] = []
-    # A frame's median must not come from disputed vertices alone: some are asked to the end.
+    # A frame's median must not come from doubtful vertices alone: some are checked in all frames.
     always = np.arange(len(mesh.vertices)) % 8 == 0
-    still_open = ~votes.settled
-    poses = list(zip(scan.frames, T_world_camera, T_world_projector, strict=True))
-    for frame, T_camera, T_projector in track(poses, "cutting to what was observed"):
-        asked = np.flatnonzero(always | ~votes.settled)
-        view = observe_vertices(
-            mesh.vertices[asked], normals[asked], occluder, frame, scan.projector, T_camera, T_projector
+    was_undecided = ~counts.decided
+    frames = list(zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True))
+    for frame, T_camera, T_projector in track(frames, "trimming to what was observed"):
+        checked = np.flatnonzero(always | ~counts.decided)
+        view = visible_vertices(
+            mesh.vertices[checked], normals[checked], occluder, frame, scan.projector, T_camera, T_projector
         )
-        vertex = asked[view.vertex]
+        vertex = checked[view.vertex]
         known = view.most[always[vertex] & np.isfinite(view.most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
         agrees, differs = view.most <= threshold, (view.least > threshold) | view.off_mask
-        new = still_open[vertex]
-        confirmed[vertex] += new & agrees
-        denied[vertex] += new & differs
-        beside[vertex] += new & view.beside
-        silent[vertex] += new & ~agrees & ~differs & ~view.beside
-    return replace(votes, residual_px=np.array(medians))
+        new = was_undecided[vertex]
+        counts.confirmed[vertex] += new & agrees
+        counts.contradicted[vertex] += new & differs
+        counts.near_mask[vertex] += new & view.near_mask
+        counts.inconclusive[vertex] += new & ~agrees & ~differs & ~view.near_mask
+    return replace(counts, residual_px=np.array(medians))
 
 
-def _begin(mesh: Mesh, before: Votes | None) -> Votes:
-    """No votes, but those of settled vertices."""
+def _begin(mesh: Mesh, before: FrameCounts | None) -> FrameCounts:
+    """Zero for every vertex, except for those that are decided."""
     if before is None:
-        confirmed, silent, denied, beside = np.zeros((4, len(mesh.vertices)), dtype=np.int64)
+        counts = np.zeros((4, len(mesh.vertices)), dtype=np.int64)
     else:
-        kept = before.settled
-        confirmed, silent, denied, beside = (
-            np.where(kept, v, 0) for v in (before.confirmed, before.silent, before.denied, before.beside)
-        )
-    return Votes(confirmed, silent, denied, beside, np.zeros(0))
+        earlier = np.stack([before.confirmed, before.inconclusive, before.contradicted, before.near_mask])
+        counts = np.where(before.decided, earlier, 0)
+    return FrameCounts(*counts, residual_px=np.zeros(0))
 
 
 @dataclass(frozen=True)
-class FrameObservation:
-    """What one frame says about the vertices that it should see and light; distances in pattern pixels."""
+class VisibleVertices:
+    """The vertices that one frame should see and light, compared with what it decoded; distances in pattern pixels."""
 
     vertex: Int64[ndarray, "m"]
-    off_mask: Bool[ndarray, "m"]  # the pattern does not fall there, nor within OFF_MASK_PX
-    beside: Bool[ndarray, "m"]  # it does not fall there, but within OFF_MASK_PX
-    least: Float[ndarray, "m"]  # distance of the decoded from the predicted coordinate: at least; NaN if not known
-    most: Float[ndarray, "m"]  # at most
+    off_mask: Bool[ndarray, "m"]  # farther than OFF_MASK_PX outside the mask
+    near_mask: Bool[ndarray, "m"]  # outside the mask, but within OFF_MASK_PX of it
+    least: Float[ndarray, "m"]  # lower bound of the distance between decoded and predicted coordinate; NaN if unknown
+    most: Float[ndarray, "m"]  # upper bound
 
 
-def observe_vertices(
+def visible_vertices(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
     occluder: Occluder,
@@ -150,10 +145,10 @@ def observe_vertices(
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> FrameObservation:
-    """What a frame says about the vertices that it should see and light.
+) -> VisibleVertices:
+    """The vertices that a frame should see and light, compared with what it decoded.
 
-    They face camera and projector, fall inside image and pattern, and the mesh hides them from neither.
+    They face camera and projector, project into image and pattern, and the mesh hides them from neither.
     """
     vertex = np.arange(len(vertices), dtype=np.int64)
     for T in (T_world_camera, T_world_projector):
@@ -166,14 +161,14 @@ def observe_vertices(
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
         vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
-    on_mask, near_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
+    on_mask, around_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
     least, most = np.full((2, len(vertex)), np.nan)
     lit, uv_camera, uv_projector = vertex[on_mask], uv_camera[on_mask], uv_projector[on_mask]
     jacobian = _jacobian(
         vertices[lit], normals[lit], uv_camera, uv_projector, frame.camera, T_world_camera, projector, T_world_projector
     )
     least[on_mask], most[on_mask] = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
-    return FrameObservation(vertex, ~near_mask, near_mask & ~on_mask, least, most)
+    return VisibleVertices(vertex, ~around_mask, around_mask & ~on_mask, least, most)
 
 
 def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:
@@ -192,7 +187,7 @@ def _faces(
 
 
 def _dot(a: Float[ndarray, "n k"], b: Float[ndarray, "n k"]) -> Float[ndarray, "n"]:
-    """Products of rows; `(a * b).sum(1)` takes five times as long."""
+    """Dot products of rows; `(a * b).sum(1)` takes five times as long."""
     return np.einsum("nk,nk->n", a, b)
 
 
@@ -217,7 +212,7 @@ def _jacobian(
     projector: Device,
     T_world_projector: Float[ndarray, "4 4"],
 ) -> Float[ndarray, "n 2 2"]:
-    """How the predicted coordinate moves, in its first index, with a camera pixel's x and y on the tangent plane."""
+    """Derivative of the predicted coordinate (first index) by the camera pixel's x and y, on the tangent plane."""
     columns = []
     for step in ((1.0, 0.0), (0.0, 1.0)):
         uv = torch.from_numpy(uv_camera + step)
@@ -236,11 +231,12 @@ def _offset_from_decoded(
     uv_projector: Float[ndarray, "n 2"],
     jacobian: Float[ndarray, "n 2 2"],
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
-    """Least and greatest distance of predicted from decoded coordinates, NaN if nothing was decoded within a pixel.
+    """Bounds of the distance between predicted and decoded coordinates, NaN if nothing was decoded within a pixel.
 
-    Where four decoded neighbours vary no more than `jacobian` lets expect, their bilinear value is compared. Else (an
-    edge, or undecoded neighbours) it is the best of nine pixels, each against the prediction on the tangent plane; how
-    far the surface may bend away from it, half of the plane's own change, makes the difference of the two distances.
+    Where four decoded neighbours vary no more than `jacobian` predicts, their bilinear value is compared. Otherwise (an
+    edge, or undecoded neighbours) the best of nine pixels is used, each compared with the prediction on the tangent
+    plane. The surface may bend away from that plane by half of the plane's own change, which is the difference between
+    the two bounds.
     """
     slope = np.sqrt(np.einsum("nij,nij->n", jacobian, jacobian))
     column, row = np.floor(uv_camera - 0.5).astype(np.int64).T
@@ -262,7 +258,7 @@ def _best_of_nine(
     jacobian: Float[ndarray, "n 2 2"],
     slope: Float[ndarray, "n"],
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n"]]:
-    """Least and greatest distance from the pixel, among nine, that agrees best with the tangent plane."""
+    """Bounds of the distance for the pixel, of nine, that agrees best with the tangent plane."""
     column, row = np.floor(uv_camera).astype(np.int64).T
     least, most = np.full(len(row), np.nan), np.full(len(row), np.nan)
     for dy, dx in product((-1, 0, 1), repeat=2):

@@ -3,9 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.capture_fit import CaptureFit, frame_pixels, look_up
-from sl_nerfstudio.evaluation.evaluate import Poses, evaluate
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, frame_pixels, look_up
+from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -17,9 +18,9 @@ from .shapes import turn
 DOE = Device(w=96, h=80, fl_x=210.0, fl_y=205.0, cx=48.0, cy=41.0, model="DOE")
 
 
-def fit_of(root: Path, mesh: Mesh, poses: Poses | None = None) -> CaptureFit:
+def fit_of(root: Path, mesh: Mesh, poses: DevicePoses | None = None) -> CaptureAgreement:
     scan = read_scan(root)
-    return evaluate(mesh, scan, poses or Poses(scan.T_world_camera, scan.T_world_projector)).fit
+    return evaluate(mesh, scan, poses or scan.poses).agreement
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(clean_scan: Pa
 
     moved = replace(frame, coords_path=path)
     pixels = frame_pixels(
-        Surface(made.truth()), moved, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector
+        IndexedMesh(made.truth()), moved, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector
     )
     np.testing.assert_allclose(np.median(pixels.offset, axis=0), [-0.3, 0.4], atol=1e-3)
     assert np.median(pixels.coordinate) == pytest.approx(0.5, abs=1e-3)
@@ -64,9 +65,9 @@ def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(clean_scan: Pa
 
 def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(clean_scan: Path) -> None:
     scan = read_scan(clean_scan)
-    projectors = scan.T_world_projector.copy()
+    projectors = scan.poses.T_world_projector.copy()
     projectors[:, :3, :3] = projectors[:, :3, :3] @ turn((1, 0, 0), 1.0)  # 1 degree is 3.2 pattern pixels
-    poses = Poses(scan.T_world_camera, projectors)
+    poses = DevicePoses(scan.poses.T_world_camera, projectors)
     sphere_fit = fit_of(clean_scan, Mesh(FacetedScan().truth().vertices * 0.8, FacetedScan().truth().faces), poses)
     true_fit = fit_of(clean_scan, FacetedScan().truth(), poses)
     assert 1.5 < true_fit.epipolar_px_median < 3.5
@@ -77,15 +78,15 @@ def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(cl
 def test_world_moved_with_mesh_and_poses_leaves_the_fit(clean_scan: Path) -> None:
     scan, made = read_scan(clean_scan), FacetedScan()
     S = Similarity(1.0, turn((1, -2, 0.3), 70.0), np.array([10.0, 500.0, -3.0]))
-    fit = fit_of(
-        clean_scan, made.truth().mapped(S), Poses(S.poses(scan.T_world_camera), S.poses(scan.T_world_projector))
-    )
+    fit = fit_of(clean_scan, made.truth().mapped(S), scan.poses.mapped(S))
     assert fit.coordinate_px_p95 < 1e-2
 
 
 def test_depth_of_a_pixel_and_ray_angle_follow_from_the_set_up(clean_scan: Path) -> None:
     fit = fit_of(clean_scan, FacetedScan().truth())
-    camera, projector = (T[:, :3, 3] / np.linalg.norm(T[:, :3, 3], axis=1)[:, None] for T in FacetedScan().true_poses())
+    true = FacetedScan().true_poses()
+    centres = (T[:, :3, 3] for T in (true.T_world_camera, true.T_world_projector))
+    camera, projector = (c / np.linalg.norm(c, axis=1)[:, None] for c in centres)
     radius = 32.0  # the surface is nearer to the devices than the centre they look at
     angle = np.median(np.arccos((camera * projector).sum(1))) * 250 / (250 - radius)
     assert fit.ray_angle_deg == pytest.approx(np.degrees(angle), rel=0.1)
@@ -107,7 +108,7 @@ def test_look_up_is_bilinear_between_pixel_centres() -> None:
 
 def test_large_frames_are_thinned_on_a_grid(clean_scan: Path) -> None:
     scan = read_scan(clean_scan)
-    frame, surface = scan.frames[0], Surface(FacetedScan().truth())
+    frame, surface = scan.frames[0], IndexedMesh(FacetedScan().truth())
     args = (surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
     every, few = frame_pixels(*args), frame_pixels(*args, max_pixels=len(frame_pixels(*args).row) // 4 + 1)
     assert (every.stride, few.stride) == (1, 2)

@@ -1,4 +1,4 @@
-"""Is a matrix a pose: a rigid motion from device to world?"""
+"""Whether a matrix is a pose: a rigid motion from device to world."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -6,17 +6,17 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.problem import Problem
 
-TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, 0.01 % of scale does not go unseen
+TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, a scale error of 0.01 % does not
 
 
 def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
-    """The first reason why `T` is no rigid motion, None if it is one."""
+    """The first reason why `T` is not a rigid motion, None if it is one."""
     if T.shape == (3, 4):
         return Problem("is 3 x 4", "the last row was left out", "add the row 0, 0, 0, 1")
     if T.shape != (4, 4):
         size = " x ".join(map(str, T.shape)) or "one number"
         return Problem(
-            f"is {size} instead of 4 x 4", "another kind of matrix", "give the 4 x 4 matrix from device to world"
+            f"is {size} instead of 4 x 4", "it is another kind of matrix", "give the 4 x 4 matrix from device to world"
         )
     if not np.isfinite(T).all():
         return Problem(
@@ -39,7 +39,7 @@ def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
         )
     return Problem(
         f"has the last row {row} instead of 0, 0, 0, 1",
-        "a projective or scaled matrix, or rows in another order",
+        "the matrix is projective or scaled, or its rows are in another order",
         "give a rigid motion from device to world",
     )
 
@@ -52,19 +52,19 @@ def _rotation_problem(R: Float64[ndarray, "3 3"]) -> Problem | None:
         if determinant > 0:
             return None
         return Problem(
-            "mirrors (the determinant of its rotation is -1)",
-            "one axis was negated, or left-handed axes were used (as in Unity or DirectX)",
+            "is a reflection (the determinant of its rotation is -1)",
+            "one axis was negated, or the axes are left-handed (as in Unity or DirectX)",
             "convert to right-handed axes: device looks along -z, +x right, +y up",
         )
     scale = float(np.cbrt(abs(determinant)))
     if scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= TOLERANCE:
         return Problem(
-            f"is scaled: its rotation is {scale:.6g} times {'a mirroring' if determinant < 0 else 'a rotation'}",
-            "a similarity (with a scale or a change of unit in it) was stored as a pose",
+            f"is scaled: its rotation is {scale:.6g} times {'a reflection' if determinant < 0 else 'a rotation'}",
+            "a similarity (which includes a scale or a change of unit) was stored as a pose",
             "divide the upper left 3 x 3 block by its scale, and give positions in the scan's unit",
         )
     return Problem(
         "has no rotation in its upper left 3 x 3 block: its columns are not unit vectors at right angles",
-        "rounded to few digits, sheared, or not a pose matrix",
+        "it was rounded to few digits, is sheared, or is not a pose matrix",
         "give the rotation with at least six digits",
     )

@@ -1,7 +1,7 @@
-"""How well a mesh and the poses explain the captures, frame by frame: needs no truth.
+"""How well a mesh and the poses agree with the captures, frame by frame; the truth is not needed.
 
-The mesh is ray cast from each camera; what is hit is projected into the pattern. That prediction is
-compared with the decoded coordinates and, looked up in the pattern, with the captured pattern image.
+Rays are cast from each camera onto the mesh, and the points that they hit are projected into the pattern. This
+prediction is compared with the decoded coordinates and, looked up in the pattern, with the captured pattern image.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import map_coordinates
 
-from sl_nerfstudio.evaluation.surface import Surface
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.geometry.rays import pixel_rays
@@ -26,13 +27,13 @@ MAX_PIXELS = 250_000  # of a frame; larger frames are evaluated on a regular gri
 
 @dataclass(frozen=True)
 class FramePixels:
-    """What is known about the evaluated pixels of one frame; NaN where something does not exist."""
+    """The evaluated pixels of one frame; NaN where a value does not exist."""
 
     row: Int[ndarray, "n"]
     column: Int[ndarray, "n"]
     stride: int  # every stride-th row and column was evaluated
-    hit: Bool[ndarray, "n"]  # the camera ray meets the mesh
-    lit: Bool[ndarray, "n"]  # ... in a point that the projector reaches, inside the pattern
+    hit: Bool[ndarray, "n"]  # the camera ray hits the mesh
+    lit: Bool[ndarray, "n"]  # ... at a point that the projector lights, inside the pattern
     decoded: Bool[ndarray, "n"]
     offset: Float[ndarray, "n 2"]  # predicted minus decoded coordinates, pattern pixels
     epipolar: Float[ndarray, "n"]  # signed distance from the epipolar curve, pattern pixels
@@ -48,11 +49,11 @@ class FramePixels:
 
 
 @dataclass(frozen=True)
-class FrameFit:
+class FrameAgreement:
     """Figures of one frame; NaN where no pixel has one."""
 
     name: str
-    pixels: int  # inside the mask, before thinning
+    pixels: int  # inside the mask, all of them
     hit_share: float  # of the masked pixels
     lit_share: float
     decoded_share: float
@@ -65,7 +66,7 @@ class FrameFit:
 
 
 @dataclass(frozen=True)
-class CaptureFit:
+class CaptureAgreement:
     """Figures of the whole scan."""
 
     coordinate_px_median: float
@@ -75,11 +76,11 @@ class CaptureFit:
     hit_share: float
     depth_per_px: float
     ray_angle_deg: float
-    frames: tuple[FrameFit, ...]
+    frames: tuple[FrameAgreement, ...]
 
 
 def frame_pixels(
-    surface: Surface,
+    surface: IndexedMesh,
     frame: Frame,
     scan: Scan,
     pattern: Float[ndarray, "ph pw"],
@@ -87,7 +88,7 @@ def frame_pixels(
     T_world_projector: Float[ndarray, "4 4"],
     max_pixels: int = MAX_PIXELS,
 ) -> FramePixels:
-    """Everything the figures and pictures of one frame need; one frame's files are read."""
+    """Everything that the figures and pictures of one frame need; reads the files of the frame."""
     mask, coords, captured = frame.read_mask(), frame.read_coords(), frame.read_pattern()
     stride = max(1, int(np.ceil(np.sqrt(mask.sum() / max_pixels))))
     row, column = np.nonzero(mask[::stride, ::stride])
@@ -127,12 +128,12 @@ def frame_pixels(
 def _predict(
     p_world: Float[ndarray, "n 3"],
     hit: Bool[ndarray, "n"],
-    surface: Surface,
+    surface: IndexedMesh,
     device: Device,
     projector: Intrinsics,
     T_world_projector: torch.Tensor,
 ) -> tuple[Float[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pattern coordinates of surface points, and whether the projector's light really gets there."""
+    """Pattern coordinates of surface points, and whether the projector really lights them."""
     p_device = transform(inverse(T_world_projector), torch.as_tensor(np.nan_to_num(p_world)))
     uv, in_front = project(projector, p_device)
     uv = uv.numpy()
@@ -152,10 +153,10 @@ def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[nd
     return out
 
 
-def fit_figures(name: str, masked: int, pixels: FramePixels) -> FrameFit:
+def frame_agreement(name: str, masked: int, pixels: FramePixels) -> FrameAgreement:
     """Summary of one frame's pixels."""
     both = pixels.lit & np.isfinite(pixels.rendered)
-    return FrameFit(
+    return FrameAgreement(
         name=name,
         pixels=masked,
         hit_share=_mean(pixels.hit),
@@ -170,18 +171,18 @@ def fit_figures(name: str, masked: int, pixels: FramePixels) -> FrameFit:
     )
 
 
-class FitAccumulator:
-    """Collects frames one after the other; keeps the residuals (float32), not the images."""
+class AgreementAccumulator:
+    """Collects frames one by one; keeps the residuals (float32), not the images."""
 
     def __init__(self) -> None:
-        self._frames: list[FrameFit] = []
+        self._frames: list[FrameAgreement] = []
         self._coordinate: list[ndarray] = []
         self._epipolar: list[ndarray] = []
         self._depth: list[ndarray] = []
         self._products = np.zeros(3)
 
-    def add(self, figures: FrameFit, pixels: FramePixels) -> None:
-        """Take one more frame in."""
+    def add(self, figures: FrameAgreement, pixels: FramePixels) -> None:
+        """Add one more frame."""
         self._frames.append(figures)
         self._coordinate.append(_known(pixels.coordinate))
         self._epipolar.append(_known(np.abs(pixels.epipolar)))
@@ -190,12 +191,12 @@ class FitAccumulator:
         a, b = pixels.captured[both], pixels.rendered[both]
         self._products += (float(a @ b), float(a @ a), float(b @ b))
 
-    def result(self) -> CaptureFit:
-        """Figures over all pixels of all frames taken in."""
+    def result(self) -> CaptureAgreement:
+        """Figures over all pixels of all frames added."""
         coordinate = np.concatenate(self._coordinate)
         ab, aa, bb = self._products
         weight = np.array([f.pixels for f in self._frames], np.float64)
-        return CaptureFit(
+        return CaptureAgreement(
             coordinate_px_median=_median(coordinate),
             coordinate_px_p95=_percentile(coordinate, 95.0),
             epipolar_px_median=_median(np.concatenate(self._epipolar)),
@@ -207,17 +208,16 @@ class FitAccumulator:
         )
 
 
-def fit_captures(
-    surface: Surface,
+def compare_captures(
+    surface: IndexedMesh,
     scan: Scan,
-    T_world_camera: Float[ndarray, "n 4 4"],
-    T_world_projector: Float[ndarray, "n 4 4"],
-) -> Iterator[tuple[Frame, FrameFit, FramePixels]]:
-    """Figures and pixels of every frame in turn; only one frame is in memory at a time."""
+    poses: DevicePoses,
+) -> Iterator[tuple[Frame, FrameAgreement, FramePixels]]:
+    """Figures and pixels of every frame in turn; one frame is in memory at a time."""
     pattern = scan.read_pattern()
-    for frame, T_c, T_p in zip(scan.frames, T_world_camera, T_world_projector, strict=True):
+    for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True):
         pixels = frame_pixels(surface, frame, scan, pattern, T_c, T_p)
-        yield frame, fit_figures(frame.name, len(pixels.row) * pixels.stride**2, pixels), pixels
+        yield frame, frame_agreement(frame.name, len(pixels.row) * pixels.stride**2, pixels), pixels
 
 
 def _known(values: Float[ndarray, "n"]) -> Float[ndarray, "m"]:

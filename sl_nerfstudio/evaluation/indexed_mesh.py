@@ -1,4 +1,4 @@
-"""A triangle mesh that can be asked for nearest points and for what a ray hits."""
+"""A triangle mesh with a search tree: nearest points, ray hits, occlusion, evenly spread samples."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,11 +30,11 @@ class RayHits:
     face: Int[ndarray, "n"]  # -1 where nothing is hit
 
 
-class Surface:
+class IndexedMesh:
     """A mesh with at least one triangle, in any unit and anywhere in space.
 
     Open3D computes in float32, so the mesh is centred and scaled to unit size inside: a scan far from
-    its origin or in metres is measured as finely as one near it or in millimetres.
+    its origin or in metres is measured as precisely as one near it or in millimetres.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -82,7 +82,7 @@ class Surface:
     def sample(self, count: int, seed: int) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"]]:
         """`count` points spread evenly over the area, and their unit normals; the same for the same seed.
 
-        Stratified along the cumulated area: every part of the surface gets its share of points.
+        Stratified along the cumulative area: every part of the surface gets its share of points.
         """
         rng = np.random.default_rng(seed)
         doubled = np.linalg.norm(self.face_cross, axis=1)
@@ -98,8 +98,8 @@ class Surface:
         """Nearest point of the surface (on its triangles, not its vertices) for each point."""
         answer = self._scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
         face = answer["primitive_ids"].numpy().astype(np.int64)
-        # Open3D's foot point is good to 1e-7 of the size, except on long thin triangles (of a CAD cylinder), where
-        # float32 can miss the right one. So: the nearest of that triangle and its neighbours, in float64.
+        # Open3D's nearest point is good to 1e-7 of the size, except on long thin triangles (of a CAD cylinder), where
+        # float32 can miss the right one. Therefore: the nearest of that triangle and its neighbours, in float64.
         foot = nearest_on_triangle(points, *self._corners(face))
         best = np.linalg.norm(points - foot, axis=1)
         near_thin = np.flatnonzero(self._by_thin[face])
@@ -128,22 +128,22 @@ class Surface:
         with np.errstate(divide="ignore", invalid="ignore"):
             exact = ((corner - origins) * cross).sum(1) / slope
         coarse = np.where(hit, t / self._scale, np.nan)
-        # The float64 intersection with the plane of the triangle, except for rays that graze it.
+        # The float64 intersection with the plane of the triangle, except for rays almost parallel to it.
         near = np.abs(exact - coarse) < 1e-4 * self.diagonal
         return RayHits(hit, np.where(hit & near, exact, coarse), face)
 
     def occluded(
         self, points: Float[ndarray, "n 3"], target: Float[ndarray, "3"], tolerance: float = 1e-3
     ) -> Bool[ndarray, "n"]:
-        """Whether the surface stands between each point and `target`.
+        """Whether the surface is between each point and `target`.
 
-        Points may lie on the surface: what is nearer than `tolerance` times the size of the mesh does not hide.
+        Points may lie on the surface: what is closer than `tolerance` times the size of the mesh does not hide.
         """
         offset = target - points
         length = np.linalg.norm(offset, axis=1)
         direction = offset / np.maximum(length, 1e-300)[:, None]
         start = points + tolerance * self.diagonal * direction
-        # Directions as long as the way to the target: one far end, 1, then holds for all rays.
+        # Directions as long as the distance to the target: all rays then end at parameter 1.
         remaining = np.maximum(length - tolerance * self.diagonal, 0) * self._scale
         rays = self._rays(start, remaining[:, None] * direction)
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()

@@ -1,0 +1,95 @@
+"""The full check of a scan folder: everything `read_scan` checks, every pixel, and whether all of it fits together."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sl_nerfstudio.errors import Fault, ScanError
+from sl_nerfstudio.progress import track
+from sl_nerfstudio.scan.check.content import FrameContent, check_content, check_pattern, duplicate_problems
+from sl_nerfstudio.scan.check.conventions import convention_problems
+from sl_nerfstudio.scan.check.interpretations import GeometricFit, fit_geometry
+from sl_nerfstudio.scan.check.pattern_shift import shift_problems
+from sl_nerfstudio.scan.document import TRANSFORMS
+from sl_nerfstudio.scan.headers import check_headers
+from sl_nerfstudio.scan.measured_length import measured_length
+from sl_nerfstudio.scan.partial_scan import PartialScan, read_partial_scan
+from sl_nerfstudio.scan.pose_files import GROUND_TRUTH, read_ground_truth
+from sl_nerfstudio.scan.problem import Faults
+from sl_nerfstudio.scan.types import UNITS, Scan
+
+
+@dataclass(frozen=True)
+class FolderCheck:
+    """The result of a check: faults, or, if there are none, the scan with its figures."""
+
+    faults: tuple[Fault, ...]
+    scan: Scan | None  # None if there are faults
+    fit: GeometricFit | None  # of the starting poses; None if there are faults
+    contents: tuple[FrameContent, ...]
+
+
+def check_folder(root: Path) -> FolderCheck:
+    """Check a whole folder, with a progress bar; faults are returned, not raised. One frame is in memory at a time."""
+    root = Path(os.path.realpath(root))
+    faults = Faults()
+    partial = read_partial_scan(root, faults)
+    good = check_headers(partial, faults)
+    pattern = check_pattern(partial, good, faults)
+    contents = [check_content(f, partial, pattern, good, faults) for f in track(partial.frames, "Checking the scan")]
+    for name, duplicate in duplicate_problems(contents):
+        faults.add(duplicate, TRANSFORMS, name)
+    for problem in shift_problems([content.shift for content in contents]):
+        faults.add(problem, TRANSFORMS, None, "sl_coords_path")
+    _check_conventions(partial, contents, faults)
+    found = faults.found
+    scan = None if found else partial.complete()
+    if scan is not None:
+        found = _faults_raised(lambda: _measure_scale_bar(scan)) + [
+            replace(fault, file=f"{GROUND_TRUTH}/{fault.file}")
+            for fault in _faults_raised(lambda: read_ground_truth(scan))
+        ]
+    if scan is None or found:
+        return FolderCheck(tuple(found), None, None, tuple(contents))
+    usable = [c.correspondences for c in contents if c.correspondences is not None]
+    return FolderCheck((), scan, fit_geometry(usable, scan.projector), tuple(contents))
+
+
+def check_scan(root: Path) -> list[Fault]:
+    """All faults of a scan folder; empty if it is good."""
+    return list(check_folder(root).faults)
+
+
+def require_valid(root: Path) -> Scan:
+    """The scan in a folder that passes the full check. Raises ScanError with all faults otherwise."""
+    result = check_folder(root)
+    if result.scan is None:
+        raise ScanError(result.faults, str(root))
+    return result.scan
+
+
+def _check_conventions(partial: PartialScan, contents: list[FrameContent], faults: Faults) -> None:
+    frames = [c.correspondences for c in contents if c.correspondences is not None]
+    if partial.projector is None or not frames:
+        return
+    metres = None if partial.units is None else UNITS[partial.units]
+    with np.errstate(all="ignore"):
+        for frame, key, problem in convention_problems(frames, partial.projector, metres):
+            faults.add(problem, TRANSFORMS, frame, key)
+
+
+def _measure_scale_bar(scan: Scan) -> None:
+    """Raises ScanError if training could not measure the scan's scale bar."""
+    if scan.scale.bar is not None:
+        measured_length(scan, scan.scale.bar, scan.poses)
+
+
+def _faults_raised(read: Callable[[], object]) -> list[Fault]:
+    try:
+        read()
+    except ScanError as error:
+        return error.faults
+    return []

@@ -1,0 +1,68 @@
+"""A trained run whose field is a ball by formula, with a scan of that ball."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.runs.trained_run import TrainedRun
+from sl_nerfstudio.scan import Scan
+from tests.meshing.ray_cast_scan import pairs_around, scan_of
+
+CENTRE, RADIUS = np.array([3.0, -2.0, 5.0]), 40.0  # of the ball, mm
+S_SCENE_WORLD = Similarity(1 / 60, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.02, -0.03, 0.01]))
+
+
+@dataclass
+class BallModel:
+    """What sl-export needs from a model, for a ball."""
+
+    scan: Scan
+    sigma: np.ndarray | None = None
+    S_scene_world: Similarity = S_SCENE_WORLD
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    def sdf(self, p_scene):
+        centre = torch.from_numpy(self.S_scene_world.points(CENTRE)).float()
+        return (p_scene - centre).norm(dim=-1) - RADIUS * self.S_scene_world.scale
+
+    def poses(self):
+        return self.scan.poses
+
+    def pose_sigma(self):
+        return self.sigma
+
+    def self_calibration(self):
+        return SelfCalibration(torch.full((6,), 0.01).double(), 1e-6 * torch.eye(6).double())
+
+    def history(self):
+        return {"step": [0.0, 5.0], "loss": [1.0, float("nan")]}
+
+
+def ball_scan(root: Path) -> Scan:
+    """Six captures of the ball from above."""
+    low, high = ((float(c[0]), float(c[1]), float(c[2])) for c in (CENTRE - 44, CENTRE + 44))
+    ball = extract_mesh(lambda p: (p - torch.from_numpy(CENTRE).float()).norm(dim=-1) - RADIUS, 60, low, high)
+    return scan_of(ball, pairs_around(6, 40), root)
+
+
+def run_of(scan: Scan, sigma: np.ndarray | None = None) -> TrainedRun:
+    """A finished run of ten steps on the scan."""
+    settings = SimpleNamespace(
+        method_name="sl-neus",
+        max_num_iterations=10,
+        pipeline=SimpleNamespace(
+            datamanager=SimpleNamespace(
+                data=scan.root,
+                train_num_rays_per_batch=7,
+                dataparser=SimpleNamespace(intrinsics_change=scan.intrinsics_change),
+            ),
+            model={"lr": 1e-3, "where": Path("a")},
+        ),
+    )
+    return TrainedRun(BallModel(scan, sigma), settings, 10)

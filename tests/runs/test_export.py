@@ -1,0 +1,63 @@
+"""What an export hands back and writes, for a ball whose field and poses are known by formula."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.runs.export import ExportSettings, export_run
+from sl_nerfstudio.runs.run_record import training_record
+from sl_nerfstudio.scan import PoseSigma, Scan, read_pose_sigmas, read_poses
+
+from .ball_run import CENTRE, RADIUS, ball_scan, run_of
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return ball_scan(tmp_path_factory.mktemp("export") / "scan")
+
+
+def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
+    sigma = np.arange(1, 25, dtype=float).reshape(6, 4) / 100
+    settings = ExportSettings(tmp_path / "mesh.ply", tmp_path / "refined", resolution=64)
+    run = run_of(scan, sigma)
+    found = export_run(run, settings)
+    written = read_mesh(settings.mesh)
+    assert np.array_equal(written.vertices, found.mesh.vertices) and np.array_equal(written.faces, found.mesh.faces)
+    assert found.trimmed is not None and found.trimmed.mesh is found.mesh
+    assert found.trimmed.total > len(found.mesh.vertices) and found.trimmed.residual_px < 0.2
+    assert found.pose_sigma is sigma and min(found.extraction_seconds, found.writing_seconds) >= 0
+    path = tmp_path / "refined/transforms.json"
+    np.testing.assert_allclose(read_poses(path, scan).stacked(), scan.poses.stacked(), atol=1e-12)
+    assert read_pose_sigmas(path, scan) == [PoseSigma(*row) for row in sigma.tolist()]
+    assert json.loads((tmp_path / "refined/training.json").read_text()) == json.loads(json.dumps(training_record(run)))
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [
+        "mesh.ply",
+        "training.json",
+        "transforms.json",
+    ]
+
+
+def test_without_trimming_the_ball_is_closed_and_no_poses_are_written_unless_wanted(scan: Scan, tmp_path):
+    found = export_run(run_of(scan), ExportSettings(tmp_path / "mesh.ply", resolution=64, keep_unobserved=True))
+    assert found.trimmed is None and found.pose_sigma is None
+    np.testing.assert_allclose(np.linalg.norm(found.mesh.vertices - CENTRE, axis=1), RADIUS, atol=0.02)
+    edges = np.sort(np.concatenate([found.mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    lower, upper = found.mesh.vertices.min(0), found.mesh.vertices.max(0)
+    np.testing.assert_allclose(upper - lower, 2 * RADIUS, rtol=2e-3)
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
+
+
+def test_poses_without_an_estimated_uncertainty_state_none(scan: Scan, tmp_path):
+    export_run(run_of(scan), ExportSettings(tmp_path / "mesh.ply", tmp_path, resolution=32))
+    assert read_pose_sigmas(tmp_path / "transforms.json", scan) == [None] * 6
+
+
+def test_the_area_of_the_trimmed_surface_does_not_depend_on_the_resolution(scan: Scan, tmp_path):
+    areas = [
+        export_run(run_of(scan), ExportSettings(tmp_path / f"{n}.ply", resolution=n)).mesh.face_areas().sum()
+        for n in (64, 96)
+    ]
+    assert areas[0] == pytest.approx(areas[1], rel=0.03)
