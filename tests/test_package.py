@@ -25,13 +25,6 @@ PACKAGE = ROOT / "sl_nerfstudio"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SCRIPTS: dict[str, str] = PROJECT["scripts"]
 
-# Folders in the order in which data walks through them: each imports only from itself and from those before it.
-LAYERS = (
-    "errors", "progress", "compiled", "geometry", "scan", "pattern", "synthesis", "decoding", "calibration",
-    "relative_pose", "registration", "bundle_adjustment", "processing", "field", "rendering", "dataparser", "model",
-    "meshing", "runs", "evaluation", "cli", "methods",
-)  # fmt: skip
-
 # A dependency whose import is not called as its distribution is.
 IMPORTED_AS = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
 # Declared without being imported here, each with the reason.
@@ -67,11 +60,6 @@ def imports(path: Path) -> Iterator[str]:
                 yield ".".join((*package, *filter(None, [node.module])))
             elif node.module:
                 yield node.module
-
-
-def layer(module: str) -> str:
-    """The folder (or file) directly below the package that a module belongs to."""
-    return (module.split(".") + [""])[1]
 
 
 def distribution_name(requirement: str) -> str:
@@ -125,26 +113,6 @@ def test_imported_packages_are_the_declared_dependencies():
     imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
     declared = {distribution_name(text) for text in PROJECT["dependencies"]} - NOT_IMPORTED.keys()
     assert imported == {IMPORTED_AS.get(name, name) for name in declared}
-
-
-# ------------------------------------------------------------------ layout
-
-
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_folders_import_only_from_those_before_them(path):
-    own = path.relative_to(PACKAGE).with_suffix("").parts[0]
-    if own == "__init__":
-        return
-    for name in imports(path):
-        if name.startswith("sl_nerfstudio."):
-            assert LAYERS.index(layer(name)) <= LAYERS.index(own), f"{own} must not import {name}"
-
-
-def test_only_the_plugin_side_imports_nerfstudio():
-    """Its import takes ten seconds. meshing/ loads training runs, cli/ none of it before a command's flags are read."""
-    users = {layer(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in modules()
-             if any(name.split(".")[0] == "nerfstudio" for name in imports(path))}  # fmt: skip
-    assert users <= {"dataparser", "model", "runs", "methods"}
 
 
 def test_no_url_and_no_machine_path_in_the_code():

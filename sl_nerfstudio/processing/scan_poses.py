@@ -50,7 +50,7 @@ def _with_known_length(poses: ScanPoses, clouds: Sequence[FrameCloud], known: Kn
     adjusted = poses.adjusted
     devices = adjusted.poses
     factor = scale_to(known, known.unit, clouds, devices.T_world_camera, devices.T_world_projector)
-    return ScanPoses(adjusted.scaled(factor), known.unit, _stated_scale(known))
+    return ScanPoses(adjusted.scaled(factor), known.unit, stated_scale(known))
 
 
 def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
@@ -62,7 +62,7 @@ def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
         )
 
 
-def _stated_scale(known: KnownLength) -> Scale:
+def stated_scale(known: KnownLength) -> Scale:
     """The known length as the scan states it; its frames are given by name."""
     if not known.pixels:
         return Scale(True, known.source, baseline_of=known.frames[0])

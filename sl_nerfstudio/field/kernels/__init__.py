@@ -1,1 +1,4 @@
-"""The field's compiled CPU kernels: numba, without BLAS, without OpenMP, without a compiler at the user's."""
+"""The field's compiled CPU kernels: numba alone, without BLAS, OpenMP or a compiler on the user's machine.
+
+In: points, the feature table and the weights as arrays. Out: values, their gradients, and the adjoints of both.
+"""
