@@ -1,4 +1,4 @@
-"""Decisive settings of relative pose estimation and registration, each over a range around its default.
+"""Decisive settings of the stages that find poses, each over a range around its default.
 
     python -m benchmarks.settings_sweep [--settings registration.pair.tolerance ...] [--frames 14]
 
@@ -7,8 +7,8 @@ coordinates are taken as decoded, so no network is needed. One setting at a time
 and benchmarks/results/settings_sweep.json, give the number of right frames (within 2 degrees, and 3 % of the baseline's
 length) and the median error of the cameras, after one common similarity.
 
-A stage that follows registration, such as bundle adjustment, is swept by the same code: its settings become a field of
-`StageSettings`, its call stands at the end of `poses_of`, and the values to try are lines of `SWEEPS`.
+Settings of relative pose estimation and registration are judged by the registered poses, those of bundle adjustment by
+the adjusted ones.
 """
 
 import argparse
@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy import ndarray
 
 from benchmarks.machine import write_rows
 from benchmarks.registration import FrameErrors, frame_errors, truth_of
+from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.settings import RegistrationSettings
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
@@ -45,6 +46,7 @@ class StageSettings:
 
     relative_pose: RelativePoseSettings = field(default_factory=RelativePoseSettings)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    bundle_adjustment: RegisteredFramesSettings = field(default_factory=RegisteredFramesSettings)
 
 
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -55,6 +57,11 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "registration.pair.scale_sigma": (0.05, 0.1, 0.2, 0.4),
     "registration.edge.fitness_scale": (0.025, 0.035, 0.05, 0.07, 0.1),
     "registration.pose_graph.kernel_chi2": (20.0, 40.0, 80.0),
+    "bundle_adjustment.adjustment.anchors_per_frame": (150, 300, 600, 1200),
+    "bundle_adjustment.adjustment.frames_per_anchor": (2, 4, 8, 13),
+    "bundle_adjustment.adjustment.look_up.half_window": (2, 3, 4),
+    "bundle_adjustment.adjustment.kernel.medians": (1.0, 2.0, 3.0, 4.0),
+    "bundle_adjustment.adjustment.kernel.noises": (2.0, 3.0, 5.0),
 }
 """Path of each setting, and its values; the default is among them."""
 
@@ -100,29 +107,33 @@ def clouds_of(root: Path, settings: RelativePoseSettings) -> list[FrameCloud]:
     return out
 
 
-def poses_of(root: Path, settings: StageSettings) -> tuple[list[str], ndarray, ndarray]:
-    """Names, camera poses and baselines of the frames that reach the end; NaN where not registered."""
+@cache
+def registered(root: Path, settings: StageSettings) -> tuple[list[FrameCloud], Registration]:
+    """Frames whose relative pose is found, and their registration."""
     clouds = clouds_of(root, settings.relative_pose)
-    found = register(clouds, settings=settings.registration)
-    return [c.name for c in clouds], found.T_world_camera, found.baseline
+    return clouds, register(clouds, settings=settings.registration)
 
 
 @cache
-def errors_of(root: Path, settings: StageSettings) -> FrameErrors:
-    """Errors of the registered frames of a scan; none where fewer than two are registered."""
-    scan = read_scan(root)
-    names, T_world_camera, baseline = poses_of(root, settings)
-    if np.isfinite(baseline).sum() < 2:
+def errors_of(root: Path, settings: StageSettings, adjusted: bool) -> FrameErrors:
+    """Errors of the registered frames of a scan, before or after bundle adjustment; none where fewer than two are."""
+    clouds, found = registered(root, replace(settings, bundle_adjustment=StageSettings().bundle_adjustment))
+    if found.registered.sum() < 2:
         return FrameErrors(*np.zeros((3, 0)))
+    scan = read_scan(root)
     number = {frame.name: k for k, frame in enumerate(scan.frames)}
-    rows = [number[name] for name in names]
-    return frame_errors(T_world_camera, baseline, truth_of(scan)[rows])
+    truth = truth_of(scan)[[number[cloud.name] for cloud in clouds]]
+    if not adjusted:
+        return frame_errors(found.T_world_camera, found.baseline, truth)
+    poses = adjust_registered(clouds, found, settings.bundle_adjustment).poses
+    return frame_errors(poses.T_world_camera, poses.baseline, truth)
 
 
 def measure(roots: Sequence[Path], path: str, value: float) -> Row:
     """All scans with one setting changed."""
     default = StageSettings()
-    errors = [errors_of(root, changed(default, path, value)) for root in roots]
+    adjusted = path.startswith("bundle_adjustment.")
+    errors = [errors_of(root, changed(default, path, value), adjusted) for root in roots]
     rotation, position = (np.concatenate([getattr(e, key) for e in errors]) for key in ("rotation_deg", "position"))
     return Row(
         path, value, value == value_at(default, path), tuple(int(e.right.sum()) for e in errors),
@@ -148,7 +159,7 @@ def scans(folder: Path, frames: int, resolution: int, seeds: Sequence[int]) -> l
 def text_of(row: Row) -> str:
     """One line of the table."""
     return (
-        f"{row.setting:36} {row.value:7g}{'*' if row.default else ' '} | {sum(row.right_frames):3} right "
+        f"{row.setting:48} {row.value:7g}{'*' if row.default else ' '} | {sum(row.right_frames):3} right "
         f"({' '.join(map(str, row.right_frames))}) | "
         f"{row.rotation_deg:.3f} deg {row.position:.3%}"
     )

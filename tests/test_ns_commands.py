@@ -156,6 +156,29 @@ def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytes
     assert list(tmp_path.glob("*/sl-neus-paper/*/nerfstudio_models/step-000000002.ckpt"))
 
 
+@pytest.mark.parametrize("free", ["known-rig", "rigid-rig", "static-projector"])
+def test_the_papers_method_keeps_what_is_known(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: str
+) -> None:
+    call(
+        ns_train.entrypoint,
+        monkeypatch,
+        *("sl-neus-paper", "--data", root, "--output-dir", tmp_path, "--max-num-iterations", 5, *SMALL),
+        *("--pipeline.model.refine-poses", free),
+    )
+    (config,) = tmp_path.glob("*/sl-neus-paper/*/config.yml")
+    model = eval_setup(config)[1].model
+    before, after = model.scan.poses, model.poses()
+    moved = np.abs(after.T_world_camera - before.T_world_camera).max((1, 2))
+    assert (moved > 1e-5).all()
+    if free == "known-rig":
+        np.testing.assert_allclose(after.T_camera_projector, before.T_camera_projector, atol=1e-9)
+    elif free == "rigid-rig":
+        np.testing.assert_allclose(after.T_camera_projector[1:], after.T_camera_projector[:-1], atol=1e-9)
+    else:
+        np.testing.assert_allclose(after.T_world_projector[1:], after.T_world_projector[:-1], atol=1e-9)
+
+
 # ---- refusals: a message, status 1, nothing written
 
 
