@@ -5,13 +5,8 @@ from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.rays import pixel_rays
-from sl_nerfstudio.geometry.se3 import hat, inverse, rotate, transform
+from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
-
-
-def essential_matrix(T_projector_camera: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """`E = [t]x R`, with `d_projector^T E d_camera = 0` for the directions (device axes) of the same world point."""
-    return hat(T_projector_camera[..., :3, 3]) @ T_projector_camera[..., :3, :3]
 
 
 def epipolar_residual(

@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int8
+from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margin
@@ -84,12 +84,6 @@ class GridPattern(PatternLayout):
         x = self.x0 + self.period * np.arange(self.columns)
         y = self.y0 + self.period * np.arange(self.rows)
         return np.stack(np.meshgrid(x, y), -1)
-
-    def node_index(self, uv: Float[ndarray, "*n 2"]) -> Int[ndarray, "*n 2"]:
-        """Nearest node (i, j) of pattern pixels (x, y); always one inside the array."""
-        j = np.rint((uv[..., 0] - self.x0) / self.period)
-        i = np.rint((uv[..., 1] - self.y0) / self.period)
-        return np.stack([np.clip(i, 0, self.rows - 1), np.clip(j, 0, self.columns - 1)], -1).astype(np.int64)
 
     def intensity(self, uv: Float[ndarray, "*n 2"]) -> Float[ndarray, "*n"]:
         """Brightness at pattern pixels (x, y): 1 on a line, `dark` between, with edges one pixel soft."""

@@ -12,11 +12,11 @@ from numpy import ndarray
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, find_degeneracies
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, distinct, fit_epipolar, noise_of
+from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, distinct, fit_epipolar
 from sl_nerfstudio.relative_pose.five_point import five_point_candidates, in_front
 from sl_nerfstudio.relative_pose.pattern_blocks import block_count
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
-from sl_nerfstudio.relative_pose.sampson import direction_basis, sampson
+from sl_nerfstudio.relative_pose.sampson import sampson
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings
 
 
@@ -49,16 +49,6 @@ class RelativePose:
     def sigma_direction_deg(self) -> float:
         """One standard deviation of the angle by which the baseline's direction is wrong."""
         return _angle_sigma_deg(self.covariance[3:, 3:])
-
-    @property
-    def covariance_of_twist(self) -> Float64[ndarray, "6 6"]:
-        """Covariance of (v, w): error of the projector's position (unit baseline) and rotation, in camera axes."""
-        t = self.T_camera_projector[:3, 3]
-        B = direction_basis(t)
-        J = np.zeros((6, 5))
-        J[:3, 3:] = np.cross(B.T, t).T  # exp(B b) t = t + (B b) x t
-        J[3:, :3] = np.eye(3)
-        return J @ self.covariance @ J.T
 
 
 def estimate_relative_pose(
@@ -109,30 +99,6 @@ def estimate_relative_pose(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found.R, found.t
     return RelativePose(T, cov, inliers, found.noise_px, degeneracies)
-
-
-def judge_relative_pose(
-    T_camera_projector: Float64[ndarray, "4 4"],
-    uv_camera: Float[ndarray, "n 2"],
-    uv_projector: Float[ndarray, "n 2"],
-    camera: Device,
-    projector: Device,
-    settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS,
-) -> RelativePose:
-    """A known pose, with the covariance and inliers that a frame's coordinates give it; degeneracies are not sought.
-
-    Raises RelativePoseError where there are too few correspondences.
-    """
-    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector, settings.blocks)
-    if len(rays) < settings.fewest:
-        raise RelativePoseError(f"{len(rays)} decoded pixels are too few to judge a pose (at least {settings.fewest})")
-    T = T_camera_projector.copy()
-    T[:3, 3] /= np.linalg.norm(T[:3, 3])
-    r = sampson(T[:3, :3], T[:3, 3], rays)
-    found = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r, settings.fit.noise_floor_px), 0.0)
-    inliers = np.zeros(len(uv_camera), dtype=bool)
-    inliers[usable] = _inliers(found, rays, settings.inlier_sigmas)
-    return RelativePose(T, covariance(found, rays, settings.fit), inliers, found.noise_px, ())
 
 
 def _inliers(found: EpipolarFit, rays: RayPairs, sigmas: float) -> Bool[ndarray, "n"]:

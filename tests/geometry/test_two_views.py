@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.geometry.epipolar import epipolar_residual, essential_matrix
+from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
 
@@ -204,20 +204,6 @@ def test_rays_that_part_meet_behind() -> None:
         assert float(found.depth_camera) == pytest.approx(depth)
         assert float(found.depth_projector) == pytest.approx(depth * (1 + (0.4 / 3) ** 2) ** 0.5)
         assert found.p_world.tolist() == pytest.approx([0, 0, -depth], abs=1e-12)
-
-
-@given(seeds, batches)
-def test_essential_matrix(seed: int, batch: tuple[int, ...]) -> None:
-    source = generator(seed)
-    T_projector_camera = motions(batch, source)
-    p_camera = torch.randn(*batch, 3, generator=source, dtype=torch.float64)
-    p_projector = transform(T_projector_camera, p_camera)
-    E = essential_matrix(T_projector_camera)
-    assert float((p_projector[..., None, :] @ E @ p_camera[..., None]).abs().max()) < 1e-12
-    singular = torch.linalg.svdvals(E)
-    length = T_projector_camera[..., :3, 3].norm(dim=-1)
-    expected = torch.stack([length, length, torch.zeros_like(length)], -1)
-    assert float((singular - expected).abs().max()) < 1e-12
 
 
 @pytest.mark.parametrize("batch", BATCHES)

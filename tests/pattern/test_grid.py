@@ -67,15 +67,6 @@ def test_nodes_of_the_default_pattern():
     assert (grid.intensity(nodes[grid.codes == 0]) == 1).all()
 
 
-def test_node_index_is_that_of_the_nearest_node():
-    grid = GridPattern()
-    rng = np.random.default_rng(0)
-    uv = rng.uniform(0, 800, (500, 2))
-    nearest = ((uv[:, None] - grid.nodes().reshape(1, -1, 2)) ** 2).sum(-1).argmin(1)
-    i, j = grid.node_index(uv).T
-    assert np.array_equal(i * 40 + j, nearest)
-
-
 def test_turning_the_picture_is_turning_the_codes():
     grid = GridPattern(w=200, h=200, seed=2)
     turned = GridPattern(w=200, h=200, codes=rotate_codes(grid.codes, 1))

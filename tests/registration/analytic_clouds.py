@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.estimation import judge_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of
+from tests.relative_pose.known_pose import known_pose
 
 
 def clouds_of(rig: Rig, size: int, projector: str = "pinhole", noise: float = 0.0) -> list[FrameCloud]:
@@ -23,7 +23,7 @@ def clouds_of(rig: Rig, size: int, projector: str = "pinhole", noise: float = 0.
         camera, device = camera_of(size), PROJECTORS[projector]
         T = rig.T_camera_projector[k].numpy()
         uv = correspondences_of(coords)
-        out.append(frame_cloud(f"frame_{k:05d}", coords, camera, device, judge_relative_pose(T, *uv, camera, device)))
+        out.append(frame_cloud(f"frame_{k:05d}", coords, camera, device, known_pose(T, *uv, camera, device)))
     return out
 
 

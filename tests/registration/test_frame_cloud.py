@@ -8,11 +8,12 @@ from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.registration.frame_cloud import frame_cloud, reliable_points
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
 from sl_nerfstudio.relative_pose.sampson import moved
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, cast, rig_of, seen
 from tests.registration.analytic_clouds import clouds_of
+from tests.relative_pose.known_pose import known_pose
 
 SIZE = 90
 RIG = rig_of(2, SIZE)
@@ -44,7 +45,7 @@ def test_the_pose_s_uncertainty_makes_points_uncertain():
     coords = _image(0) + np.random.default_rng(0).normal(0, 0.3, (SIZE, SIZE, 2)).astype(np.float32)
     uv = correspondences_of(coords)
     devices = camera_of(SIZE), PROJECTORS["pinhole"]
-    pose = judge_relative_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices)
+    pose = known_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices)
     cloud = frame_cloud("a", coords, *devices, pose)
     d_camera, d_projector = (
         torch.from_numpy(directions(device, xy[pose.inliers])) for device, xy in zip(devices, uv, strict=True)
@@ -71,7 +72,7 @@ def test_what_contradicts_the_pose_is_left_out_of_points_and_coordinates():
     coords[wrong[:, 0], wrong[:, 1]] += np.float32([30, -25])
     uv = correspondences_of(coords)
     devices = camera_of(SIZE), PROJECTORS["pinhole"]
-    cloud = frame_cloud("a", coords, *devices, judge_relative_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices))
+    cloud = frame_cloud("a", coords, *devices, known_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices))
     assert np.isnan(cloud.coords[wrong[:, 0], wrong[:, 1]]).all()
     assert len(cloud.points) == np.isfinite(cloud.coords).all(-1).sum() == len(decoded) - len(wrong)
 

@@ -15,8 +15,9 @@ from sl_nerfstudio.registration import settings as registration_settings
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
 from sl_nerfstudio.registration.settings import FrameCloudSettings
 from sl_nerfstudio.relative_pose import settings as relative_pose_settings
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose, judge_relative_pose
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
+from tests.relative_pose.known_pose import known_pose
 from tests.relative_pose.two_views import view
 
 MODULES = {relative_pose_settings: relative_pose, registration_settings: registration}
@@ -63,10 +64,6 @@ def test_the_limits_of_a_relative_pose_are_obeyed():
     frame = view(count=300).noisy(0.3, seed=0)
     with pytest.raises(RelativePoseError, match=r"300 decoded pixels are too few .* \(at least 301\)"):
         estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, fewest=301))
-    with pytest.raises(RelativePoseError, match=r"300 decoded pixels are too few to judge .* \(at least 301\)"):
-        judge_relative_pose(
-            frame.T_camera_projector, *frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, fewest=301)
-        )
     with pytest.raises(RelativePoseError, match="best relative pose fits"):
         estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, least_inlier_share=1.1))
     narrow = estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, inlier_sigmas=1.0))
@@ -82,7 +79,7 @@ def test_the_limit_of_a_cloud_is_obeyed():
     coords[row, column] = frame.uv_projector
     count = int(np.isfinite(coords).all(-1).sum())
     uv = np.argwhere(np.isfinite(coords).all(-1))[:, ::-1] + 0.5
-    pose = judge_relative_pose(
+    pose = known_pose(
         frame.T_camera_projector, uv, coords[np.isfinite(coords).all(-1)].astype(np.float64),
         frame.camera, frame.projector,
     )  # fmt: skip

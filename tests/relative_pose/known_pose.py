@@ -1,0 +1,30 @@
+"""A relative pose that is known, with the covariance and inliers that a frame's coordinates give it."""
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, noise_of
+from sl_nerfstudio.relative_pose.estimation import RelativePose
+from sl_nerfstudio.relative_pose.ray_pairs import ray_pairs
+from sl_nerfstudio.relative_pose.sampson import sampson
+from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS
+
+
+def known_pose(
+    T_camera_projector: Float64[ndarray, "4 4"],
+    uv_camera: Float64[ndarray, "n 2"],
+    uv_projector: Float64[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+) -> RelativePose:
+    settings = RELATIVE_POSE_DEFAULTS
+    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector, settings.blocks)
+    T = T_camera_projector.copy()
+    T[:3, 3] /= np.linalg.norm(T[:3, 3])
+    r = sampson(T[:3, :3], T[:3, 3], rays)
+    fit = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r, settings.fit.noise_floor_px), 0.0)
+    inliers = np.zeros(len(uv_camera), dtype=bool)
+    inliers[usable] = np.abs(r) < settings.inlier_sigmas * fit.noise_px
+    return RelativePose(T, covariance(fit, rays, settings.fit), inliers, fit.noise_px, ())
