@@ -282,7 +282,7 @@ def test_a_gpu_that_is_not_there(
 
 
 def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
-    """The installed ns-train, in a process of its own."""
+    """The installed ns-train, in a separate process."""
     root = TinyScan(frames=2).write(tmp_path / "scan")
     (root / "coords/frame_00001.npz").unlink()
     (tmp_path / "here").mkdir()

@@ -12,10 +12,10 @@ class PlaneField(SDFField):
 
     def __init__(self, normal: tuple[float, float, float], offset: float) -> None:
         nn.Module.__init__(self)
-        self.normal, self.offset, self.asked = torch.tensor(normal), offset, 0
+        self.normal, self.offset, self.evaluated = torch.tensor(normal), offset, 0
 
     def sdf(self, p: Tensor) -> Tensor:
-        self.asked += len(p)
+        self.evaluated += len(p)
         return p @ self.normal - self.offset
 
 
@@ -31,7 +31,7 @@ def test_a_plane_is_reproduced_exactly_in_the_whole_box():
     cache.refresh(field)
     p = torch.cat([points(), torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])])
     assert torch.allclose(cache.look_up(p), p @ field.normal - 0.1, atol=2e-6)  # each axis has its own slope
-    assert field.asked == 12**3 and cache.cell == 2 / 11
+    assert field.evaluated == 12**3 and cache.cell == 2 / 11
 
 
 def test_outside_the_box_the_value_is_that_at_the_border():
@@ -50,7 +50,7 @@ def test_later_only_the_neighbourhood_of_the_surface_is_updated():
     near = z.abs() < 3 * cache.cell
     assert torch.allclose(cache.values[near][:, 0, 0], z[near] - 0.05, atol=1e-6)
     assert torch.allclose(cache.values[~near][:, 0, 0], z[~near], atol=1e-6)
-    assert after.asked == int(near.sum()) * 400
+    assert after.evaluated == int(near.sum()) * 400
 
 
 def test_it_is_saved_in_a_checkpoint():

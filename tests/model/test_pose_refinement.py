@@ -249,11 +249,11 @@ def test_refinement_starts_from_a_stated_change(scan, corrected):
 
 def test_held_out_pixels_decide_once_about_intrinsics(scan, corrected, monkeypatch):
     """With repeated decisions on the same pixels, one would be positive by chance."""
-    asked = []
+    calls = []
     real = intrinsics_refinement.cross_validate
-    monkeypatch.setattr(intrinsics_refinement, "cross_validate", lambda *a: asked.append(a) or real(*a))
+    monkeypatch.setattr(intrinsics_refinement, "cross_validate", lambda *a: calls.append(a) or real(*a))
     refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
-    assert len(asked) == 1
+    assert len(calls) == 1
 
 
 def settings_for(scan: Scan, **model: object) -> SLTrainerConfig:
