@@ -1,11 +1,11 @@
-"""Errors that a user can mend: their text is the whole message, and command lines print it without a traceback."""
+"""Errors that a user can fix: their text is the whole message, and command lines print it without a traceback."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 
 class UserError(Exception):
-    """Anything a user can mend. `str()` names the file or flag, the likely cause and the remedy."""
+    """Anything a user can fix. `str()` names the file or flag, the likely cause and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Fault:
 
     def __str__(self) -> str:
         """Three lines: where and what, why, what to do."""
-        # A frame is named only where the file's own name does not already say which one it is.
+        # The frame is named only if the file's name does not already show which one it is.
         frame = None if self.frame is None or self.frame in self.file else f"frame {self.frame}"
         where = ": ".join(part for part in (self.file, frame, self.field) if part)
         return f"{where}: {self.problem}\n    cause:  {self.cause}\n    remedy: {self.remedy}"

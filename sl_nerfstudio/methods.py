@@ -19,7 +19,7 @@ warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimension
 def _trainer(
     method_name: str, model: SLModelConfig, rays: int, iterations: int, optimizers: dict[str, Any]
 ) -> SLTrainerConfig:
-    """A run that trains, saves, says where the result lies, and returns; evaluated on held-out pixels as it goes."""
+    """A run that trains, saves, prints where the result is, and returns; meanwhile evaluated on held-out pixels."""
     return SLTrainerConfig(
         method_name=method_name,
         max_num_iterations=iterations,
@@ -57,7 +57,7 @@ sl_neus = MethodSpecification(
 
 
 def _paper_group(lr: float) -> dict[str, Any]:
-    """Down to 5e-12 at step 8,000, as the paper has it."""
+    """Down to 5e-12 at step 8,000, as in the paper."""
     decay = DecaySchedulerConfig(shape="exponential", final=5e-12 / lr, max_steps=8000)
     return _group(FusedAdamOptimizerConfig(lr=lr, eps=1e-15), decay)
 

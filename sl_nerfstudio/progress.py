@@ -1,4 +1,4 @@
-"""A progress bar for work that takes a person's time."""
+"""A progress bar for work that a person waits for."""
 
 import sys
 import time
@@ -8,14 +8,14 @@ from typing import TypeVar
 T = TypeVar("T")
 
 SHOW_AFTER_SECONDS = 2.0
-_shown = False  # one bar at a time: a bar inside a bar would fight for the same line
+_shown = False  # one bar at a time: nested bars would overwrite the same line
 
 
 def track(iterable: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
     """Yield the items of `iterable`, with a bar on stderr once the work has taken two seconds.
 
-    Quiet where stderr is not a terminal, for short work, and inside another tracked loop.
-    `total` is the number of items; taken from `len(iterable)` where that exists.
+    Shows nothing if stderr is not a terminal, for short work, and inside another tracked loop.
+    `total` is the number of items, by default `len(iterable)` if that exists.
     """
     global _shown
     if total is None and hasattr(iterable, "__len__"):

@@ -21,7 +21,7 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
-LOG = ROOT / "benchmarks" / "log.md"  # what was tried: names there are those of the time
+LOG = ROOT / "benchmarks" / "log.md"  # a record of experiments: it uses the names of its time
 PAGES = sorted(path for folder in (".", "docs", "benchmarks", "training") for path in (ROOT / folder).glob("*.md"))
 CURRENT = [page for page in PAGES if page != LOG]
 SCRIPTS: dict[str, str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -36,7 +36,7 @@ current_pages = pytest.mark.parametrize("page", CURRENT, ids=lambda page: str(pa
 
 
 def commands(page: Path) -> list[list[str]]:
-    """Words of every command in the page's code blocks (fenced or indented), comments and `$` cut off."""
+    """Words of every command in the page's code blocks (fenced or indented), without comments and `$`."""
     text = re.sub(r"\\\n\s*", "", page.read_text())
     found, fenced = [], False
     for line in text.splitlines():
@@ -169,7 +169,7 @@ def test_contributing_lists_folders_in_the_order_of_their_imports():
 
 
 @pages
-def test_links_lead_somewhere(page):
+def test_link_targets_exist(page):
     for target in LINK.findall(page.read_text()):
         if re.match(r"[a-z]+:", target):
             continue

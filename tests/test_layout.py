@@ -1,4 +1,4 @@
-"""The layout: folders in the order of the data, no circles, small files, nerfstudio only where it belongs."""
+"""The layout: folders in the order of the data, no import cycles, small files, nerfstudio only where it is allowed."""
 
 import ast
 import importlib.util
@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sl_nerfstudio"
 
-# Folders in the order in which data walks through them: each imports only from itself and from those before it.
+# Folders in the order in which data passes through them: each imports only from itself and from those before it.
 LAYERS = (
     "errors", "progress", "threads", "compiled", "geometry", "scan", "pattern", "synthesis", "decoding", "calibration",
     "relative_pose", "registration", "bundle_adjustment", "processing", "field", "rendering", "dataparser", "model",
@@ -28,7 +28,7 @@ each_module = pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path
 
 @cache
 def imports(path: Path) -> tuple[str, ...]:
-    """Absolute names of all modules that a file imports, wherever in it and for whatever: for types, too."""
+    """Absolute names of all modules that a file imports, anywhere in it and for any purpose, including types."""
     return tuple(_imports(path))
 
 
@@ -47,13 +47,13 @@ def _imports(path: Path) -> Iterator[str]:
 
 
 def file_of(module: str) -> Path | None:
-    """The file of a module of the package; None where there is no such module."""
+    """The file of a module of the package; None if there is no such module."""
     stem = ROOT.joinpath(*module.split("."))
     return next((f for f in (stem.with_suffix(".py"), stem / "__init__.py") if f.exists()), None)
 
 
 def layer(path: Path) -> str:
-    """The folder (or file) directly below the package that a file lies in."""
+    """The folder (or file) directly below the package that contains a file."""
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
@@ -73,8 +73,8 @@ def test_folders_import_only_from_those_before_them(path):
         assert own == "__init__" or LAYERS.index(layer(file)) <= LAYERS.index(own), f"{own} must not import {file}"
 
 
-def test_no_files_import_each_other_in_a_circle():
-    """Depth first; a file that is met again while its imports are still being followed closes a circle."""
+def test_no_files_import_each_other_in_a_cycle():
+    """Depth first; a file that is reached again while its imports are still being followed closes a cycle."""
     done: set[Path] = set()
 
     def follow(path: Path, way: tuple[Path, ...]) -> None:
@@ -109,7 +109,7 @@ def test_folders_are_small(folder):
     "path", sorted(PACKAGE.rglob("__init__.py")), ids=lambda path: str(path.parent.relative_to(ROOT))
 )
 def test_every_folder_says_what_comes_in_and_goes_out(path):
-    """Three sentences or so: what the folder is for, what comes in, what goes out."""
+    """About three sentences: what the folder is for, what goes in, what comes out."""
     text = ast.get_docstring(ast.parse(path.read_text())) or ""
     assert path.parent == PACKAGE or (text.count(".") >= 3 and "In:" in text and "Out:" in text), text
 

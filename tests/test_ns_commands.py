@@ -1,4 +1,4 @@
-"""nerfstudio's commands on a small scan: their own entry points, called in this process to import nerfstudio once."""
+"""nerfstudio's commands on a small scan: their entry points, called in this process to import nerfstudio only once."""
 
 import copy
 import json
@@ -35,7 +35,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.methods import sl_neus, sl_neus_paper
 from sl_nerfstudio.model.pipeline import SLPipeline
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
+pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
 
 SMALL = [
     "--pipeline.model.sdf.log2-table-size",
@@ -56,7 +56,7 @@ STEPS = 40
 
 @pytest.fixture(autouse=True)
 def _fresh_writers() -> Iterator[None]:
-    """nerfstudio keeps its log writers in a module; one command must not write into another's folder."""
+    """nerfstudio keeps its log writers in a module; one command must not write to another's folder."""
     yield
     for event_writer in writer.EVENT_WRITERS:
         tensorboard = getattr(event_writer, "tb_writer", None)
@@ -72,7 +72,7 @@ def call(entry: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, *arguments: 
 
 
 def train(monkeypatch: pytest.MonkeyPatch, root: Path, output: Path, steps: int, *more: object) -> Path:
-    """Train and give the run's config.yml."""
+    """Train and return the run's config.yml."""
     call(
         ns_train.entrypoint,
         monkeypatch,
@@ -117,7 +117,7 @@ def distance_to_sphere_mm(vertices: np.ndarray) -> np.ndarray:
 # ---- training
 
 
-def test_training_saves_and_says_what_next(
+def test_training_saves_and_prints_the_next_commands(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -142,7 +142,7 @@ def test_resumed_run_equals_an_uninterrupted_one(root: Path, tmp_path: Path, mon
     whole = final(train(monkeypatch, root, tmp_path / "whole", 24))
     half = train(monkeypatch, root, tmp_path / "half", 12, "--schedule-iterations", 24)
     rest = final(train(monkeypatch, root, tmp_path / "rest", 12, "--load-dir", half.parent / "nerfstudio_models"))
-    assert whole["schedulers"] == rest["schedulers"]  # the resumed run follows the first one's schedule, unasked
+    assert whole["schedulers"] == rest["schedulers"]  # the resumed run follows the first one's schedule by default
     for name, value in whole["pipeline"].items():
         torch.testing.assert_close(rest["pipeline"][name], value, rtol=0, atol=0, equal_nan=True, msg=name)
 
@@ -305,7 +305,7 @@ def test_a_gpu_that_is_not_there(
 
 
 def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
-    """The installed ns-train, in a process of its own."""
+    """The installed ns-train, in a separate process."""
     root = TinyScan(frames=2).write(tmp_path / "scan")
     (root / "coords/frame_00001.npz").unlink()
     (tmp_path / "here").mkdir()
@@ -321,7 +321,7 @@ def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
     assert not list((tmp_path / "here").iterdir())
 
 
-# ---- what can be done with a result
+# ---- commands that use a result
 
 
 def test_eval_writes_finite_json_about_held_out_pixels(
@@ -370,7 +370,7 @@ def test_export_tsdf(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     )
     mesh = trimesh.load(tmp_path / "tsdf_mesh.ply")
     S = pipeline.datamanager.dataparser.loaded.S_scene_world.inverse()
-    # half of the mesh is the unseen inside of nerfstudio's volume; the sphere must be in it
+    # half of the mesh is the unobserved inside of nerfstudio's volume; the sphere must be in it
     assert (distance_to_sphere_mm(S.points(np.asarray(mesh.vertices))) < 3).mean() > 0.3
 
 
@@ -384,8 +384,8 @@ def test_export_cameras_gives_the_refined_poses(
         np.testing.assert_allclose([f["transform"] for f in frames], refined[:, :3].numpy(), atol=1e-5)
 
 
-def test_export_marching_cubes_finds_what_it_asks_for(pipeline: SLPipeline) -> None:
-    """The command itself needs CUDA, whatever the machine; these are the two things it takes from a model."""
+def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline) -> None:
+    """The command itself needs CUDA on any machine; these are the two attributes of a model that it uses."""
     assert hasattr(pipeline.model.config, "sdf_field")
     p = torch.rand(100, 3) * 2 - 1
     torch.testing.assert_close(pipeline._sl_model.field.forward_geonetwork(p)[:, 0], pipeline._sl_model.sdf(p))
@@ -464,7 +464,7 @@ def test_viewer_checkboxes_hide_frusta(viewer: Viewer, pipeline: SLPipeline) -> 
 
 
 def test_every_output_can_be_shown(pipeline: SLPipeline) -> None:
-    """The viewer knows floats of one or three channels only, and asks from cameras of no frame."""
+    """The viewer supports only floats of one or three channels, and uses cameras that are not those of a frame."""
     cameras = copy.deepcopy(pipeline.datamanager.train_dataset.cameras[0:1])
     cameras.metadata = {"cam_idx": 0}
     outputs = pipeline.model.eval().get_outputs_for_camera(cameras)

@@ -1,4 +1,4 @@
-"""What the package promises as a whole: entry points, commands and their help, dependencies, layers, no network."""
+"""Guarantees of the whole package: entry points, commands and their help, dependencies, layers, no network."""
 
 import ast
 import dataclasses
@@ -25,12 +25,12 @@ PACKAGE = ROOT / "sl_nerfstudio"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SCRIPTS: dict[str, str] = PROJECT["scripts"]
 
-# A dependency whose import is not called as its distribution is.
+# Dependencies whose import name differs from the name of the distribution.
 IMPORTED_AS = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
 # Declared without being imported here, each with the reason.
 NOT_IMPORTED: dict[str, str] = {}
 
-# Runs a command's `main` with --help and prints the heavy modules that this loaded. Sockets raise.
+# Runs a command's `main` with --help and prints the slow modules that this loaded. Sockets raise.
 HELP = """
 import importlib, socket, sys
 def refuse(*a, **k): raise RuntimeError("a help text reached for the network")
@@ -50,7 +50,7 @@ def modules() -> list[Path]:
 
 
 def imports(path: Path) -> Iterator[str]:
-    """Absolute names of all modules that a file imports, wherever in it."""
+    """Absolute names of all modules that a file imports, anywhere in it."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (name.name for name in node.names)
@@ -74,7 +74,7 @@ def test_version_is_that_of_the_installed_package():
 
 
 @pytest.mark.parametrize("group", ["nerfstudio.method_configs", "nerfstudio.dataparser_configs"])
-def test_entry_points_load_under_the_name_they_are_registered_by(group):
+def test_entry_points_load_under_their_registered_names(group):
     declared = PROJECT["entry-points"][group]
     found = {e.name: e for e in importlib.metadata.entry_points(group=group) if e.value in declared.values()}
     assert found.keys() == declared.keys()
@@ -86,7 +86,7 @@ def test_entry_points_load_under_the_name_they_are_registered_by(group):
 
 
 def test_help_templates_and_weights_are_inside_the_package_folder():
-    """The wheel holds the package folder and nothing else, so a file that code reads must lie there."""
+    """The wheel contains only the package folder, so a file that code reads must be there."""
     templates = [path for path in PACKAGE.rglob("*.html*")]
     assert templates, "the report's template"
 
@@ -136,8 +136,8 @@ def test_help_needs_no_heavy_import_and_no_network(script):
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_flag_says_what_it_is(script):
-    """What is left of a flag's help without its name, its type and its default has to be words."""
+def test_every_flag_is_explained(script):
+    """The help of a flag must contain words besides its name, its type and its default."""
     environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1"}
     command = [sys.executable, "-c", HELP, SCRIPTS[script], script]
     text = subprocess.run(command, capture_output=True, text=True, env=environment).stdout
@@ -149,8 +149,8 @@ def test_every_flag_says_what_it_is(script):
         assert re.search(r"\w+ \w+", explanation), f"{script}: {flag} is not explained"
 
 
-def test_every_setting_of_the_methods_says_what_it_is():
-    """`ns-train sl-neus --help` shows the text below each field; fields of nerfstudio's are its own."""
+def test_every_setting_of_the_methods_is_explained():
+    """`ns-train sl-neus --help` shows the text below each field; nerfstudio's own fields are not checked."""
     for name, cls in config_classes():
         source = ast.parse(Path(sys.modules[cls.__module__].__file__ or "").read_text())
         body = next(node for node in ast.walk(source) if isinstance(node, ast.ClassDef) and node.name == name).body
@@ -165,7 +165,7 @@ def test_every_setting_of_the_methods_says_what_it_is():
 
 
 def config_classes() -> list[tuple[str, type]]:
-    """Every settings class of ours that the methods are made of."""
+    """Every settings class of this package that the methods use."""
     from sl_nerfstudio import methods
 
     found: dict[str, type] = {}

@@ -9,14 +9,14 @@ from sl_nerfstudio.progress import track
 
 
 class Terminal(io.StringIO):
-    """What rich takes for a terminal."""
+    """A stream that rich treats as a terminal."""
 
     def isatty(self) -> bool:
         return True
 
 
 def use_terminal(monkeypatch: pytest.MonkeyPatch, show_after: float = -1.0) -> Terminal:
-    """From here on stderr is a terminal (in a fixture pytest would put its own stream back)."""
+    """From now on stderr is a terminal (in a fixture, pytest would restore its own stream)."""
     stream = Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
@@ -59,7 +59,7 @@ def test_one_bar_at_a_time_and_errors_pass_through(monkeypatch: pytest.MonkeyPat
     assert progress._shown is False
 
 
-def test_leaving_early_frees_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leaving_a_loop_early_releases_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     use_terminal(monkeypatch)
     for item in track(range(10), "Working"):
         if item == 4:

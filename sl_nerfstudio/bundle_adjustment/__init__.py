@@ -1,5 +1,6 @@
-"""All poses, and on request the intrinsics, adjusted together by second-order steps on decoded coordinates.
+"""Joint adjustment of all poses, and of the intrinsics on request, by second-order steps on decoded coordinates.
 
-In: a `Rig` of starting poses, the coordinate images of all frames, a prior with the stated uncertainties, what is free.
-Out: the adjusted `Rig`, its covariance, and how well the intrinsics agree with the captures; facts only, no messages.
+In: a `Rig` of starting poses, the coordinate images of all frames, a prior with the stated uncertainties, and which
+parameters are free. Out: the adjusted `Rig`, its covariance, and how well the intrinsics agree with the captures; facts
+only, no messages.
 """

@@ -27,7 +27,7 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_torch_thread
 
-_NO_GATE = float("inf")  # pixels: no residual is too large to be looked at
+_NO_GATE = float("inf")  # pixels: no residual is too large to be used
 
 
 @dataclass(frozen=True)
@@ -54,19 +54,20 @@ class _Stage:
     """A part of the adjustment."""
 
     refine: RefinePoses
-    rough: bool  # residuals still come from wrong poses: those of one frame err together, and count as few
+    rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
     iterations: int  # at most
 
 
 def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
-    """Frames move as wholes; then everything moves; then everything moves with every residual at full weight.
+    """First frames move as a whole; then everything moves; then everything moves with all residuals at full weight.
 
-    As long as poses are wrong, the thousands of residuals of a frame are a handful of independent measurements. Counted
-    as thousands they would overrule the prior along directions that they hardly determine, and the scene would drift.
+    While poses are wrong, the thousands of residuals of a frame amount to only a few independent measurements. If they
+    counted as thousands, they would overrule the prior along directions that they hardly determine, and the scene would
+    drift.
     """
     rough = max(settings.max_iterations // 2 - settings.rigid_iterations, 1)
     found = [_Stage(refine, True, rough), _Stage(refine, False, settings.max_iterations)]
-    if refine in ("free", "rigid-rig"):  # a static projector has its place already
+    if refine in ("free", "rigid-rig"):  # a static projector is already in place
         found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
     return found
 
@@ -91,7 +92,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Progress:
-    """How far an adjustment has come."""
+    """The current state of an adjustment."""
 
     state: LMState
     rows: Observations
@@ -105,13 +106,13 @@ class _Progress:
         return self.rows.pairs(self.state.anchors)
 
     def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "_Progress":
-        """The same with some frames elsewhere: their kernels open again."""
+        """The same with some frames at other poses; the kernels of those frames are wide again."""
         widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
         return replace(self, state=replace(self.state, rig=rig), widths=widths)
 
 
 def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
-    """Steps of one stage, until nothing moves any more."""
+    """Take the steps of one stage, until nothing moves any more."""
     start, maps, s = problem.start, problem.maps, problem.settings
     found = replace(found, state=replace(found.state, damping=s.steps.damping))
     for iteration in track(range(stage.iterations), "Adjusting poses"):
@@ -147,8 +148,8 @@ def adjust(
 ) -> Adjustment:
     """Adjust all poses together. The scene must be normalised: origin at the object's centre, radius about one.
 
-    The gauge stays where the prior puts it; `gauge.restore` pins the scale. Frames that share nothing with others stay
-    where they are.
+    The gauge stays where the prior puts it; `gauge.restore` sets the scale afterwards. Frames that share nothing with
+    others do not move.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // start.frames))
@@ -171,7 +172,7 @@ def adjust(
 
 
 def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _Progress) -> _Progress:
-    """Lost frames are placed again, and everything adjusted with them, as long as that finds any."""
+    """Place lost frames again and adjust everything with them, until no frame moves any more."""
     if refine not in ("free", "rigid-rig", "known-rig"):
         return found
     for _ in range(problem.settings.relocalisation.rounds):
@@ -187,7 +188,7 @@ def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _
 
 
 def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: float) -> Adjustment:
-    """Poses with their covariance: every residual at full weight, in whichever stage the steps ended."""
+    """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     state, maps = found.state, problem.maps
     linear = linearise(state.rig, state.anchors, found.rows, maps)
     r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
@@ -208,7 +209,7 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
 
 
 def _unmoved(start: Rig, prior: PosePrior, B: Tensor, settings: AdjustmentSettings) -> Adjustment:
-    """The starting poses, where no step is wanted or no frame sees what another decoded; known as the prior says."""
+    """The starting poses with the prior's uncertainty, if no step is allowed or no frame sees what another decoded."""
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
     noise = settings.kernel.noise_floor_px

@@ -1,9 +1,9 @@
 """Decoded coordinate images of all frames, looked up between pixels.
 
 A look-up fits a paraboloid to the decoded pixels of a small window: this averages the decoding noise,
-gives the derivative with respect to the pixel, and shows where the map is torn (edges, wrong cells).
-(A plane would average better, but on a curved surface it is off by the same amount everywhere, and the
-adjustment would turn that offset into wrong poses.)
+provides the derivative with respect to the pixel, and shows where the map is discontinuous (edges, wrong
+cells). (A plane would average better, but on a curved surface it is off by the same amount everywhere, and
+the adjustment would turn that offset into wrong poses.)
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class MapSample:
 
     uv_projector: Float[Tensor, "n 2"]
     jacobian: Float[Tensor, "n 2 2"]  # d uv_projector / d uv_camera
-    valid: Bool[Tensor, "n"]  # enough decoded pixels, and they lie on a paraboloid
+    valid: Bool[Tensor, "n"]  # enough decoded pixels, and a paraboloid fits them
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class CoordinateMaps:
     widths: Int[Tensor, "frames"]
     heights: Int[Tensor, "frames"]
     settings: LookUpSettings
-    max_roughness: float  # projector pixels; rougher windows are torn
+    max_roughness: float  # projector pixels; rougher windows are discontinuous
 
     @staticmethod
     def of(images: Sequence[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
@@ -77,14 +77,14 @@ class CoordinateMaps:
         return torch.stack([chosen % w + 0.5, chosen // w + 0.5], -1).double()
 
     def look_up(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> MapSample:
-        """Fits around positions in the camera images of `frame`; invalid outside the image."""
+        """Fit around positions in the camera images of `frame`; invalid outside the image."""
         fit, roughness = self._fit(frame, uv_camera)
         return MapSample(fit[:, 0], fit[:, 1:].transpose(1, 2), roughness < self.max_roughness)
 
     def _fit(
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]
     ) -> tuple[Float[Tensor, "n 3 2"], Float[Tensor, "n"]]:
-        """Value and derivatives by x and y, and the window's RMS distance from the paraboloid: infinite where none."""
+        """Value, derivatives by x and y, and the window's RMS distance from the paraboloid (infinite without a fit)."""
         n = len(frame)
         fit, roughness = np.zeros((n, 3, 2)), np.full(n, np.inf)
         _fit_paraboloids(
@@ -102,7 +102,7 @@ class CoordinateMaps:
         return torch.from_numpy(fit), torch.from_numpy(roughness)
 
     def _median_roughness(self) -> float:
-        """Of windows all over the frames; 0 where nothing is decoded."""
+        """Median roughness of windows all over the frames; 0 if nothing is decoded."""
         generator = torch.Generator().manual_seed(0)
         drawn = [self.draw(k, self.settings.sampled_windows, generator) for k in range(self.frames)]
         frame = torch.repeat_interleave(torch.arange(self.frames), torch.tensor([len(d) for d in drawn]))
@@ -121,7 +121,7 @@ class CoordinateMaps:
 
 @compiled_range
 def _fit_paraboloids(first, last, values, offsets, widths, heights, frame, uv, limits, fit, roughness):
-    """Least squares of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` around each position, from its window."""
+    """Least-squares fit of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` to the window of each position."""
     half_window, least_pixels, least_pivot = limits
     for k in range(first, last):
         f, px, py = frame[k], uv[k, 0], uv[k, 1]

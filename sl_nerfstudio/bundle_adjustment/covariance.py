@@ -2,9 +2,9 @@
 
 The inverse of the normal matrix assumes independent residuals. Those of one corner of one image are not independent: a
 lens that is modelled slightly wrong, or a systematic error of the decoding, pushes all of them the same way. So the
-gradient is summed over blocks of each image, and the spread of those sums gives a second estimate (the cluster-robust
-"sandwich": Liang and Zeger, Biometrika 1986). The larger of the two is stated. Intrinsics are uncertain, too
-(`self_calibration`).
+gradient is summed over blocks of each image, and the spread of those sums provides a second estimate (the
+cluster-robust "sandwich": Liang and Zeger, Biometrika 1986). The larger of the two is reported. The intrinsics are
+uncertain, too (`self_calibration`).
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalib
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 
-_EXACT = 1e-9  # stands for an uncertainty of zero
+_EXACT = 1e-9  # used for an uncertainty of zero
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Residuals at the result, with their derivatives (by the intrinsics, too) and weights."""
+    """Residuals at the result, with their weights and derivatives (including those by the intrinsics)."""
 
     rig: Rig
     anchors: Anchors
@@ -42,7 +42,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class PoseCovariance:
-    """Covariance of the poses at the result, and what the residuals say about the intrinsics."""
+    """Covariance of the poses at the result, and the self-calibration of the intrinsics."""
 
     covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho); the gauge is projected out
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
@@ -51,10 +51,10 @@ class PoseCovariance:
 def pose_covariance(
     evidence: Evidence, B: Float[Tensor, "unknowns k"], start: Rig, prior: PosePrior, noise: float
 ) -> PoseCovariance:
-    """Second moments of the errors of poses that were found with the present intrinsics.
+    """Second moments of the errors of poses that were found with the current intrinsics.
 
-    `B` spans the free parameters, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. What
-    the poses would still move if the intrinsics followed the captures counts as an error, too.
+    `B` spans the free parameters, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. How
+    far the poses would move if the intrinsics followed the captures counts as an error, too.
     """
     e, n = evidence, evidence.rig.frames
     if B.shape[1] == 0:
@@ -75,7 +75,7 @@ def pose_covariance(
     formal = noise**2 * P @ B @ H_inverse @ B.T @ P.T
     sums = _block_sums(e, equations, *weights) @ B
     blocks = int((sums != 0).any(1).sum())
-    free = max(blocks - B.shape[1], blocks / 4)  # degrees of freedom that the fit of the poses leaves
+    free = max(blocks - B.shape[1], blocks / 4)  # degrees of freedom left after the fit of the poses
     spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
     robust = P @ B @ H_inverse @ spread @ H_inverse @ B.T @ P.T
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
@@ -94,7 +94,7 @@ def _block_sums(
     own_weight: Float[Tensor, "anchors"],
     cross_weight: Float[Tensor, "rows"],
 ) -> Float[Tensor, "blocks unknowns"]:
-    """Gradient of the poses from each block of each image, depths eliminated."""
+    """Gradient of the poses from each block of each image, with depths eliminated."""
     n, r, size = e.rig.frames, e.linear.residuals, e.linear.unknowns
     own_block, cross_block = _blocks_of(e)
     out = torch.zeros(n * e.image_blocks**2 * size, dtype=torch.float64)
@@ -111,7 +111,7 @@ def _block_sums(
 
 
 def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
-    """The block of its own image in which an anchor lies, and that of the other image in which it is looked up."""
+    """The block that holds an anchor in its own image, and the block of the other image in which it is looked up."""
     rig, p_camera = e.rig, e.anchors.depth[:, None] * e.anchors.d_camera
     at = project(rig.camera[e.anchors.frame], p_camera)[0]
     p_world = transform(rig.T_world_camera[e.anchors.frame], p_camera)[e.rows.anchor]
@@ -131,13 +131,13 @@ def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]
 
 
 def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndarray, "frames 4"]:
-    """RMS per axis: frame translation (scene units times `unit`), frame rotation (degree), the same relative."""
+    """RMS per axis of frame translation (scene units times `unit`) and rotation (degrees), then of relative poses."""
     parts = sigma.reshape(-1, 4, 3).pow(2).mean(-1).sqrt().cpu().numpy()
     return parts * np.array([unit, 180 / np.pi, unit, 180 / np.pi])
 
 
 def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
-    """`noise^2 / H` with the gauge projected out: right if residuals are independent."""
+    """`noise^2 / H` with the gauge projected out; correct if residuals are independent."""
     if B.shape[1] == 0:
         return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
     P = _without_gauge(rig, len(B))
@@ -145,7 +145,7 @@ def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "u
 
 
 def _without_gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns unknowns"]:
-    """Projection of steps of the poses (and of unknowns after them) that removes what moves the whole scene."""
+    """Projection of steps of the poses (and of unknowns after them) that removes motion of the whole scene."""
     G = torch.zeros(unknowns, 7, dtype=torch.float64)
     G[: 12 * rig.frames] = gauge_directions(rig)
     return torch.eye(unknowns, dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)

@@ -1,8 +1,8 @@
 """Are adjusted poses better? Pixels that took no part in the adjustment decide, by a paired comparison.
 
-Each held-out pixel has the same residuals under both sets of poses, so their differences are compared with zero, not
-two means with each other. Residuals within a small block of an image depend on each other: blocks are the independent
-samples from which the standard error follows.
+Each held-out pixel has the same residuals under both sets of poses. So the mean of their differences is compared with
+zero, rather than two means with each other. Residuals within a small block of an image depend on each other: blocks are
+the independent samples from which the standard error follows.
 """
 
 from dataclasses import dataclass
@@ -35,15 +35,15 @@ class HeldOutPixels:
 class CrossValidation:
     """How well held-out pixels agree with two sets of poses; robust residuals in projector pixels."""
 
-    before_px: float  # robust RMS residual with the poses before
+    before_px: float  # robust RMS residual with the old poses
     after_px: float
     difference: float  # mean of the paired differences of squared robust residuals, after minus before, px^2
     standard_error: float  # of that mean; infinite for fewer than two blocks
-    standard_errors: float  # by which the difference must lie below zero
+    standard_errors: float  # by which the difference must be below zero
 
     @property
     def better(self) -> bool:
-        """Whether the poses after are to be kept: better by more than chance."""
+        """Whether to keep the new poses: they are better by more than chance."""
         return self.difference < -self.standard_errors * self.standard_error
 
 
@@ -58,7 +58,7 @@ def cross_validate(
 ) -> CrossValidation:
     """Compare two sets of poses on the same pixels and the same pairs of frames.
 
-    A residual counts as r^2 / (1 + r^2 / width^2): a wrong decoding costs width^2 whatever the poses. `noise_px` is the
+    A residual counts as r^2 / (1 + r^2 / width^2): a wrong decoding costs width^2 with any poses. `noise_px` is the
     decoding noise of one look-up.
     """
     settings = settings or AdjustmentSettings()
@@ -81,7 +81,7 @@ def cross_validate(
 def _robust_squares(
     rig: Rig, held_out: HeldOutPixels, rows: Observations, maps: CoordinateMaps, width: float
 ) -> Float[Tensor, "residuals"]:
-    """Robust squares of the own residuals, then of the cross residuals; width^2 where there is none."""
+    """Robust squares of the own residuals, then of the cross residuals; width^2 for those that do not exist."""
     r = residuals_of(rig, _anchors(rig, held_out), rows, maps)
     own2 = torch.nan_to_num((r.own**2).sum(-1), nan=float("inf"))
     cross2 = torch.where(r.cross_valid, (r.cross**2).sum(-1), torch.full_like(r.cross[:, 0], float("inf")))
@@ -90,7 +90,7 @@ def _robust_squares(
 
 
 def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple[float, float]:
-    """Mean, and its standard error where the values of a block may depend on each other in any way.
+    """Mean and its standard error, if the values within a block may depend on each other in any way.
 
     The error of a ratio of sums over blocks (Cochran, Sampling Techniques, 1977, section 6.3).
     """
@@ -108,6 +108,6 @@ def _anchors(rig: Rig, held_out: HeldOutPixels) -> Anchors:
     T = rig.T_camera_projector[held_out.frame]
     d_projector = (T[:, :3, :3] @ unproject(rig.projector, held_out.uv_projector)[..., None]).squeeze(-1)
     depth, _ = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
-    # No map surrounds a held-out pixel, so there is no normal; "towards the camera" is near enough to choose who sees
-    # it.
+    # No map surrounds a held-out pixel, so there is no normal; "towards the camera" is accurate enough to choose the
+    # frames that see it.
     return Anchors(held_out.frame, d_camera, held_out.uv_projector, torch.nan_to_num(depth, nan=1.0), -d_camera)

@@ -1,4 +1,4 @@
-"""What is free to move while poses are refined."""
+"""Which parameters are free while poses are refined."""
 
 from typing import Literal
 
@@ -13,7 +13,7 @@ RefinePoses = Literal["free", "rigid-rig", "known-rig", "static-projector", "off
 
 
 def free_parameters(refine: RefinePoses, rig: Rig) -> Float[Tensor, "unknowns k"]:
-    """Columns: the increments (delta, rho) of all frames that a mode leaves free at a rig."""
+    """A basis (in columns) of the increments (delta, rho) of all frames that a choice leaves free at a rig."""
     n, eye = rig.frames, torch.eye(6 * rig.frames, dtype=torch.float64)
     zero = torch.zeros_like(eye)
     delta = torch.cat([eye, zero])
@@ -32,12 +32,12 @@ def free_parameters(refine: RefinePoses, rig: Rig) -> Float[Tensor, "unknowns k"
 
 
 def constrained(refine: RefinePoses, rig: Rig) -> Rig:
-    """A rig that a mode can reach, for a given one to start from: a pose that frames share becomes their mean."""
+    """A starting rig that satisfies a choice: a pose that all frames share is replaced by its mean over the frames."""
     if refine == "rigid-rig":
         mean = mean_pose(rig.T_camera_projector)
         return Rig(rig.camera, rig.projector, rig.T_world_camera, mean.expand_as(rig.T_camera_projector).clone())
     if refine == "static-projector":
-        # relative poses come from each frame's own coordinates: better known than the frames' places in the world
+        # relative poses come from each frame's own coordinates: they are better known than the frames' world poses
         camera = mean_pose(rig.T_world_projector) @ inverse(rig.T_camera_projector)
         return Rig(rig.camera, rig.projector, camera, rig.T_camera_projector)
     return rig

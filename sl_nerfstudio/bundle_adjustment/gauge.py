@@ -1,8 +1,8 @@
-"""The seven degrees of freedom that no measurement fixes: where the world is, and how long a unit is.
+"""The seven degrees of freedom that no measurement fixes: position and orientation of the world, and its scale.
 
-After an adjustment the whole scene is moved by one similarity, which changes no residual. The scale returns to what is
-known of it (a baseline, or all lengths of the starting poses), else to the geometric mean of the baselines; position
-and orientation return to the best agreement, in least squares, with the starting poses.
+After an adjustment the whole scene is moved by one similarity, which changes no residual. The scale is set to its known
+value (from a baseline, or from all lengths of the starting poses), else to the geometric mean of the baselines.
+Position and orientation are set to the best agreement with the starting poses, in least squares.
 """
 
 import math
@@ -20,7 +20,7 @@ _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
 
 
 def baseline_scale(start: Rig, rig: Rig, frame: int | None) -> float:
-    """The factor that gives `rig` the baseline that `frame` has in `start`; None: the geometric mean of all."""
+    """The factor that gives `rig` the baseline that `frame` has in `start`; for None, the geometric mean of all."""
     log_ratio = torch.log(start.baseline / rig.baseline)
     return float(torch.exp(log_ratio.mean() if frame is None else log_ratio[frame]))
 
@@ -28,9 +28,9 @@ def baseline_scale(start: Rig, rig: Rig, frame: int | None) -> float:
 def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
     """The factor for which all lengths of `rig`, between frames and within them, agree best with the starting poses.
 
-    The maximum of the prior over similarities. A small rotation of the projectors against their cameras looks like a
-    longer baseline (by distance^2 / baseline: at 270 mm and 26 mm, 0.1 degree is 2 %). Where the positions of the
-    frames are known, too, they determine the scale better.
+    It maximises the prior over similarities. A small rotation of the projectors against their cameras looks like a
+    longer baseline (by distance^2 / baseline: at 270 mm and 26 mm, 0.1 degree is 2 %). If the positions of the frames
+    are known, too, they determine the scale better.
     """
     scale = baseline_scale(start, rig, None)
     for _ in range(_MOST_STEPS):
@@ -45,7 +45,7 @@ def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
 
 
 def restore(start: Rig, rig: Rig, scale: float) -> Rig:
-    """The adjusted rig, `scale` times as large, placed and turned as the start is."""
+    """The adjusted rig, `scale` times as large, aligned with the position and orientation of the start."""
     scaled = rig.scaled(scale)
     ahead = start.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
     S = fit_similarity(_axes_points(scaled, ahead).numpy(), _axes_points(start, ahead).numpy(), with_scale=False)
@@ -54,7 +54,7 @@ def restore(start: Rig, rig: Rig, scale: float) -> Rig:
 
 
 def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
-    """Increments (delta, rho) that move the whole scene by a similarity: they change no residual."""
+    """Increments (delta, rho) that move the whole scene by a similarity and change no residual."""
     n = rig.frames
     out = torch.zeros(2, n, 6, 7, dtype=torch.float64)
     out[0, :, :, :6] = torch.eye(6, dtype=torch.float64)
@@ -64,9 +64,9 @@ def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
 
 
 def _axes_points(rig: Rig, distance: Float[Tensor, "frames 1"]) -> Float[Tensor, "n 3"]:
-    """Camera centres, and for each the point `distance` ahead of it, about where it sees the scene's centre.
+    """Camera centres, and for each the point `distance` in front of it, near the scene's centre.
 
-    Points near the scene count as much as the far-away cameras: turning one camera moves its point, too.
+    Points near the scene count as much as the distant cameras, so rotating one camera has an effect, too.
     """
     T = rig.T_world_camera
     centre = T[:, :3, 3]

@@ -17,12 +17,12 @@ from sl_nerfstudio.bundle_adjustment.settings import StepSettings
 
 @dataclass(frozen=True)
 class LMState:
-    """Where an adjustment stands."""
+    """The current estimate of an adjustment."""
 
     rig: Rig
     anchors: Anchors
     damping: float
-    size: float = 0.0  # of the last step: scene units or radian, the largest; 0 where no step lowered the objective
+    size: float = 0.0  # largest component of the last step, scene units or radian; 0 if no step lowered the objective
 
 
 def lm_step(
@@ -35,7 +35,7 @@ def lm_step(
     B: Float[Tensor, "unknowns k"],
     settings: StepSettings,
 ) -> LMState:
-    """A step along the columns of `B` that lowers the whole objective, damped until it does (Levenberg-Marquardt).
+    """Take a step along the columns of `B`, damped until it lowers the whole objective (Levenberg-Marquardt).
 
     The objective is the robust cost of the residuals that exist before and after the step, plus the prior.
     """

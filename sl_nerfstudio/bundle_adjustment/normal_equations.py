@@ -14,7 +14,7 @@ from sl_nerfstudio.threads import threads
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Gauss-Newton equations of all unknowns but the depths, which are eliminated."""
+    """Gauss-Newton equations of all unknowns except the depths, which are eliminated."""
 
     H: Float[Tensor, "unknowns unknowns"]
     g: Float[Tensor, "unknowns"]
@@ -23,7 +23,7 @@ class NormalEquations:
     g_depth: Float[Tensor, "anchors"]
 
     def depth_step(self, step: Float[Tensor, "unknowns"]) -> Float[Tensor, "anchors"]:
-        """Change of the depths that goes with a step of the other unknowns."""
+        """Change of the depths that follows from a step of the other unknowns."""
         return -(self.g_depth + self.depth_by_rest @ step) / self.H_depth
 
 
@@ -63,7 +63,7 @@ def normal_equations(
 
 @compiled_range
 def _accumulate(first, last, J, weight, columns, partial):
-    """Lower triangle of `sum_n w_n J_n^T J_n`, in partial sums that threads make by themselves."""
+    """Lower triangle of `sum_n w_n J_n^T J_n`, in partial sums, one per thread."""
     parts, rows, width = partial.shape[0], J.shape[0], J.shape[2]
     for t in range(first, last):
         for n in range(t * rows // parts, (t + 1) * rows // parts):

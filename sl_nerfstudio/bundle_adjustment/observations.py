@@ -35,7 +35,7 @@ def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: tor
 def _meet(
     rig: Rig, frame: int, uv_camera: Float[Tensor, "*n 2"], uv_projector: Float[Tensor, "*n 2"]
 ) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-    """Points on camera rays of a frame nearest to those of its projector, in camera axes; in front of both devices?"""
+    """Points on a frame's camera rays nearest to its projector rays, in camera axes; whether in front of both."""
     d_camera = unproject(rig.camera[frame], uv_camera)
     T = rig.T_camera_projector[frame]
     d_projector = rotate(T, unproject(rig.projector, uv_projector))
@@ -55,10 +55,10 @@ def observe(
     generator: torch.Generator,
     around: int | None = None,
 ) -> Observations:
-    """For every anchor up to `per_anchor` other frames that decoded something near it, within `gate_px` of it.
+    """For every anchor, up to `per_anchor` other frames that decoded something near it, within `gate_px` of it.
 
     Frames whose camera or projector is behind the anchor's surface, or sees it at a cosine below `least_cosine`, are
-    left out: they see, or light, another side of the object. With `around`, only what one frame takes part in.
+    left out: they see, or light, another side of the object. With `around`, only observations that involve one frame.
     """
     chosen = []
     devices = (rig.T_world_camera, rig.T_world_projector)

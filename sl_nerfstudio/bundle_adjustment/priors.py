@@ -1,4 +1,4 @@
-"""What is known of poses and intrinsics before any residual is computed."""
+"""What is known about poses and intrinsics before any residual is computed."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 
-INTRINSICS_SIGMA = 0.005  # share of the focal length, where nobody says how well the intrinsics are known
+INTRINSICS_SIGMA = 0.005  # share of the focal length, if the uncertainty of the intrinsics is not stated
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class PosePrior:
     relative_translation: Float[Tensor, "frames"]
     relative_rotation: Float[Tensor, "frames"]
     intrinsics: float = INTRINSICS_SIGMA  # focal lengths and principal points, as a share of the focal length
-    intrinsics_change: IntrinsicsChange = UNCHANGED  # how far the devices are from what was stated of them
+    intrinsics_change: IntrinsicsChange = UNCHANGED  # of the devices, relative to the stated intrinsics
 
     @property
     def sigma(self) -> Float[Tensor, "frames 12"]:
@@ -33,9 +33,9 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class PriorTerm:
-    """The prior's part of the objective: squared departures from the starting poses in units of their sigma.
+    """The prior's part of the objective: squared differences from the starting poses in units of their sigma.
 
-    `weight` brings it to the unit of the data's part (px^2).
+    `weight` converts it to the unit of the data's part (px^2).
     """
 
     prior: PosePrior
@@ -56,7 +56,7 @@ class PriorTerm:
 def prior_equations(
     prior: PosePrior, start: Rig, rig: Rig
 ) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
-    """Information matrix and gradient of the departure from the starting poses, by (delta, rho) of all frames."""
+    """Information matrix and gradient of the difference from the starting poses, by (delta, rho) of all frames."""
     n = rig.frames
     weight = 1 / prior.sigma**2
     w_frame, w_relative = weight[:, :6], weight[:, 6:]
@@ -73,7 +73,7 @@ def prior_equations(
 
 
 def _frame_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
-    """Increment that leads each frame as a whole from its start to where it is."""
+    """Increment that moves each frame as a whole from its starting pose to its current one."""
     return log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
 
 
@@ -87,6 +87,6 @@ def _relative_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
 def rough_weight(noise: float, residuals_per_frame: float, independent: float) -> float:
     """Weight of the prior while residuals come from wrong poses rather than from noise.
 
-    The residuals of a frame then err together: they count as `independent` measurements, however many they are.
+    The residuals of a frame are then correlated: they count as `independent` measurements, however many there are.
     """
     return noise**2 * max(residuals_per_frame / independent, 1.0)

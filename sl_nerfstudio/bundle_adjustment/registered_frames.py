@@ -29,13 +29,14 @@ class RegisteredFramesSettings:
     """Bundle adjustment after a registration by surfaces."""
 
     frame_rotation_deg: float = 1.0
-    """What registration leaves of each frame's rotation, 1 sigma per axis, in degrees."""
+    """Error of each frame's rotation after registration, 1 sigma per axis, in degrees."""
     frame_translation: float = 0.03
     """The same for its position, as a share of the object's radius."""
     baseline_length: float = 0.02
-    """What it leaves of a baseline's length, 1 sigma of the logarithm."""
+    """Error of a baseline's length after registration, 1 sigma of the logarithm."""
     least_relative_rotation_deg: float = 0.02
-    """Smallest sigma of the relative rotation, in degrees: wrong intrinsics are not in a frame's own covariance."""
+    """Smallest sigma of the relative rotation, in degrees: a frame's own covariance does not include wrong
+    intrinsics."""
     dependence: float = 2.0
     """Factor on the stated sigma: look-ups share pixels, cells and edges, and errors on synthetic scans are about twice
     as large as independent residuals suggest."""
@@ -52,7 +53,7 @@ class AdjustedFrames:
     poses: DevicePoses
     sigma: tuple[PoseSigma | None, ...]  # of the frame as a whole, and of projector against camera; per axis
     noise_px: float  # of one look-up, projector pixels
-    median_before_px: float  # cross-frame residual before
+    median_before_px: float  # cross-frame residual before the adjustment
     median_after_px: float
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
 
@@ -72,7 +73,7 @@ class AdjustedFrames:
         return replace(self, poses=self.poses.mapped(S_target_world), sigma=sigma)
 
     def scaled(self, factor: float) -> "AdjustedFrames":
-        """With all lengths multiplied: what makes a scan metric."""
+        """With all lengths multiplied, which makes a scan metric."""
         return self.mapped(Similarity(factor, np.eye(3), np.zeros(3)))
 
 
@@ -117,7 +118,7 @@ def adjust_registered(
 
 
 def _among_all(poses: DevicePoses, index: Sequence[int], frames: int) -> DevicePoses:
-    """Poses of some frames in the places of those frames among all; NaN elsewhere."""
+    """Poses of some frames, at the indices of those frames among all; NaN elsewhere."""
     camera, projector = np.full((2, frames, 4, 4), np.nan)
     camera[index], projector[index] = poses.T_world_camera, poses.T_world_projector
     return DevicePoses(camera, projector)
@@ -148,7 +149,7 @@ def _prior(
     scale: float,
     settings: RegisteredFramesSettings,
 ) -> PosePrior:
-    """How well registration and relative pose estimation know each frame; scene units."""
+    """Uncertainty of each frame after registration and relative pose estimation; scene units."""
     rows = []
     for k in index:
         pose, length = clouds[k].pose, registration.baseline[k] * scale

@@ -1,7 +1,7 @@
-"""Frames that ended in a wrong minimum while the others agreed: each is placed again by itself.
+"""Frames that ended in a wrong minimum while the others agreed: each is placed again on its own.
 
-With all other frames held, a frame is six unknowns and thousands of residuals. From a wide kernel, and from a few
-places around where it stands, it finds the surface that the others agree on.
+With all other frames fixed, a frame has six unknowns and thousands of residuals. Starting with a wide kernel, and from
+a few poses around its current one, it finds the surface that the others agree on.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, lin
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 
 
 @dataclass(frozen=True)
@@ -53,17 +54,17 @@ class _Problem:
 
 
 def least_support(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> float:
-    """The support from which on a frame counts as placed.
+    """The smallest support with which a frame counts as placed.
 
-    Some robust standard deviations below the median frame, but always between two shares of its support.
+    It is some robust standard deviations below the median frame's, but always between two shares of that.
     """
     middle = support.nanmedian()
-    sigma = 1.4826 * (support - middle).abs().nanmedian()
+    sigma = MAD_TO_SIGMA * (support - middle).abs().nanmedian()
     return float((middle - settings.sigmas * sigma).clamp(settings.least_share * middle, settings.most_share * middle))
 
 
 def find_lost_frames(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> Int[Tensor, "lost"]:
-    """Frames with far less support than most, the best of them first."""
+    """Frames with far less support than most others, those with the most support first."""
     lost = (support < least_support(support, settings)).nonzero().squeeze(-1)
     return lost[support[lost].argsort(descending=True)]
 
@@ -78,10 +79,10 @@ def relocalise(
     generator: torch.Generator,
     settings: AdjustmentSettings,
 ) -> Rig:
-    """The rig with lost frames moved to where the other frames support them; a frame without a better place stays.
+    """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
 
-    A lost frame is searched around where it stands, as far as the prior is uncertain. Where projectors are free, it
-    starts with the relative pose it had at first: what was made of that in a wrong place is worth nothing.
+    The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
+    starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
     """
     s = settings.relocalisation
     relative_free = refine == "free"
@@ -114,7 +115,7 @@ def relocalise(
 
 
 def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Problem) -> tuple[Rig, float]:
-    """Move frame k alone, as a whole, then its projector too; and the support it has then."""
+    """Move frame k alone, first as a whole, then its projector too; returns the rig and the frame's support in it."""
     settings, n = problem.settings, rig.frames
     s = settings.relocalisation
     B = torch.zeros(12 * n, 12, dtype=torch.float64)
@@ -145,7 +146,7 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
 
 
 def _rows_of(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], problem: _Problem) -> Observations:
-    """Residuals of frame k with the frames that are allowed, some of them where there are too many."""
+    """Residuals of frame k with the frames that are allowed; a random subset if there are too many."""
     rows = problem.rows(rig, k)
     mine = allowed[problem.anchors.frame[rows.anchor]] & allowed[rows.frame]
     chosen = mine.nonzero().squeeze(-1)

@@ -4,11 +4,11 @@ Unknowns are the poses and, for every *anchor* (a decoded pixel of one frame), i
 camera ray. An anchor makes two kinds of residuals:
 
     own    its decoded coordinate against its own projector's view of it,
-    cross  wherever another camera sees it: the coordinate decoded *there* against that frame's
-           projector's view of it.
+    cross  wherever another camera sees it: the coordinate decoded *there* against the view of it
+           from that frame's projector.
 
-All residuals are projector pixels, so nothing is gained by shrinking the scene: the collapse that
-free-scale ICP suffers from cannot happen.
+All residuals are projector pixels, so shrinking the scene does not lower them: the collapse of
+free-scale ICP cannot happen.
 
 Increments: `T_world_camera <- exp(delta) T_world_camera` moves a frame as a whole (rotating about
 the origin, which is the centre of the scene), `T_camera_projector <- exp(rho) T_camera_projector`
@@ -72,17 +72,17 @@ class Linearisation:
     """Residuals with their derivatives, before weighting."""
 
     residuals: Residuals
-    own: Float[Tensor, "anchors 2 a"]  # by rho of the anchor's frame
+    own: Float[Tensor, "anchors 2 a"]  # with respect to rho of the anchor's frame
     own_columns: Int[Tensor, "anchors a"]  # which of the unknowns those are
     own_depth: Float[Tensor, "anchors 2"]
-    cross: Float[Tensor, "rows 2 b"]  # by delta of the anchor's frame, delta and rho of the seeing frame
+    cross: Float[Tensor, "rows 2 b"]  # delta of the anchor's frame; delta, rho of the seeing frame
     cross_columns: Int[Tensor, "rows b"]
     cross_depth: Float[Tensor, "rows 2"]
-    unknowns: int  # beside depths: delta of all frames, then rho of all frames
+    unknowns: int  # without the depths: delta of all frames, then rho of all frames
 
 
 def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Linearisation:
-    """Residuals and first derivatives at the present state."""
+    """Residuals and first derivatives at the current state."""
     i = anchors.frame
     p_camera = anchors.depth[:, None] * anchors.d_camera
     own, own_rho, own_point = _projector_view(rig, i, p_camera)
@@ -113,7 +113,7 @@ def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: Coor
 
 
 def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Residuals:
-    """Residuals alone."""
+    """Residuals without derivatives."""
     i, j, a = anchors.frame, observations.frame, observations.anchor
     p_camera = anchors.depth[:, None] * anchors.d_camera
     own = project(rig.projector, transform(inverse(rig.T_camera_projector)[i], p_camera))[0]
@@ -127,7 +127,7 @@ def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: C
 def _projector_view(
     rig: Rig, frame: Int[Tensor, "n"], p_camera: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 6"], Float[Tensor, "n 2 3"]]:
-    """Projector pixel of points in camera axes; its derivative by rho and by the point."""
+    """Projector pixel of points in camera axes, and its derivatives by rho and by the point."""
     T_projector_camera = inverse(rig.T_camera_projector)[frame]
     p_projector = transform(T_projector_camera, p_camera)
     uv, _ = project(rig.projector, p_projector)

@@ -1,4 +1,4 @@
-"""All devices of a scan as tensors, in the scene frame: what a solver works on."""
+"""All devices of a scan as tensors in the scene frame, for solvers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,7 +54,7 @@ class Rig:
         return self.T_camera_projector[:, :3, 3].norm(dim=-1)
 
     def moved(self, delta: Float[Tensor, "frames 6"], rho: Float[Tensor, "frames 6"]) -> "Rig":
-        """The rig after an increment of every frame as a whole, and of its projector against its camera."""
+        """The rig after an increment of every frame as a whole, and of its projector relative to its camera."""
         return replace(
             self,
             T_world_camera=exp_se3(delta) @ self.T_world_camera,

@@ -1,7 +1,7 @@
-"""The robust kernel of the bundle adjustment: wrong decodings end without influence, slow frames are not given up.
+"""The robust kernel of the bundle adjustment: wrong decodings lose their influence, slow frames keep theirs.
 
-Its width follows the residuals down (graduated non-convexity: Yang et al., RA-L 2020), separately for every frame:
-while most frames fit, one that does not yet keeps a kernel wide enough to be pulled in.
+Its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately for every frame: when
+most frames already fit, a frame that does not yet fit keeps a kernel wide enough to be pulled in.
 """
 
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """Geman-McClure's, with a width for each frame; a gross error costs the same whatever the width."""
+    """The Geman-McClure kernel, with a width for each frame; a gross error costs the same at any width."""
 
     width: Float[Tensor, "frames"]  # projector pixels
     frame: Int[Tensor, "anchors"]
@@ -28,16 +29,15 @@ class Kernel:
         return float(self.width.min())
 
     def weights(self, r: Residuals) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
-        """Of own and cross residuals, for the normal equations."""
+        """Weights of own and cross residuals, for the normal equations."""
         parts = []
         for value, width2 in zip((r.own, r.cross), self._squares(), strict=True):
-            relative = 1 / (1 + (value * value).sum(-1) / width2)
-            parts.append(self.narrowest**2 / width2 * relative**2)
+            parts.append(self.narrowest**2 / width2 * geman_mcclure_weight((value * value).sum(-1) / width2))
         own, cross = parts
         return own, torch.where(r.cross_valid, cross, torch.zeros_like(cross))
 
     def cost(self, r: Residuals, valid: Bool[Tensor, "rows"]) -> float:
-        """The data's part of the objective, px^2; half its gradient is that of the weighted normal equations."""
+        """The data's part of the objective, px^2; half of its gradient is that of the weighted normal equations."""
         own2, cross2 = self._squares()
         own = ((r.own**2).sum(-1), own2)
         cross = ((r.cross**2).sum(-1)[valid], cross2[valid])
@@ -48,7 +48,7 @@ class Kernel:
 
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
-    """Median cross residual of what each frame takes part in; infinite where it takes part in nothing."""
+    """Median of the cross residuals that involve each frame; infinite if there are none."""
     size, out = r.cross.norm(dim=-1), torch.full((frames,), float("inf"), dtype=torch.float64)
     for k in range(frames):
         mine = r.cross_valid & (pair == k).any(0)
@@ -60,13 +60,13 @@ def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Flo
 def narrowed(
     width: Float[Tensor, "frames"], target: Float[Tensor, "frames"], settings: KernelSettings
 ) -> Float[Tensor, "frames"]:
-    """Kernel widths on their way to a narrower target, not in one leap: a part may fit before the whole does."""
+    """Kernel widths one gradual step closer to a narrower target: a part of a frame may fit before all of it does."""
     gently = torch.where(width.isfinite(), width / settings.fastest, torch.zeros_like(width))
     return torch.minimum(width, torch.maximum(target, gently))
 
 
 def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
-    """Robust 1 sigma of one residual component among those that the kernel keeps, pattern pixels."""
+    """Robust 1 sigma of one residual component, from the residuals that the kernel keeps; pattern pixels."""
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
-    return max(float(values.median()) * 1.4826, settings.noise_floor_px)
+    return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)

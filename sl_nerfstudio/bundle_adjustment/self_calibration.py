@@ -1,9 +1,9 @@
 """How well the stated intrinsics agree with the captures.
 
 Focal length and principal point of both devices become six more unknowns of the bundle adjustment, common to all
-frames. One Gauss-Newton step says how much better other values would agree (self-calibration: Triggs et al., Bundle
+frames. One Gauss-Newton step shows how much better other values would agree (self-calibration: Triggs et al., Bundle
 Adjustment - A Modern Synthesis, 2000, section 3). The step is reported, not taken. Poses that were adjusted with wrong
-intrinsics have absorbed part of the error, and how much belongs to their stated uncertainty.
+intrinsics have absorbed part of the error, and their stated uncertainty includes that part.
 
 Changes are shares of the focal length, in the order of `IntrinsicsChange.values`.
 """
@@ -43,12 +43,12 @@ class SelfCalibration:
 
     @property
     def known(self) -> bool:
-        """Whether there is an estimate at all; there is none where nothing was adjusted."""
+        """Whether there is an estimate at all; there is none if nothing was adjusted."""
         return bool(self.change.isfinite().all() and self.covariance.isfinite().all())
 
     @property
     def chi_square(self) -> float:
-        """Squared length of the change in units of its uncertainty: about six if the intrinsics are right."""
+        """Squared length of the change in units of its uncertainty: about six if the intrinsics are correct."""
         return float(self.change @ torch.linalg.solve(self.covariance, self.change))
 
     def contradicts(self, settings: SelfCalibrationSettings | None = None) -> bool:
@@ -62,11 +62,11 @@ class SelfCalibration:
 def linearise_with_intrinsics(
     linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
 ) -> Linearisation:
-    """The same residuals with their derivatives by the six intrinsics, which come after the poses."""
+    """The same residuals with added derivatives by the six intrinsics, which come after the poses."""
     i, j, a = anchors.frame, observations.frame, observations.anchor
     ray = rig.camera[i]
     K = project_jacobian(ray, anchors.d_camera)
-    # A pixel is fixed, its ray is not: it turns so that its pixel moves back by what the intrinsics move it.
+    # A pixel is fixed, its ray is not: the ray turns to cancel the shift of the pixel that the intrinsics cause.
     turn = -K.transpose(1, 2) @ torch.linalg.solve(
         K @ K.transpose(1, 2), by_intrinsics(ray, project(ray, anchors.d_camera)[0])
     )
@@ -95,7 +95,7 @@ def linearise_with_intrinsics(
 
 
 def by_intrinsics(devices: Intrinsics, uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2 3"]:
-    """Derivative of pixels by focal length and principal point, as shares of the focal length; distortion stays."""
+    """Derivative of pixels by focal length and principal point, as shares of the focal length; distortion is fixed."""
     f, c = devices.params[..., :1], devices.params[..., 2:4]
     out = torch.zeros(*uv.shape, 3, dtype=uv.dtype)
     out[..., 0] = uv - c

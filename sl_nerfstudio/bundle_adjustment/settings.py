@@ -14,12 +14,12 @@ class LookUpSettings:
     least_pivot: float = 1e-3
     """Smallest share of a pivot that elimination may leave; below it the window's pixels lie on a conic."""
     roughness_px: float = 2.0
-    """RMS distance, in pattern pixels, of a window's pixels from their paraboloid, beyond which the map is torn
-    there."""
+    """RMS distance, in pattern pixels, of a window's pixels from their paraboloid, beyond which the map counts as
+    discontinuous there."""
     roughness_medians: float = 3.0
-    """The same limit as a multiple of the median window's roughness; the larger limit holds."""
+    """The same limit as a multiple of the median window's roughness; the larger limit applies."""
     sampled_windows: int = 200
-    """Windows of each frame from which that median is taken."""
+    """Number of windows of each frame from which that median is taken."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class KernelSettings:
     noises: float = 3.0
     """Smallest width, as a multiple of the estimated noise."""
     fastest: float = 1.4
-    """Factor by which a kernel narrows in one step at most."""
+    """Largest factor by which a kernel narrows in one step."""
     noise_floor_px: float = 0.01
-    """Smallest noise of one look-up that is believed, in pattern pixels."""
+    """Smallest plausible noise of one look-up, in pattern pixels."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class StepSettings:
     damping: float = 1e-4
     """Damping of the first step, as a share of the normal matrix's diagonal."""
     relax: float = 5.0
-    """Factor by which damping falls after a step that was accepted."""
+    """Factor by which damping falls after an accepted step."""
     tighten: float = 10.0
-    """Factor by which damping grows after a step that was refused."""
+    """Factor by which damping grows after a rejected step."""
     least_damping: float = 1e-9
     """Damping never falls below this."""
     tries: int = 8
-    """Refused steps in a row after which the poses stay where they are."""
+    """Rejected steps in a row after which the poses are left unchanged."""
     least_depth: float = 0.7
     """Smallest factor by which one step may change an anchor's depth."""
     most_depth: float = 1.4
@@ -65,25 +65,25 @@ class RelocalisationSettings:
     """The search for frames that ended in a wrong minimum."""
 
     rounds: int = 3
-    """Searches at most; frames that were found help to find the others."""
+    """Most rounds of searching; frames that were found help to find the others."""
     anchors_per_frame: int = 200
-    """Decoded pixels of each frame that take part."""
+    """Decoded pixels of each frame that are used."""
     most_residuals: int = 6000
-    """Residuals between one frame and all others that take part, at most."""
+    """Most residuals between one frame and all others that are used."""
     starts: int = 12
-    """Places from which a lost frame is searched, drawn from the prior."""
+    """Starting poses for the search of a lost frame, drawn from the prior."""
     frame_steps: int = 10
-    """Steps from each place in which the frame moves as a whole."""
+    """Steps from each starting pose in which the frame moves as a whole."""
     projector_steps: int = 10
     """Steps after those in which its projector moves, too."""
     observe_every: int = 3
     """Steps between new choices of which pixels the other frames see."""
     inlier_noises: float = 5.0
-    """Residual, as a multiple of the noise, up to which it supports a pose."""
+    """Largest residual that supports a pose, as a multiple of the noise."""
     least_gain: float = 0.02
-    """Share of supporting residuals that a new place must add to replace the old one."""
+    """Share of supporting residuals that a new pose must add to replace the old one."""
     sigmas: float = 4.0
-    """A frame is lost if its support lies this many robust standard deviations below the median frame's."""
+    """A frame is lost if its support is this many robust standard deviations below the median frame's."""
     least_share: float = 0.75
     """Support below this share of the median frame's always counts as lost."""
     most_share: float = 0.95
@@ -92,18 +92,18 @@ class RelocalisationSettings:
 
 @dataclass(frozen=True)
 class CrossValidationSettings:
-    """The decision whether adjusted poses (or intrinsics) are kept, on pixels that were held out."""
+    """The decision whether adjusted poses (or intrinsics) are kept, based on held-out pixels."""
 
     pixels_per_frame: int = 300
-    """Held-out pixels of each frame, at most."""
+    """Most held-out pixels used of each frame."""
     frames_per_pixel: int = 8
-    """Other frames in which each of them is looked up, at most."""
+    """Most other frames in which each of them is looked up."""
     width_noises: float = 4.0
     """Width of the robust kernel, as a multiple of the decoding noise."""
     least_width_px: float = 0.25
     """Smallest width of that kernel, in pattern pixels: looking up between pixels is never perfect."""
     standard_errors: float = 2.0
-    """Standard errors by which the mean paired difference must lie below zero for the change to be kept."""
+    """Standard errors by which the mean paired difference must be below zero for the change to be kept."""
 
 
 @dataclass(frozen=True)
@@ -111,14 +111,14 @@ class SelfCalibrationSettings:
     """When captures contradict the stated intrinsics, and how those are changed on request."""
 
     contradiction: float = 50.0
-    """Chi square (six degrees of freedom) beyond which the intrinsics are contradicted. Chance alone exceeds it once in
-    10^8, but blocks of pixels do not err independently."""
+    """Chi square (six degrees of freedom) above which the captures contradict the intrinsics. Chance alone exceeds it
+    once in 10^8, but the errors of blocks of pixels are not independent."""
     least_change: float = 1e-3
     """Changes below this share of the focal length are never reported: no calibration is that good."""
     agreement: float = 6.0
-    """Chi square that right intrinsics have: below it the change ends."""
+    """Chi square of correct intrinsics: below it, no further steps are taken."""
     rounds: int = 3
-    """Gauss-Newton steps of the intrinsics at most; all poses are adjusted again after each."""
+    """Most Gauss-Newton steps of the intrinsics; all poses are adjusted again after each."""
 
 
 @dataclass(frozen=True)
@@ -130,30 +130,30 @@ class AdjustmentSettings:
     max_anchors: int = 12000
     """The same over all frames, at most: time grows with this number, accuracy with its square root."""
     frames_per_anchor: int = 8
-    """Other frames in which each of them is looked up, at most."""
+    """Most other frames in which each of them is looked up."""
     max_iterations: int = 40
-    """Levenberg-Marquardt steps, at most."""
+    """Most Levenberg-Marquardt steps."""
     rigid_iterations: int = 5
-    """Steps, at most, in which frames move as a whole before projectors move against their cameras."""
+    """Most steps in which frames move as a whole, before projectors move relative to their cameras."""
     observe_every: int = 4
     """Steps between new choices of which frame sees which anchor."""
     least_cosine: float = 0.1
-    """Cosine between surface normal and ray below which a device is taken not to see a place."""
+    """Cosine between surface normal and ray below which a device counts as not seeing a point."""
     independent_residuals: float = 50.0
-    """Residuals of a frame that count as independent of each other while the poses are still rough."""
+    """Number of a frame's residuals that count as independent of each other while the poses are still rough."""
     image_blocks: int = 4
-    """Blocks along each side of an image; residuals within a block may depend on each other in the covariance."""
+    """Blocks along each side of an image; the covariance allows residuals within a block to depend on each other."""
     seed: int = 0
     """Seed of the choice of pixels."""
     look_up: LookUpSettings = field(default_factory=LookUpSettings)
-    """Coordinates between pixels."""
+    """Look-up of coordinates between pixels."""
     kernel: KernelSettings = field(default_factory=KernelSettings)
     """Robust kernel."""
     steps: StepSettings = field(default_factory=StepSettings)
     """Levenberg-Marquardt steps."""
     relocalisation: RelocalisationSettings = field(default_factory=RelocalisationSettings)
-    """Frames that ended in a wrong minimum."""
+    """Search for frames that ended in a wrong minimum."""
     cross_validation: CrossValidationSettings = field(default_factory=CrossValidationSettings)
-    """Keep the result or the starting poses."""
+    """Decision between the result and the starting poses."""
     self_calibration: SelfCalibrationSettings = field(default_factory=SelfCalibrationSettings)
     """Intrinsics that the captures contradict."""

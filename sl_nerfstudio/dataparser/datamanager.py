@@ -1,4 +1,4 @@
-"""Batches of rays and what was measured along them, straight from the table of pixels."""
+"""Batches of rays with their measurements, directly from the table of pixels."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,15 +32,15 @@ class SLDataManagerConfig(VanillaDataManagerConfig):
 
     _target: type = field(default_factory=lambda: SLDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=SLDataParserConfig)
-    """Must stay `sl-data`: other data sets have no projector."""
+    """Must be `sl-data`: other data sets have no projector."""
     train_num_rays_per_batch: int = 1024
-    """Pixels of a training step."""
+    """Pixels in a training step."""
     eval_num_rays_per_batch: int = 1024
-    """Held-out pixels of an evaluation during training."""
+    """Held-out pixels in an evaluation during training."""
     images_on_gpu: bool = False
-    """Keep the table of all pixels on the GPU (19 bytes a pixel) instead of copying each batch there."""
+    """Keep the table of all pixels on the GPU (19 bytes per pixel) instead of copying each batch there."""
 
-    # nerfstudio's own ways of picking images and pixels, which have no meaning here.
+    # nerfstudio's own settings for choosing images and pixels, which have no meaning here.
     masks_on_gpu: tyro.conf.Suppress[bool] = False
     train_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
     train_num_times_to_repeat_images: tyro.conf.Suppress[int] = -1
@@ -54,7 +54,7 @@ class SLDataManagerConfig(VanillaDataManagerConfig):
 
 
 class SLDataManager(VanillaDataManager[SLDataset]):
-    """Draws pixels, makes their rays from the starting poses, and hands out whole frames for evaluation.
+    """Draws pixels, makes their rays from the starting poses, and provides whole frames for evaluation.
 
     A batch holds `indices` [n, 3] (frame, row, column), `coords` [n, 2] (pattern pixels, NaN where not decoded),
     `decoded` [n, 1], `pattern` [n, 1], `image` [n, 3] (the pattern, grey) and `mask` [n, 1]. The rays' metadata hold
@@ -88,7 +88,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         return SLDataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
 
     def setup_train(self) -> None:
-        """Make what draws training batches."""
+        """Prepare the drawing of training batches."""
         self._samples = self.samples.to(self.device) if self.config.images_on_gpu else self.samples
         self.train_pixel_sampler = SLPixelSampler(self._samples, self.config.train_num_rays_per_batch, held_out=False)
         loaded = self.dataparser.loaded
@@ -96,13 +96,13 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         self.scene_rays = SceneRays(loaded.scan, poses.to(self.device))
 
     def setup_eval(self) -> None:
-        """Make what draws evaluation batches and whole frames."""
+        """Prepare the drawing of evaluation batches and whole frames."""
         self.eval_pixel_sampler = SLPixelSampler(self._samples, self.config.eval_num_rays_per_batch, held_out=True)
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
         self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, Batch]:
-        """Pixels to train on; which ones depends on the seed and on `step` alone."""
+        """Pixels to train on; the choice depends only on the seed and on `step`."""
         self.train_count += 1
         return self._rays_and_batch(self.train_pixel_sampler.sample(step))
 
@@ -119,9 +119,9 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         return self._rays_and_batch(self._samples.at(index))
 
     def stand_at(self, T_scene_camera: Float[Tensor, "n 4 4"]) -> None:
-        """Make all cameras and rays come from refined poses, and mark them, so that the model leaves them alone.
+        """Use refined poses for all cameras and rays, and mark them, so that the model does not correct them again.
 
-        nerfstudio's exporters and viewer take poses from the data sets' cameras and know no corrections.
+        nerfstudio's exporters and viewer use the poses of the data sets' cameras without corrections.
         """
         T_scene_camera = T_scene_camera.detach().to(self.device, torch.float32)
         outputs = (self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs)

@@ -26,14 +26,14 @@ class SLDataParserConfig(DataParserConfig):
     data: Path = Path()
     """The scan folder, or its transforms.json."""
     downscale_factor: float | None = None
-    """Shrink whole images by this factor in evaluation, rendering and the viewer. Training sees every pixel."""
+    """Shrink whole images by this factor in evaluation, rendering and the viewer. Training uses every pixel."""
     intrinsics_change: IntrinsicsChange = UNCHANGED
-    """Change of the scan's focal lengths and principal points; `refine_intrinsics` fills it in."""
+    """Change of the scan's focal lengths and principal points; `refine_intrinsics` sets it."""
 
 
 @dataclass(frozen=True)
 class LoadedScan:
-    """A scan with what is computed from all of its pixels."""
+    """A scan with the table of its pixels and its normalisation."""
 
     scan: Scan
     samples: PixelSamples
@@ -44,14 +44,14 @@ class LoadedScan:
 class SLDataParser(DataParser):
     """Cameras in the normalised scene. All splits hold all frames: poses are refined, so every frame is needed.
 
-    What training never sees are small blocks of pixels in every frame (`held_out`).
+    Training never uses small blocks of pixels in every frame (`held_out`).
     """
 
     config: SLDataParserConfig
 
     def __init__(self, config: SLDataParserConfig) -> None:
         super().__init__(config=config)
-        # An attribute, because nerfstudio overwrites it where it wants no images resized.
+        # An attribute, because nerfstudio overwrites it to switch resizing off.
         self.downscale_factor: float | int | None = config.downscale_factor
 
     @property
@@ -99,7 +99,7 @@ def _column(devices: list[Device], *names: str) -> torch.Tensor:
 
 
 def scan_root(data: Path) -> Path:
-    """The scan folder, absolute, of what was given to `--data`: the folder or its transforms.json."""
+    """The absolute path of the scan folder, from the value of `--data`: the folder or its transforms.json."""
     data = Path(data).expanduser().absolute()
     return data.parent if data.name == "transforms.json" else data
 
@@ -108,10 +108,10 @@ _remembered: dict[tuple[Path, int], dict[IntrinsicsChange, LoadedScan]] = {}
 
 
 def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED) -> LoadedScan:
-    """Read a scan with all of its pixels. The last one is remembered while its transforms.json is unchanged.
+    """Read a scan with all of its pixels. The last one is cached while its transforms.json is unchanged.
 
     nerfstudio makes several dataparsers in one command; the pixels are read once. Raises UserError for a folder that
-    cannot be used, or a change that makes impossible devices of its intrinsics.
+    cannot be used, or for a change that leads to impossible intrinsics.
     """
     root = scan_root(data)
     scan = read_scan(root)
@@ -130,13 +130,13 @@ def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED) -> Lo
 
 
 def _require_possible(scan: Scan) -> None:
-    """No device that cannot be true. Raises UserError."""
+    """Raises UserError if the intrinsics of a device are impossible."""
     for device in {*(frame.camera for frame in scan.frames), scan.projector}:
         for key, problem in device_problems(device):
             raise UserError(
                 f"intrinsics_change {scan.intrinsics_change.values}: {key} {problem.problem}\n"
                 "    cause:  percent or pixels were given\n"
-                "    remedy: give shares of the focal length, 0.01 for one hundredth of it"
+                "    remedy: give shares of the focal length, for example 0.01 for one per cent of it"
             )
 
 

@@ -1,4 +1,4 @@
-"""Whole frames as nerfstudio wants them: for evaluation, rendering and the viewer. Read one by one, when asked for."""
+"""Whole frames in nerfstudio's form, for evaluation, rendering and the viewer. Each is read when it is needed."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from sl_nerfstudio.scan import Frame, Scan
 class SLDataset(InputDataset):
     """Frames of a scan, at the resolution of `cameras`.
 
-    Beside `image` (RGB, [0, 1]) an item holds, each as (h, w, channels): `pattern` in [0, 1], `coords` in pattern
+    Besides `image` (RGB, [0, 1]) an item holds, each as (h, w, channels): `pattern` in [0, 1], `coords` in pattern
     pixels (NaN where not decoded), and the flags `mask`, `decoded` and `held_out`.
     """
 
@@ -24,15 +24,15 @@ class SLDataset(InputDataset):
         return self.metadata["sl_scan"]
 
     def get_numpy_image(self, image_idx: int) -> UInt8[ndarray, "h w 3"]:
-        """The captured image in 8 bit, whatever its depth and colours in the file."""
+        """The captured image as 8-bit RGB, from any bit depth and number of channels in the file."""
         return (self._image(image_idx) * 255 + 0.5).astype(np.uint8)
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
-        """The captured image in [0, 1] with the file's full depth."""
+        """The captured image in [0, 1] with the file's full bit depth."""
         return torch.from_numpy(self._image(image_idx))
 
     def get_metadata(self, data: dict) -> dict[str, Tensor]:
-        """What belongs to the pixels beside their colour."""
+        """The data of the pixels other than their colour."""
         index = data["image_idx"]
         frame = self.scan.frames[index]
         coords = frame.read_coords()
@@ -50,7 +50,7 @@ class SLDataset(InputDataset):
         return self._resized(index, _rgb(self.scan.frames[index]))
 
     def _resized(self, index: int, image: Shaped[ndarray, "h w c"]) -> Shaped[ndarray, "h2 w2 c"]:
-        """At the camera's resolution; the nearest pixel, because coordinates must not be averaged across edges."""
+        """An image at the camera's resolution, by nearest pixel: coordinates must not be averaged across edges."""
         h, w = int(self.cameras.height[index]), int(self.cameras.width[index])
         rows, columns = _nearest(h, image.shape[0]), _nearest(w, image.shape[1])
         return np.ascontiguousarray(image[rows[:, None], columns[None, :]])

@@ -1,10 +1,10 @@
-"""Which pixels are never trained on: small blocks, chosen by a hash of frame and block."""
+"""Which pixels are never used for training: small blocks, chosen by a hash of frame and block."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt64
 from numpy import ndarray
 
-BLOCK = 8  # pixels; larger than what bilinear look-up or interpolated coordinates share between neighbours
+BLOCK = 8  # pixels; larger than the neighbourhood that bilinear look-up or interpolated coordinates share
 FRACTION = 0.02
 _SEED = 0x5EED
 
@@ -18,7 +18,7 @@ def block_hash(frame: int, height: int, width: int) -> Float[ndarray, "rows colu
 
 
 def held_out_pixels(frame: int, height: int, width: int) -> Bool[ndarray, "height width"]:
-    """True where a pixel of frame number `frame` is kept from training; about FRACTION of all."""
+    """True where a pixel of frame number `frame` is excluded from training; about FRACTION of all."""
     return spread(block_hash(frame, height, width) < FRACTION, height, width)
 
 
@@ -28,7 +28,7 @@ def spread(blocks: Shaped[ndarray, "rows columns"], height: int, width: int) -> 
 
 
 def _mix(key: UInt64[ndarray, "..."]) -> UInt64[ndarray, "..."]:
-    """SplitMix64's finaliser (Steele et al., OOPSLA 2014): every bit of the key moves every bit of the result."""
+    """SplitMix64's finaliser (Steele et al., OOPSLA 2014): every bit of the key affects every bit of the result."""
     with np.errstate(over="ignore"):
         key = key * np.uint64(0x9E3779B97F4A7C15)
         key = (key ^ (key >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -1,7 +1,7 @@
-"""From the scan's world to the scene in which the field lives: object at 0, inside the unit sphere.
+"""From the scan's world to the scene of the field: the object is at the origin, inside the unit sphere.
 
-The map is made from the triangulated points and from the cameras' orientation alone. Turn, shift or scale the
-world of a scan, and the normalised scene stays the same but for rounding.
+The map depends only on the triangulated points and on the cameras' orientations. If the world of a scan is
+rotated, shifted or scaled, the normalised scene stays the same except for rounding.
 """
 
 import numpy as np
@@ -18,27 +18,27 @@ from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan import Scan
 
-OBJECT_RADIUS = 0.8  # of the scene's unit sphere; the rest is room for poses that are still wrong
+OBJECT_RADIUS = 0.8  # of the scene's unit sphere; the rest allows for poses that are still wrong
 _POINTS_PER_FRAME = 1000
 _FEWEST_POINTS = 16
 _NEIGHBOURS = 8
-_LONELY = 4.0  # times the usual distance to the neighbours: a wrong decoding
-_COMMON_UP = 0.3  # length of the mean of the cameras' up directions from which on they count as having one
-_INSIDE = 0.99  # share of the points that the object's sphere holds
+_LONELY = 4.0  # times the median distance to the neighbours: beyond it a decoding counts as wrong
+_COMMON_UP = 0.3  # smallest length of the cameras' mean up direction with which it counts as a common one
+_INSIDE = 0.99  # share of the points inside the object's sphere
 
 
 def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
-    """`S_scene_world`, with scene axes as `upright` makes them from the cameras.
+    """`S_scene_world`, with scene axes that `upright` derives from the cameras.
 
-    Raises UserError where hardly any pixel triangulates.
+    Raises UserError if hardly any pixel can be triangulated.
     """
     points, tried = triangulated_points(scan, samples)
     if len(points) < _FEWEST_POINTS:
         raise UserError(
             f"{scan.root / 'transforms.json'}: only {len(points)} of {tried} pixels have a camera ray and a projector "
             "ray that meet in front of both devices. The poses are probably world-to-device instead of "
-            "device-to-world, or in OpenCV axes (turn them by diag(1, -1, -1, 1) on the right), or coords/ has x and y "
-            "swapped. Run sl-check on the folder."
+            "device-to-world, or in OpenCV axes (multiply them by diag(1, -1, -1, 1) from the right), or coords/ has "
+            "x and y swapped. Run sl-check on the folder."
         )
     centre, radius = enclosing_sphere(without_lonely(points))
     scale = OBJECT_RADIUS / radius
@@ -47,15 +47,15 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
 
 
 def upright(T_world_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "3 3"]:
-    """Rotation from world to scene axes: z is the cameras' mean up, x the first camera's right as far as it can be.
+    """Rotation from world to scene axes: z is the cameras' mean up, x as close as possible to the first camera's right.
 
-    Where the cameras roll so freely that they have no common up, z is the first camera's.
+    If the cameras roll so much that they have no common up, z is the first camera's up.
     """
     up = T_world_camera[:, :3, 1].mean(0)
     if np.linalg.norm(up) < _COMMON_UP:
         up = T_world_camera[0, :3, 1]
     z = up / np.linalg.norm(up)
-    # right and back of the first camera are perpendicular: they cannot both lie along z
+    # right and back of the first camera are perpendicular: they cannot both be parallel to z
     across = [axis - (axis @ z) * z for axis in T_world_camera[0, :3, [0, 2]]]
     right, back = (np.linalg.norm(axis) for axis in across)
     x = across[0] / right if right > 0.1 else np.cross(z, across[1] / back)
@@ -86,7 +86,7 @@ def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarra
 
 
 def without_lonely(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
-    """Points whose neighbours are about as near as everybody's: wrong decodings scatter along their rays."""
+    """Points whose neighbours are about as close as those of most points: wrong decodings scatter along their rays."""
     distance, _ = KDTree(points).query(points, k=_NEIGHBOURS + 1)
     distance = distance[:, -1]
     return points[distance <= _LONELY * np.median(distance)]
@@ -96,7 +96,7 @@ def enclosing_sphere(points: Float[ndarray, "n 3"], rounds: int = 300) -> tuple[
     """Centre and radius of a nearly smallest sphere around 99 % of the points.
 
     Badoiu and Clarkson's iteration (SODA 2003) with the farthest point replaced by the one at the 99 % quantile.
-    Nothing in it depends on the axes.
+    The result does not depend on the axes.
     """
     centre = points.mean(0)
     last = int(_INSIDE * (len(points) - 1))

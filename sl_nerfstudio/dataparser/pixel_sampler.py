@@ -10,8 +10,8 @@ _STRIDE = 1_000_003  # a prime, so that seeds of neighbouring runs do not share 
 class SLPixelSampler:
     """Draws `num_rays_per_batch` pixels; nerfstudio's exporters set that number from outside.
 
-    The batch of a step depends on the seed and the step alone, so that a resumed run goes on as an uninterrupted one.
-    Asked twice for one step (as `ns-export pointcloud` does), it goes on drawing.
+    The batch of a step depends only on the seed and the step, so that a resumed run continues like an uninterrupted
+    one. A second call for the same step (as by `ns-export pointcloud`) draws other pixels.
     """
 
     def __init__(self, samples: PixelSamples, num_rays_per_batch: int, held_out: bool) -> None:

@@ -17,7 +17,7 @@ from sl_nerfstudio.scan import Frame, Scan
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """Pixels picked from PixelSamples, in the types that computations want."""
+    """Pixels selected from PixelSamples, in the types that computations need."""
 
     frame: Int[Tensor, "n"]
     row: Int[Tensor, "n"]
@@ -42,14 +42,14 @@ class PixelBatch:
 
 @dataclass(frozen=True)
 class PixelSamples:
-    """Every masked pixel of every frame, one frame after the other; 19 bytes a pixel."""
+    """Every masked pixel of every frame, one frame after the other; 19 bytes per pixel."""
 
     frame: Int32[Tensor, "n"]
     row: Int16[Tensor, "n"]
     column: Int16[Tensor, "n"]
     coords: Float32[Tensor, "n 2"]  # pattern pixels; NaN where not decoded
     pattern: Float16[Tensor, "n"]  # [0, 1]; 11 bits are enough for a normalised intensity
-    held_out: Bool[Tensor, "n"]  # never trained on
+    held_out: Bool[Tensor, "n"]  # never used for training
     first: Int[Tensor, "frames_and_one"]  # frame i holds rows first[i] to first[i + 1] - 1
     _held_out_index: Int[Tensor, "m"] = field(init=False, repr=False)
 
@@ -61,7 +61,7 @@ class PixelSamples:
 
     @property
     def device(self) -> torch.device:
-        """Where the table lies."""
+        """The device that holds the table."""
         return self.frame.device
 
     def to(self, device: torch.device | str) -> "PixelSamples":
@@ -69,14 +69,14 @@ class PixelSamples:
         return PixelSamples(**{f.name: getattr(self, f.name).to(device) for f in fields(self) if f.init})
 
     def draw(self, count: int, generator: torch.Generator | None = None, held_out: bool = False) -> Int[Tensor, "n"]:
-        """Indices of `count` pixels, uniformly and with replacement, from those trained on or from those held out.
+        """Indices of `count` pixels, uniformly and with replacement, from those for training or from those held out.
 
-        The time does not depend on the size of the table. `generator` must live where the table does.
+        The time does not depend on the size of the table. `generator` must be on the table's device.
         """
         if held_out:
             return self._held_out_index[self._randint(len(self._held_out_index), count, generator)]
         index = self._randint(len(self), count, generator)
-        while True:  # rejection: a few in a hundred are held out, so two or three rounds
+        while True:  # rejection sampling: a few per cent are held out, so two or three rounds
             again = self.held_out[index].nonzero()[:, 0]
             if len(again) == 0:
                 return index
@@ -105,7 +105,7 @@ class PixelSamples:
 def build_samples(scan: Scan, show_progress: bool = True) -> PixelSamples:
     """Read all frames of a scan, one in memory at a time.
 
-    Raises UserError if the whole scan has too few masked pixels to train on some and test on others.
+    Raises UserError if the whole scan has too few masked pixels to train with some and test with others.
     """
     frames: Iterable[Frame] = track(scan.frames, "Reading frames") if show_progress else scan.frames
     columns: dict[str, list[ndarray]] = {}
@@ -115,7 +115,7 @@ def build_samples(scan: Scan, show_progress: bool = True) -> PixelSamples:
         first.append(first[-1] + len(pixels["row"]))
         for name, values in pixels.items():
             columns.setdefault(name, []).append(values)
-    # column by column, each list released at once: the peak is the table and one more column
+    # column by column, each list released immediately: peak memory is the table and one more column
     table = {name: torch.from_numpy(np.concatenate(columns.pop(name))) for name in list(columns)}
     if not table["held_out"].any():
         table["held_out"] = torch.from_numpy(_one_block(scan, table))
@@ -142,7 +142,7 @@ def _frame_pixels(number: int, frame: Frame) -> dict[str, ndarray]:
 
 
 def _one_block(scan: Scan, table: dict[str, Tensor]) -> Bool[ndarray, "n"]:
-    """For scans so small that the hash holds out nothing: the one occupied block with the smallest hash."""
+    """For scans so small that the hash holds nothing out: the occupied block with the smallest hash."""
     value = np.empty(len(table["row"]))
     for number, frame in enumerate(scan.frames):
         own = table["frame"] == number

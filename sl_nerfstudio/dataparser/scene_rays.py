@@ -11,9 +11,9 @@ from sl_nerfstudio.scan import Scan
 
 
 class SceneRays:
-    """Makes rays from one pose for each frame, on the device where the poses lie.
+    """Makes rays from one pose for each frame, on the device that holds the poses.
 
-    The same rays as nerfstudio's `Cameras.generate_rays`, without its work for camera types that cannot occur here.
+    They equal those of nerfstudio's `Cameras.generate_rays`, without the work for camera types that cannot occur here.
     """
 
     def __init__(self, scan: Scan, T_scene_camera: Float[Tensor, "n 4 4"], refined: bool = False) -> None:

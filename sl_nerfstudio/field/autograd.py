@@ -14,16 +14,16 @@ from sl_nerfstudio.field.table_gradient import TableGradient, Wanted, wanted
 
 @dataclass(frozen=True)
 class _Target:
-    """Where a backward pass puts the parameters' gradients."""
+    """Where a backward pass stores the parameters' gradients."""
 
     parameters: bool
-    """Whether any parameter's gradient is wanted."""
+    """Whether any parameter's gradient is needed."""
     table: Tensor | None
     """What the table's gradient is added to."""
     marks: Tensor | None
-    """Marks of its rows, if it is the persistent buffer."""
+    """Marks of the table's rows, if it is the persistent buffer."""
     returned: Tensor | None
-    """The table's gradient as a result of the backward function."""
+    """The table's gradient, if the backward function returns it."""
 
 
 def _target(ctx: Any) -> _Target:
@@ -41,7 +41,7 @@ def _target(ctx: Any) -> _Target:
 def _keep(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, tensors: tuple[Tensor, ...]) -> FieldState:
     p, level_weights, table, *mlp = tensors
     ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
-    ctx.save_for_backward(p, level_weights.clone(), table, *mlp)  # checks that none is changed before the backward pass
+    ctx.save_for_backward(p, level_weights.clone(), table, *mlp)  # torch checks that none changes before backward()
     return FieldState(table, level_weights, tuple(mlp))
 
 
@@ -94,7 +94,7 @@ def value(
 ) -> Float[Tensor, "n"]:
     """Values at `p`, differentiable with respect to parameters and points.
 
-    `backward()` adds the table's gradient to `buffer`, if there is one, which is or becomes its `.grad`.
+    If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
     return _apply(_Value, backend, buffer, state, p)
 
@@ -110,6 +110,6 @@ def value_and_gradient(
 
 
 def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
-    """Call an autograd function in the parameters' precision, also where mixed precision is switched on."""
+    """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     with torch.autocast(p.device.type, enabled=False):
         return function.apply(backend, buffer, p.to(state.table.dtype), state.level_weights, state.table, *state.mlp)

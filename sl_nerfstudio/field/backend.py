@@ -1,7 +1,7 @@
-"""What an implementation of the field offers, and which one is taken.
+"""The interface of an implementation of the field, and what the compiled one supports.
 
-An implementation evaluates the field inside and outside its box and pulls gradients back; `field_function.py` makes
-torch operations of it. It never sees autograd.
+An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd:
+`autograd.py` makes torch operations from it.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ BackendName = Literal["auto", "torch", "numba"]
 
 @dataclass(frozen=True)
 class FieldState:
-    """Everything a field's values depend on besides the points."""
+    """Everything that a field's values depend on, apart from the points."""
 
     table: Float[Tensor, "rows f"]
     level_weights: Float[Tensor, "levels"]
@@ -28,7 +28,7 @@ class FieldState:
 
 @dataclass(frozen=True)
 class Pulled:
-    """What a pull-back gives; None where it was not wanted."""
+    """The result of a pull-back; None for parts that were not requested."""
 
     points: Float[Tensor, "n 3"] | None
     mlp: tuple[Tensor, ...] | None
@@ -41,7 +41,7 @@ class FieldBackend(Protocol):
     def evaluate(
         self, state: FieldState, p: Float[Tensor, "n 3"], gradient: bool
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"] | None]:
-        """Values at points, and their gradients if asked for."""
+        """Values at points, and their gradients on request."""
         ...
 
     def pull_back(
@@ -54,9 +54,9 @@ class FieldBackend(Protocol):
         table_gradient: Float[Tensor, "rows f"] | None,
         marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
-        """Gradients of `sum g f(p)` with respect to the points and to the parameters, if wanted.
+        """Gradients of `sum g f(p)` with respect to the points and to the parameters, on request.
 
-        That of the table is added to `table_gradient`, and the rows written to are marked in `marks`.
+        The table's gradient is added to `table_gradient`, and the rows written to are marked in `marks`.
         """
         ...
 
@@ -80,5 +80,5 @@ def numba_cannot(layout: GridLayout, table: Tensor) -> str | None:
     if table.dtype != torch.float32:
         return f"the numba backend computes in float32, the field is {table.dtype}"
     if layout.features != 8:
-        return f"the numba backend wants 8 features a level, the field has {layout.features}"
+        return f"the numba backend needs 8 features per level, the field has {layout.features}"
     return None

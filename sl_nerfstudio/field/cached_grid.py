@@ -1,4 +1,4 @@
-"""A coarse grid of the field's values: tells at next to no cost where a ray meets the surface."""
+"""A coarse grid of the field's values: a very cheap way to find where a ray meets the surface."""
 
 import torch
 from jaxtyping import Float
@@ -7,12 +7,15 @@ from torch.nn import functional as F
 
 from sl_nerfstudio.field.signed_distance import SignedDistance
 
-_BAND_CELLS = 3.0  # vertices this near to the surface are kept up to date
+_BAND_CELLS = 3.0  # vertices this close to the surface are kept up to date
 _AT_ONCE = 131072
 
 
 class CachedGrid(nn.Module):
-    """Values of a field on a grid of [-1, 1]^3. Part of a checkpoint: a resumed run samples as it would have."""
+    """Values of a field on a grid of [-1, 1]^3.
+
+    Part of a checkpoint, so that a resumed run samples as an uninterrupted one would.
+    """
 
     values: Tensor
     filled: Tensor
@@ -30,7 +33,7 @@ class CachedGrid(nn.Module):
 
     @torch.no_grad()
     def refresh(self, field: SignedDistance) -> None:
-        """Evaluate the field again: near its cached surface; the first time everywhere."""
+        """Evaluate the field again near its cached surface; the first time, everywhere."""
         flat = self.values.reshape(-1)
         if self.filled:
             index = (flat.abs() < _BAND_CELLS * self.cell).nonzero()[:, 0]
@@ -43,7 +46,7 @@ class CachedGrid(nn.Module):
         self.filled.fill_(True)
 
     def look_up(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Trilinear values at points; the border's value outside."""
+        """Trilinear values at points; outside the box, the value at the border."""
         grid = p.reshape(1, -1, 1, 1, 3)
         found = F.grid_sample(self.values[None, None], grid, padding_mode="border", align_corners=True)
         return found.reshape(-1)

@@ -1,6 +1,6 @@
-"""Multi-resolution feature grid: which table row belongs to which grid corner, and the module that owns the table.
+"""Multi-resolution feature grid: which table row each grid corner uses, and the module that owns the table.
 
-Points live in [-1, 1]^3. A level of resolution R has (R + 1)^3 corners. Levels whose corners fit into
+Points are in [-1, 1]^3. A level of resolution R has (R + 1)^3 corners. Levels whose corners fit into
 `2 ** log2_table_size` rows are indexed densely, finer ones are hashed (Müller et al., Instant Neural Graphics
 Primitives, 2022). All levels share one flat table, so that the optimiser sees a single parameter.
 
@@ -18,16 +18,16 @@ PRIMES = (1, 2654435761, 805459861)  # of the spatial hash; the first is 1, so n
 
 @dataclass(frozen=True)
 class GridLayout:
-    """Where the levels of a feature grid lie in the table."""
+    """Where the levels of a feature grid are in the table."""
 
     resolutions: tuple[int, ...]
     """Cells per axis of each level."""
     offsets: tuple[int, ...]
     """First row of each level in the table."""
     sizes: tuple[int, ...]
-    """Rows of each level, at least its corners unless it is hashed."""
+    """Rows of each level: at least as many as its corners, unless it is hashed."""
     hashed: tuple[bool, ...]
-    """Whether rows are found by hashing (size is then a power of two) instead of counting."""
+    """Whether rows are found by hashing (the size is then a power of two) instead of dense indexing."""
     features: int
     """Numbers per row."""
     smooth: bool = False
@@ -43,7 +43,7 @@ class GridLayout:
             ValueError: there is no level, or the resolutions are not increasing.
         """
         if levels < 1 or features < 1 or not 1 <= min_resolution <= max_resolution:
-            raise ValueError(f"no such grid: {levels} levels, {min_resolution}..{max_resolution}, {features} features")
+            raise ValueError(f"invalid grid: {levels} levels, {min_resolution}..{max_resolution}, {features} features")
         growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
         resolutions = tuple(round(min_resolution * growth**level) for level in range(levels))
         corners = [(r + 1) ** 3 for r in resolutions]
@@ -83,8 +83,8 @@ class HashGrid(nn.Module):
         """Fade levels: 0 switches a level off, 1 is its full strength.
 
         Raises:
-            ValueError: the number of weights is not that of the levels.
+            ValueError: the number of weights differs from the number of levels.
         """
         if weights.shape != self.level_weights.shape:
-            raise ValueError(f"{self.layout.levels} level weights wanted, got {tuple(weights.shape)}")
+            raise ValueError(f"expected {self.layout.levels} level weights, got {tuple(weights.shape)}")
         self.level_weights.copy_(weights)

@@ -1,4 +1,4 @@
-"""The feature grid in plain torch: the reference the fast versions are tested against, and the path for GPUs."""
+"""The feature grid in plain torch: the reference for tests of the fast versions, and the version that runs on GPUs."""
 
 import torch
 from jaxtyping import Float, Int

@@ -18,13 +18,13 @@ from sl_nerfstudio.field.kernels.pack import pack_grid, pack_network, unpack_gra
 from sl_nerfstudio.field.kernels.simd import FEATURES
 from sl_nerfstudio.threads import parallel, split
 
-_BATCH = 16384  # points whose feature gradients wait (in cache) between the MLP and the table
+_BATCH = 16384  # points whose feature gradients are kept (in cache) between the MLP and the table
 
 _buffers = local()
 
 
 class NumbaField:
-    """`FieldBackend` for float32 on the CPU with 8 features a level."""
+    """`FieldBackend` for float32 on the CPU with 8 features per level."""
 
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
@@ -131,10 +131,10 @@ class NumbaField:
         marks: Tensor | None,
         work: Callable[..., None],
     ) -> list[Weights]:
-        """Batch by batch: MLP in parallel over ranges of points, then the table in parallel over levels.
+        """For each batch, run the MLP in parallel over ranges of points, then the table in parallel over levels.
 
-        Gives the ranges' sums of MLP gradients. Nothing depends on timing: each range has its own sums, and each
-        level of the table is written by one thread, in the order of the points.
+        Returns the sums of MLP gradients of the ranges. Results do not depend on timing: each range has its own sums,
+        and each level of the table is written by one thread, in the order of the points.
         """
         batch = min(len(xyz), _BATCH)
         ranges = _ranges(batch)
@@ -168,15 +168,15 @@ class NumbaField:
 
 
 def _heavy(g: Float[Tensor, "n"]) -> Tensor | None:
-    """Indices of the points that matter, or None if it is not worth the trouble.
+    """Indices of the points that matter, or None if leaving out the others would not save much.
 
-    All others together change no sum over the points by more than the rounding (2^-24) of its largest term. Rendering
-    weights make most points of a ray such points: those in free space and those deep behind the surface.
+    All others together change no sum over the points by more than the rounding (2^-24) of its largest term. Because of
+    the rendering weights most points of a ray are negligible: those in free space and those deep behind the surface.
     """
     if len(g) == 0:
         return None
     size = g.abs()
-    light = size <= size.max() * (2.0**-24 / len(g))  # false for NaN, which must not get lost
+    light = size <= size.max() * (2.0**-24 / len(g))  # false for NaN, which must be kept
     if light.all() or light.count_nonzero() < 0.1 * len(g):
         return None
     return light.logical_not_().nonzero()[:, 0]
@@ -195,6 +195,6 @@ def _array(t: Tensor) -> np.ndarray:
 
 
 def _ranges(n: int) -> list[tuple[int, int]]:
-    """Twice as many ranges as threads, so that the others relieve a thread that is held up."""
+    """Twice as many ranges as threads, so that other threads can take over work from a slow one."""
     threads = torch.get_num_threads()
     return split(n, 1 if threads == 1 else 2 * threads, POINTS)

@@ -1,8 +1,8 @@
-"""Adam for feature tables: a row is stepped only when it has a gradient.
+"""Adam for feature tables: a row is updated only if it has a gradient.
 
-A batch of points touches a fraction of the table. As Müller et al. (Instant Neural Graphics Primitives, 2022) do, rows
+A batch of points touches a fraction of the table. As in Müller et al. (Instant Neural Graphics Primitives, 2022), rows
 whose gradient is exactly zero are skipped: moments and bias correction count a row's own steps. On the CPU the skipped
-rows are not even read, and a step leaves the gradient cleared: the next backward pass need not do it.
+rows are not even read, and a step clears the gradient, so that the next backward pass does not have to.
 """
 
 import math
@@ -31,7 +31,7 @@ class RowAdam(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
-        """One step for all rows that have a gradient; gives the closure's value."""
+        """Take one step for all rows that have a gradient; returns the closure's value."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -58,7 +58,7 @@ class RowAdam(Optimizer):
 
 @lru_cache(maxsize=4)
 def _corrections(beta1: float, beta2: float) -> np.ndarray:
-    """Row t: factors that free step t's moments of their start at zero; constant from the last row on."""
+    """Row t: factors that correct step t's moments for their start at zero; constant from the last row on."""
     until = max(math.log(2**-24) / math.log(beta) if 0 < beta < 1 else 1 for beta in (beta1, beta2))
     t = np.arange(1, math.ceil(until) + 1)
     rows = np.stack([1 / (1 - beta1**t), np.sqrt(1 / (1 - beta2**t))], -1)
@@ -75,7 +75,7 @@ def _step_marked(
     beta2: float,
     eps: float,
 ) -> None:
-    """The compiled step of a table whose gradient lies in its own buffer."""
+    """The compiled step of a table whose gradient is in its persistent buffer."""
     marks = buffer.trusted_marks().numpy()
     arrays = [t.detach().numpy().reshape(-1) for t in (parameter, buffer.buffer, state["moments"], state["steps"])]
     constants = [np.float32(x) for x in (lr, beta1, beta2, eps)]
@@ -96,7 +96,7 @@ def _step_any(
     beta2: float,
     eps: float,
 ) -> None:
-    """The same in torch, for any device, shape and precision."""
+    """The same step in torch, for any device, shape and precision."""
     g, steps = parameter.grad, state["steps"]
     mean, square = state["moments"].unbind(1)
     assert g is not None

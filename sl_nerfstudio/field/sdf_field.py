@@ -23,7 +23,7 @@ from sl_nerfstudio.field.torch_backend import TorchField, knee
 
 @dataclass
 class FieldConfig:
-    """Size and start of the field; the defaults are the paper's sizes."""
+    """Size and initial state of the field; the defaults are the paper's sizes."""
 
     levels: int = 5
     """Levels of the feature grid."""
@@ -46,7 +46,7 @@ class FieldConfig:
     sphere_radius: float = 0.5
     """Radius, in scene units, of the sphere the field starts from."""
     backend: BackendName = "auto"
-    """numba: compiled for this CPU; torch: any device and precision; auto: numba wherever it can."""
+    """numba: compiled for this CPU; torch: any device and precision; auto: numba wherever it works."""
 
 
 class SDFField(nn.Module):
@@ -111,7 +111,7 @@ class SDFField(nn.Module):
         return h
 
     def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
-        """Fade the grid's levels in, coarse to fine: one weight in [0, 1] a level."""
+        """Fade the grid's levels in, coarse to fine: one weight in [0, 1] per level."""
         self.encoding.set_level_weights(weights)
 
     def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -120,7 +120,7 @@ class SDFField(nn.Module):
         return value(self._backend(state), self._buffer(state), state, p)
 
     def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
-        """`sdf` as a column, under the name by which `ns-export marching-cubes` asks for it."""
+        """`sdf` as a column, under the name that `ns-export marching-cubes` uses."""
         return self.sdf(p)[:, None]
 
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
@@ -144,7 +144,7 @@ class SDFField(nn.Module):
         return self._numba
 
     def _buffer(self, state: FieldState) -> TableGradient | None:
-        """The table's persistent gradient buffer, where one is used: compiled kernels, one process."""
+        """The table's persistent gradient buffer, if one is used (compiled kernels, one process)."""
         distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
         if distributed or self._backend(state) is self._torch:
             return None

@@ -1,4 +1,4 @@
-"""What rendering needs of a field."""
+"""The interface of a field that rendering needs."""
 
 from typing import Protocol, runtime_checkable
 

@@ -1,4 +1,4 @@
-"""The table's gradient: one buffer for the whole run, with marks on the rows that hold something."""
+"""The table's gradient: one buffer for the whole run, with marks on the rows that may not be zero."""
 
 from enum import Enum, auto
 from functools import partial
@@ -13,34 +13,35 @@ from sl_nerfstudio.threads import parallel, split
 
 
 class Wanted(Enum):
-    """What a running backward pass wants with a parameter's gradient."""
+    """What a running backward pass needs from a parameter's gradient."""
 
     NO = auto()
-    """Nothing: it is frozen, or `torch.autograd.grad` asks for other tensors only."""
+    """Nothing: it is frozen, or `torch.autograd.grad` was called for other tensors only."""
     ACCUMULATED = auto()
-    """That it is added to `.grad`: `backward()`."""
+    """It is added to `.grad`, by `backward()`."""
     RETURNED = auto()
-    """The tensor itself: `torch.autograd.grad` asks for it."""
+    """The tensor itself is returned, by `torch.autograd.grad`."""
 
 
 def wanted(parameter: Tensor) -> Wanted:
-    """What the backward pass that is running wants with a leaf's gradient."""
+    """What the running backward pass needs from a leaf's gradient."""
     if not parameter.requires_grad:
         return Wanted.NO
     ask = getattr(torch._C, "_will_engine_execute_node", None)
-    if ask is None:  # not a public function; without it only backward() is served
+    if ask is None:  # not a public function; without it only backward() is supported
         return Wanted.ACCUMULATED
     try:
         return Wanted.ACCUMULATED if ask(get_gradient_edge(parameter).node) else Wanted.NO
-    except RuntimeError:  # so it says that torch.autograd.grad asks for this very leaf
+    except RuntimeError:  # raised if torch.autograd.grad was called for this very leaf
         return Wanted.RETURNED
 
 
 class TableGradient:
-    """Gradient buffer of a table, reused from step to step (a fresh 44 MB costs 20 ms in page faults).
+    """Gradient buffer of a table, reused from step to step (a new one of 44 MB costs 20 ms in page faults).
 
-    Rows that are not zero are marked, so that clearing and the optimiser need not read the others. Kernels write past
-    torch's version counter; if that counter moved, somebody else wrote, and every row counts as marked.
+    Rows that are not zero are marked, so that clearing and the optimiser need not read the others. Kernels do not
+    increase torch's version counter. If the counter has changed, something else wrote to the buffer, and every row
+    counts as marked.
     """
 
     def __init__(self, table: Tensor):
@@ -50,20 +51,20 @@ class TableGradient:
 
     @staticmethod
     def known(table: Tensor) -> "TableGradient | None":
-        """The buffer that belongs to a table, if there is one."""
+        """The buffer of a table, if there is one."""
         known = getattr(table, "_sl_gradient", None)
         return known if isinstance(known, TableGradient) and known.buffer.shape == table.shape else None
 
     @staticmethod
     def of(table: nn.Parameter) -> "TableGradient":
-        """The buffer that belongs to a table, made at first use; the optimiser finds it here, too."""
+        """The buffer of a table, created at first use; the optimiser finds it here, too."""
         known = TableGradient.known(table)
         if known is None:
             known = table._sl_gradient = TableGradient(table)  # pyright: ignore
         return known
 
     def attach(self, table: nn.Parameter) -> Tensor:
-        """The tensor to add the table's gradient to: `table.grad`, which becomes the (cleared) buffer if it is None."""
+        """The tensor to add the table's gradient to: `table.grad`, set to the (cleared) buffer if it is None."""
         if table.grad is None:
             self.clear()
             table.grad = self.buffer
@@ -77,14 +78,14 @@ class TableGradient:
         return gradient is not None and gradient.data_ptr() == self.buffer.data_ptr()
 
     def trusted_marks(self) -> Tensor:
-        """Marks of the rows that may hold something: all, if torch wrote to the buffer."""
+        """Marks of the rows that may not be zero: all of them, if torch wrote to the buffer."""
         if self.buffer._version != self._version:
             self.marks.fill_(1)
             self._version = self.buffer._version
         return self.marks
 
     def clear(self) -> None:
-        """Make the buffer zero."""
+        """Set the buffer to zero."""
         marks, gradient = self.trusted_marks().numpy(), self.buffer.numpy().reshape(-1)
 
         def work(start: int, stop: int) -> None:

@@ -1,4 +1,4 @@
-"""The field in plain torch, gradients by hand: any device, any precision; the reference for the compiled version.
+"""The field in plain torch with hand-written gradients: any device, any precision; the compiled version's reference.
 
 Sizes in comments: n points, l levels, f features, c corners (8), h hidden width.
 """
@@ -13,7 +13,7 @@ from sl_nerfstudio.field.hash_grid_torch import corner_rows, corner_weights
 
 
 def knee(z: Float[Tensor, "*batch"], width: float) -> Float[Tensor, "*batch"]:
-    """ReLU whose corner, of half-width `width`, is rounded so that it is twice continuously differentiable."""
+    """ReLU with a rounded corner of half-width `width`, which makes it twice continuously differentiable."""
     t = _place(z, width)
     return width * t**3 * (2 - t) + (z - width).clamp_min(0)
 
@@ -70,7 +70,7 @@ class TorchField:
         return a, z
 
     def _derivatives(self, state: FieldState, z: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Derivatives of f with respect to activations, and to pre-activations; the last is that of the MLP's input."""
+        """Derivatives of f by activations and by pre-activations; the last one is that of the MLP's input."""
         h = [state.mlp[-2].detach().expand(len(z[0]), -1)]
         u = []
         for w, z_layer in zip(state.mlp[-4::-2], reversed(z), strict=True):
@@ -153,7 +153,7 @@ class TorchField:
         v: Float[Tensor, "n 3"] | None,
         table_gradient: Float[Tensor, "rows f"],
     ) -> None:
-        """Add adjoints `d` of the MLP's input to the table's gradient; `slopes` go with the weights' derivatives."""
+        """Add adjoints `d` of the MLP's input to the table's gradient; `slopes` multiply the weights' derivatives."""
         q = p.clamp(-1, 1)
         features = self.layout.features
         for level in self._levels(state):

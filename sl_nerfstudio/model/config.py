@@ -1,4 +1,4 @@
-"""The model's configuration as nerfstudio makes a model of it, and that of the paper's method."""
+"""The configuration from which nerfstudio creates the model, and that of the paper's method."""
 
 from dataclasses import dataclass, field, replace
 
@@ -14,7 +14,7 @@ class SLModelConfig(SLModelSettings):
 
 
 def paper_model() -> SLModelConfig:
-    """The paper's: sphere start, independent poses trained by Adam, all levels, uniform samples, no direct terms."""
+    """The paper's model: initial sphere, independent poses by Adam, all levels, uniform samples, no direct terms."""
     c = SLModelConfig(pose_method="render-independently", warm_start=0.0)
     losses = replace(
         c.losses,

@@ -7,13 +7,14 @@ from torch import Tensor
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.rendering.direct_losses import DecodingNoise
 from sl_nerfstudio.scan import Scan
 
 _PER_FRAME = 2000  # pixels
-_LEAST_PX = 0.02  # noise that is believed, pattern pixels
+_LEAST_PX = 0.02  # smallest plausible noise, pattern pixels
 
 
 @torch.no_grad()
@@ -45,4 +46,5 @@ def measure_decoding(
         slopes.append(1 / triangulate(*arguments).sigma_depth)
     residual, slope = torch.cat(residuals), torch.cat(slopes)
     finite = residual.isfinite() & slope.isfinite()
-    return DecodingNoise(max(float(residual[finite].median()) * 1.4826, _LEAST_PX), float(slope[finite].median()))
+    sigma = float(residual[finite].median()) * MAD_TO_SIGMA
+    return DecodingNoise(max(sigma, _LEAST_PX), float(slope[finite].median()))

@@ -1,4 +1,4 @@
-"""Convergence curves that travel with the checkpoint."""
+"""Convergence curves that are saved in the checkpoint."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ _ROWS = 512
 
 
 class History(nn.Module):
-    """A table of the last values, thinned out when full: a run of any length fits."""
+    """A table of values over the run, thinned out when full, so that a run of any length fits."""
 
     table: Tensor
     state: Tensor
@@ -26,7 +26,7 @@ class History(nn.Module):
         return int(self.state[1])
 
     def add(self, step: int, values: dict[str, float]) -> None:
-        """Append one row; missing values are NaN. When the table is full, every other row goes."""
+        """Append one row; missing values are NaN. When the table is full, every other row is removed."""
         used = int(self.state[0])
         row = [float(step), *(values.get(name, float("nan")) for name in self.names)]
         self.table[used] = torch.tensor(row, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Intrinsics that agree better with the captures: found before training, kept only if held-out pixels agree, too."""
+"""Intrinsics that agree better with the captures: found before training, kept only if held-out pixels confirm them."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ from sl_nerfstudio.model.pose_refinement import (
 
 @dataclass(frozen=True)
 class RefinedIntrinsics:
-    """How intrinsics were changed; `change` is that of the scan where they were not."""
+    """How intrinsics were changed; if they were not, `change` is the stated one."""
 
     change: IntrinsicsChange
     before: Found
@@ -39,11 +39,11 @@ def refine_intrinsics(
     prior: PriorConfig,
     settings: AdjustmentSettings,
 ) -> RefinedIntrinsics:
-    """Change the intrinsics as far as the captures contradict them, adjusting all poses with each change.
+    """Change the intrinsics if the captures contradict them, adjusting all poses with each change.
 
-    `loaded` holds the scan as its folder states it, `stated` a change that is known already. Intrinsics that the
-    captures do not contradict stay exactly as they are. Gauss-Newton steps follow each other while the contradiction
-    falls; held-out pixels then decide once between the first result and the last.
+    `loaded` holds the scan with the intrinsics of its folder, `stated` a change that is already known. Intrinsics that
+    the captures do not contradict remain unchanged. Gauss-Newton steps are taken while the chi square of the
+    contradiction falls; held-out pixels then decide once between the first result and the last.
     """
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples, settings)
     s = settings.self_calibration

@@ -1,4 +1,4 @@
-"""Decoded coordinates looked up at scene points: what the viewer's residual picture compares with."""
+"""Decoded coordinates looked up at scene points, for the residual image in the viewer."""
 
 import torch
 from jaxtyping import Float, Int
@@ -21,7 +21,7 @@ class MeasuredCoordinates:
     def at(
         self, p: Float[Tensor, "n 3"], views: Int[Tensor, "n"], T_camera_scene: Float[Tensor, "frames 4 4"]
     ) -> Float[Tensor, "n 2"]:
-        """What was decoded at the pixels where frames `views` see scene points; NaN where nothing was."""
+        """The coordinates decoded at the pixels where frames `views` see scene points; NaN where not decoded."""
         result = torch.full_like(p[:, :2], float("nan"))
         for view in views.unique().tolist():
             mine = views == view
@@ -37,7 +37,7 @@ class MeasuredCoordinates:
         image = self._images.pop(view, None)
         if image is None:
             image = torch.from_numpy(self._scan.frames[view].read_coords())
-        self._images[view] = image  # the last one used stands at the end
+        self._images[view] = image  # the most recently used one is at the end
         for oldest in list(self._images)[:-_KEPT]:
             del self._images[oldest]
         return image

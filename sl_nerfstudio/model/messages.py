@@ -1,4 +1,4 @@
-"""What a training run says about poses and intrinsics before its first step."""
+"""Messages about poses and intrinsics that a training run prints before its first step."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def poses_message(found: ScanAdjustment) -> str:
 
 
 def contradiction_message(found: SelfCalibration, cameras: Sequence[Device], projector: Device) -> str:
-    """Which intrinsics would agree better, for the person who calibrated; "" if the captures do not contradict them."""
+    """Which intrinsics would agree better, for the person who calibrated; "" if the captures agree with them."""
     if not found.contradicts():
         return ""
     lines = describe_change(
@@ -32,25 +32,25 @@ def contradiction_message(found: SelfCalibration, cameras: Sequence[Device], pro
             f"The intrinsics contradict the captures (chi square {found.chi_square:.0f}, by chance 6). These changes, "
             "together, would agree better:",
             *(f"    {line}" for line in lines),
-            "    cause:  the calibration of a device is off, or was made with another zoom, focus or image size",
+            "    cause:  the calibration of a device is inaccurate, or was made with another zoom, focus or image size",
             "    remedy: train with --pipeline.model.refine-intrinsics True; if that does not help, calibrate again.\n"
-            "            Until then poses and surface absorb part of the error, which the stated uncertainty covers",
+            "            Until then poses and surface absorb part of the error; the reported uncertainty includes it",
         ]
     )
 
 
 def refined_intrinsics_message(found: RefinedIntrinsics, cameras: Sequence[Device], projector: Device) -> str:
-    """How the intrinsics were changed, or why not; `cameras` and `projector` as they are stated."""
+    """How the intrinsics were changed, or why not; `cameras` and `projector` have the stated intrinsics."""
     before, after = found.before.intrinsics, found.after.intrinsics
     if before is None or after is None:
         return "Intrinsics NOT changed: no frame sees what another one decoded."
     if found.cross_validation is None:
         return (
             "Intrinsics NOT changed: the captures agree with them "
-            f"(chi square {before.chi_square:.0f}, right ones have about 6)."
+            f"(chi square {before.chi_square:.0f}; about 6 is expected for correct ones)."
         )
     if not found.changed:
-        return f"Intrinsics NOT changed: others did not help ({_comparison(found.cross_validation)})."
+        return f"Intrinsics NOT changed: changing them did not help ({_comparison(found.cross_validation)})."
     sigma = IntrinsicsChange.of(after.sigma.tolist())
     return "\n".join(
         [

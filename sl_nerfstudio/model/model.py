@@ -45,7 +45,7 @@ _REFRESH_EVERY = 20  # steps between updates of the cached grid
 
 
 class SLModel(Model):
-    """See docs/method.md. Lengths inside are scene units; `poses` and `S_scene_world` lead back to the scan's."""
+    """See docs/method.md. Lengths are in scene units; `poses` and `S_scene_world` convert to the scan's units."""
 
     config: SLModelSettings
     step_now: Tensor
@@ -63,11 +63,11 @@ class SLModel(Model):
         super().__init__(config, scene_box, num_train_data, **kwargs)
 
     def populate_modules(self) -> None:
-        """Make field, poses and what is known of the devices."""
+        """Create the field, the poses and the buffers that describe the devices."""
         super().populate_modules()
         self.field = SDFField(self.config.sdf)
         self.cache = CachedGrid()
-        self._cache_is_old = False  # after a checkpoint was loaded to be looked at: as old as the last refresh
+        self._cache_is_old = False  # True after a checkpoint was loaded for inspection
         rig = scene_rig(self.scan, self.S_scene_world)
         self.device_poses = make_pose_parameters(self.config, rig.T_world_camera, rig.T_world_projector)
         self.measured = MeasuredCoordinates(self.scan)
@@ -76,8 +76,8 @@ class SLModel(Model):
         self._projector_distorted = projector.distorted
         self.register_buffer("projector_params", projector.params, persistent=False)
         self.register_buffer("pattern", torch.from_numpy(self.scan.read_pattern()).float(), persistent=False)
-        # what a checkpoint must know besides weights: the step, for annealing; the decoding noise, measured once; how
-        # far the intrinsics were changed, so that a resumed run has the same devices
+        # a checkpoint must hold more than weights: the step, for annealing; the decoding noise, measured once; and the
+        # change of the intrinsics, so that a resumed run has the same devices
         self.register_buffer("step_now", torch.zeros((), dtype=torch.int64))
         self.register_buffer("noise_px", torch.ones(()))
         self.register_buffer("px_per_length", torch.tensor(float("nan")))
@@ -86,10 +86,10 @@ class SLModel(Model):
         self.history_table = History(("loss", "coordinate_px", "pattern_cosine", "eikonal", "surface"))
         self.projector_of_frame = ViewerSlider("Projector of frame", 0, 0, max(len(self.scan.frames) - 1, 1), 1)
 
-    # ---- what other parts of the package use
+    # ---- for other parts of the package
 
     def poses_scene(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """Present poses of cameras and projectors in the scene."""
+        """Current poses of cameras and projectors in the scene."""
         with torch.no_grad():
             return self.device_poses()
 
@@ -100,12 +100,12 @@ class SLModel(Model):
         return DevicePoses(S.poses(camera.cpu().numpy()), S.poses(projector.cpu().numpy()))
 
     def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
-        """1 sigma per frame (see pose_refinement.sigmas_in_scan_units), or None where it was not estimated."""
+        """1 sigma per frame (see pose_refinement.sigmas_in_scan_units), or None if it was not estimated."""
         sigma = self.device_poses.sigma
         return None if bool(sigma.isnan().any()) else sigmas_in_scan_units(sigma, self.S_scene_world)
 
     def self_calibration(self) -> SelfCalibration | None:
-        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
+        """How well the intrinsics agree with the captures; None if poses were not adjusted."""
         return self.device_poses.self_calibration()
 
     def history(self) -> dict[str, list[float]]:
@@ -168,18 +168,18 @@ class SLModel(Model):
         self.px_per_length.fill_(noise.px_per_length)
 
     def anneal(self, step: int) -> None:
-        """Set sharpness and detail of a step; called before each, and when a checkpoint is loaded."""
+        """Set sharpness and level of detail for a step; called before each step, and when a checkpoint is loaded."""
         self.step_now.fill_(step)
         c = self.config
         self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
         uses_cache = self.training and c.sampling.strategy == "surface" and self._renders(step)
         if uses_cache and (not self.cache.filled or step % _REFRESH_EVERY == 0):
             self.cache.refresh(self.field)
-        if self.training:  # training goes on: with the cache as it was, or the resumed run would be another one
+        if self.training:  # training continues with the saved cache, so that a resumed run equals an uninterrupted one
             self._cache_is_old = False
 
     def update_to_step(self, step: int) -> None:
-        """Called by nerfstudio before weights are loaded: the levels must be those of that step."""
+        """Called by nerfstudio before weights are loaded: sets the levels to those of the checkpoint's step."""
         self.anneal(step)
         self._cache_is_old = True
 
@@ -188,19 +188,19 @@ class SLModel(Model):
 
     @property
     def kappa(self) -> float:
-        """Present sharpness, per scene unit."""
+        """Current sharpness, per scene unit."""
         return kappa_at(self.config.annealing, int(self.step_now), self.config.schedule_iterations)
 
     @property
     def renderer(self) -> Renderer:
-        """The field under the projector, as sharp as it is now; outside training with a fresh cached grid."""
+        """The field lit by the projector, at its current sharpness; outside training with an up-to-date cached grid."""
         if not self.training and (self._cache_is_old or not self.cache.filled):
             self.cache.refresh(self.field)
             self._cache_is_old = False
         return Renderer(self.field, self.cache, self.projector, self.pattern, self.config.sampling, self.kappa)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Rendered outputs of rays; in training those that the losses need."""
+        """Rendered outputs of rays; in training, those that the losses need."""
         if not self.training:
             return self._eval_outputs(ray_bundle)
         views = ray_bundle.metadata["sl_view"][:, 0]
@@ -225,7 +225,7 @@ class SLModel(Model):
         origins, directions, views = self.corrected_rays(bundle)
         T_camera, T_projector = self.poses_scene()
         outputs = ray_outputs(self.renderer, origins, directions, T_projector.float()[views])
-        if "sl_uv" not in (bundle.metadata or {}):  # single pixels of a batch bring their measured coordinates along
+        if "sl_uv" not in (bundle.metadata or {}):  # batches of single pixels hold their measured coordinates
             depth = torch.where(outputs["accumulation"] > 0.5, outputs["depth"], 0.0)
             measured = self.measured.at(origins + depth * directions, views, inverse(T_camera).float())
             outputs["residual"] = residual_output(outputs, measured)
@@ -234,7 +234,7 @@ class SLModel(Model):
     def corrected_rays(self, bundle: RayBundle) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"], Tensor]:
         """Origins, directions and frame numbers of rays, at their refined poses.
 
-        Rays of a free viewpoint belong to no frame: they stay as they are, and see by the projector chosen in the
+        Rays of a free viewpoint are not part of a frame: they are unchanged, and use the projector chosen in the
         viewer.
         """
         metadata = bundle.metadata or {}
@@ -247,7 +247,7 @@ class SLModel(Model):
         return *self._corrected(bundle, views, self.poses_scene()[0]), views
 
     def _corrected(self, bundle: RayBundle, views: Tensor, T_camera: Tensor) -> tuple[Tensor, Tensor]:
-        """From the starting pose, in which the rays come, to the present one."""
+        """Move rays from the starting pose, at which they were made, to the current one."""
         correction = (T_camera @ inverse(self.device_poses.start_camera)).float()[views]
         directions = rotate(correction, bundle.directions)
         return T_camera[:, :3, 3].float()[views], directions / directions.norm(dim=-1, keepdim=True)
@@ -255,7 +255,7 @@ class SLModel(Model):
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
-        """The weighted losses of a training step; in evaluation the terms that rendered outputs have."""
+        """The weighted losses of a training step; in evaluation, the terms that need only rendered outputs."""
         w = self.config.losses
         losses: dict[str, Tensor] = {}
         if "origins" not in outputs:
@@ -305,15 +305,15 @@ class SLModel(Model):
     # ---- evaluation
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Median coordinate residual in pixels and pattern cosine of some pixels."""
+        """Median coordinate residual (pattern pixels) and pattern cosine of a batch."""
         return fit_metrics(outputs, batch)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Colour with the accumulation as opacity: exporters keep what is opaque."""
+        """Colour with the accumulation as opacity: exporters keep opaque pixels."""
         return torch.cat([outputs[output_name], outputs["accumulation"]], -1)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Rendered beside captured, for one whole frame."""
+        """Rendered and captured images side by side, for one whole frame."""
         return image_metrics_and_images(outputs, batch)

@@ -1,7 +1,7 @@
 """Learning rates and the optimizer, as nerfstudio's configs.
 
-nerfstudio's own schedulers return numpy floats, which land in the checkpoint and which torch >= 2.6 refuses to load;
-these return Python floats. The whole schedule is kept in the checkpoint, so that a resumed run goes on along it.
+nerfstudio's own schedulers return numpy floats, which are saved in the checkpoint and which torch >= 2.6 refuses to
+load; these return Python floats. The whole schedule is saved in the checkpoint, so that a resumed run continues it.
 """
 
 import math
@@ -31,7 +31,7 @@ class FusedAdamOptimizerConfig(OptimizerConfig):
 
 @dataclass
 class RowAdamOptimizerConfig(OptimizerConfig):
-    """Adam that passes over the rows of a feature table that a step did not touch."""
+    """Adam that skips the rows of a feature table that a step did not touch."""
 
     _target: type = RowAdam
     lr: float = 1e-2
@@ -46,7 +46,7 @@ Shape = Literal["cosine", "exponential"]
 class LearningRate:
     """Factor on the initial learning rate: a linear warm-up, then a decay to `final`, then constant.
 
-    A callable object and not a function: torch then writes its attributes into the checkpoint.
+    A callable object rather than a function, so that torch writes its attributes to the checkpoint.
     """
 
     def __init__(self, shape: Shape, final: float, warm_up: int, max_steps: int) -> None:
@@ -81,16 +81,16 @@ class DecaySchedulerConfig(SchedulerConfig):
 
 
 class DecayScheduler(Scheduler):
-    """Makes torch's scheduler of a DecaySchedulerConfig."""
+    """Makes torch's scheduler from a DecaySchedulerConfig."""
 
     config: DecaySchedulerConfig
 
     def get_scheduler(self, optimizer: torch.optim.Optimizer, lr_init: float) -> LambdaLR:
         """A scheduler for one optimizer; the initial rate is the optimizer's own.
 
-        Raises ValueError where the length of the run has not been filled in.
+        Raises ValueError if the length of the run has not been set.
         """
         c = self.config
         if c.max_steps is None:
-            raise ValueError("DecaySchedulerConfig.max_steps is not set; SLTrainerConfig fills it in before training")
+            raise ValueError("DecaySchedulerConfig.max_steps is not set; SLTrainerConfig sets it before training")
         return LambdaLR(optimizer, LearningRate(c.shape, c.final, c.warm_up, c.max_steps))

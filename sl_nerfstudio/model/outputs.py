@@ -1,4 +1,4 @@
-"""What the model shows outside training: outputs of rays for viewer, exporters and evaluation."""
+"""The model's outputs outside training: images for viewer, exporters and evaluation."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from sl_nerfstudio.rendering.renderer import Renderer
 
 _EVAL_SAMPLES = 24
 _OPAQUE = 0.5
-_MODULO = 128.0  # pattern pixels of one turn of the coordinate colours
+_MODULO = 128.0  # pattern pixels of one cycle of the coordinate colours
 _RESIDUAL_WHITE_PX = 5.0
 
 
@@ -22,9 +22,9 @@ def ray_outputs(
     directions: Float[Tensor, "rays 3"],
     T_scene_projector: Float[Tensor, "rays 4 4"],
 ) -> dict[str, Tensor]:
-    """Float images of 1 or 3 channels: what nerfstudio's viewer, renderer and exporters rely on, and ours.
+    """Float images of 1 or 3 channels: those that nerfstudio's viewer, renderer and exporters need, and our own.
 
-    `depth` is the distance along the unit ray, in scene units, and far (1000) where there is no object.
+    `depth` is the distance along the unit ray, in scene units, and 1000 where there is no object.
     """
     o, d = origins, directions
     samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
@@ -48,7 +48,7 @@ def ray_outputs(
 
 
 def residual_output(outputs: dict[str, Tensor], measured: Float[Tensor, "rays 2"]) -> Float[Tensor, "rays 1"]:
-    """Distance of rendered from measured coordinates as brightness; 0 off the object and where nothing was decoded."""
+    """Distance between rendered and measured coordinates as brightness; 0 beside the object and where not decoded."""
     rendered = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
     share = torch.nan_to_num((rendered - measured).norm(dim=-1) / _RESIDUAL_WHITE_PX, nan=0.0)
     opaque = outputs["accumulation"][:, 0] > _OPAQUE
@@ -56,7 +56,7 @@ def residual_output(outputs: dict[str, Tensor], measured: Float[Tensor, "rays 2"
 
 
 def coordinate_colours(uv: Float[Tensor, "n 2"], valid: Tensor) -> Float[Tensor, "n 3"]:
-    """The usual picture of a coordinate image: x modulo 128 in red, y modulo 128 in green."""
+    """The usual colours of a coordinate image: x modulo 128 in red, y modulo 128 in green."""
     turn = uv.remainder(_MODULO) / _MODULO
     colour = torch.cat([turn, torch.full_like(turn[:, :1], 0.2)], -1)
     return torch.where(valid[:, None], colour, 0.0)
@@ -85,7 +85,7 @@ def fit_metrics(outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, 
 def image_metrics_and_images(
     outputs: dict[str, Tensor], batch: dict[str, Any]
 ) -> tuple[dict[str, float], dict[str, Tensor]]:
-    """Captured beside rendered, [H, 2 W, 3], and the images of the other outputs."""
+    """Captured and rendered image side by side, [H, 2 W, 3], and the images of the other outputs."""
     captured = batch["image"].to(outputs["rgb"].device)[..., :3]
     h, w = outputs["rgb"].shape[:2]
     captured = captured[:h, :w]

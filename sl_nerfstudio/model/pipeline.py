@@ -1,4 +1,4 @@
-"""What stands between nerfstudio's commands and the model: reproducible steps, honest evaluation, refined poses."""
+"""The link between nerfstudio's commands and the model: reproducible steps, held-out evaluation, refined poses."""
 
 import math
 import shlex
@@ -25,7 +25,7 @@ _HELD_OUT_PIXELS = 4096  # of one frame, at most: enough for a median to two dig
 
 @dataclass
 class SLPipelineConfig(VanillaPipelineConfig):
-    """Pixels of a scan and the model that explains them."""
+    """The pixels of a scan, and the model that is fitted to them."""
 
     _target: type = field(default_factory=lambda: SLPipeline)
 
@@ -33,11 +33,11 @@ class SLPipelineConfig(VanillaPipelineConfig):
 class SLPipeline(VanillaPipeline):
     """nerfstudio's pipeline with four differences.
 
-    - The random numbers of a training step depend on the seed and the step alone: a resumed run goes on as an
-      uninterrupted one would have.
-    - Evaluation looks at held-out pixels of every frame, not at whole images that were trained on.
-    - After a checkpoint is loaded to be looked at or exported, cameras stand where refinement has put them.
-    - The viewer shows projectors, and the end of training says what can be done next.
+    - The random numbers of a training step depend only on the seed and the step: a resumed run continues as an
+      uninterrupted one would.
+    - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
+    - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
+    - The viewer shows projectors, and at the end of training the next commands are printed.
     """
 
     datamanager: SLDataManager
@@ -53,7 +53,7 @@ class SLPipeline(VanillaPipeline):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """The model's, with ours around them."""
+        """The model's callbacks, with those of this pipeline before and after them."""
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
         return [
             TrainingCallback([before], self._seed_step),
@@ -71,7 +71,7 @@ class SLPipeline(VanillaPipeline):
         return cast(SLModel, self.model)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load weights; unless training is to go on (`test_mode` "val"), put the cameras at their refined poses."""
+        """Load weights; unless training continues (`test_mode` "val"), move the cameras to their refined poses."""
         super().load_pipeline(loaded_state, step)
         if self.test_mode != "val":
             self.datamanager.stand_at(self._sl_model.poses_scene()[0])
@@ -82,7 +82,7 @@ class SLPipeline(VanillaPipeline):
     ) -> dict[str, float]:
         """Means over the frames of the metrics of their held-out pixels, all finite; `ns-eval` writes them.
 
-        With `output_path`, whole frames are rendered and saved there beside.
+        With `output_path`, whole frames are also rendered and saved there.
         """
         self.eval()
         frames = range(len(self.datamanager.train_dataset))
@@ -124,12 +124,12 @@ class SLPipeline(VanillaPipeline):
 
 
 def what_next(config: Path, scan: Path) -> str:
-    """Where the result lies, and the commands that go on from there."""
+    """Where the result is, and the commands to continue with."""
     settings, data = shlex.quote(str(config)), shlex.quote(str(scan))
     return "\n".join(
         [
             f"Result: {config.parent}",
-            "Look at it, and write the surface and the refined poses in the scan's units:",
+            "To view it, and to export the surface and the refined poses in the scan's units:",
             f"  ns-viewer --load-config {settings}",
             f"  sl-export --load-config {settings} --output mesh.ply --poses refined/",
             f"  sl-eval   --mesh mesh.ply --data {data} --poses refined/transforms.json --report report.html",
@@ -138,9 +138,9 @@ def what_next(config: Path, scan: Path) -> str:
 
 
 def mean_over_frames(per_frame: list[dict[str, float]], with_std: bool) -> dict[str, float]:
-    """Mean, and on request `<name>_std`, of each metric over the frames that have it; nothing that is not finite.
+    """Mean, and on request `<name>_std`, of each metric over the frames that have a finite value of it.
 
-    The deviation of a single value is 0, where nerfstudio's would be NaN, which is not JSON.
+    The standard deviation of a single value is 0; nerfstudio's would be NaN, which JSON does not allow.
     """
     result: dict[str, float] = {}
     for name in dict.fromkeys(name for metrics in per_frame for name in metrics):

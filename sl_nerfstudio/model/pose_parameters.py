@@ -1,11 +1,11 @@
 """Poses of all devices as parameters, in the scene frame.
 
-`RigPoseParameters`: a frame moves as a whole, and its projector moves against its camera.
-`StaticProjectorParameters`: cameras move about a projector that does not.
-`IndependentPoseParameters` (the paper's): camera and projector of a frame know nothing of each other.
-`CoupledPoseParameters`: each camera by itself, and a projector whose pose against it is known or shared by all frames.
+`RigPoseParameters`: a frame moves as a whole, and its projector moves relative to its camera.
+`StaticProjectorParameters`: cameras move, their projector does not.
+`IndependentPoseParameters` (the paper's): camera and projector of a frame move independently of each other.
+`CoupledPoseParameters`: each camera moves independently; the relative pose of its projector is known or shared by all.
 
-All start from a *base* that may be replaced (by the bundle adjustment) before training goes on; the parameters are
+All start from a *base* that may be replaced (by the bundle adjustment) before training continues; the parameters are
 increments to it.
 """
 
@@ -44,7 +44,7 @@ class PoseParameters(nn.Module):
         n = len(T_scene_camera)
         # 1 sigma of (delta, rho): translation xyz, rotation xyz each; NaN where not estimated
         self.register_buffer("sigma", torch.full((n, 12), float("nan"), dtype=torch.float64))
-        # what the adjustment found about the intrinsics (see SelfCalibration); NaN where it found nothing
+        # the adjustment's self-calibration of the intrinsics (see SelfCalibration); NaN where there is none
         self.register_buffer("intrinsics_change", torch.full((UNKNOWNS,), float("nan"), dtype=torch.float64))
         covariance = torch.full((UNKNOWNS, UNKNOWNS), float("nan"), dtype=torch.float64)
         self.register_buffer("intrinsics_covariance", covariance)
@@ -55,7 +55,7 @@ class PoseParameters(nn.Module):
     def rebase(
         self, T_scene_camera: Float[Tensor, "frames 4 4"], T_scene_projector: Float[Tensor, "frames 4 4"]
     ) -> None:
-        """Go on from other poses; the increments become zero."""
+        """Continue from other poses; the increments become zero."""
         self.base_camera.copy_(T_scene_camera)
         self.base_projector.copy_(T_scene_projector)
         self.camera_step.zero_()
@@ -63,14 +63,14 @@ class PoseParameters(nn.Module):
 
     @torch.no_grad()
     def note(self, sigma: Float[Tensor, "frames 12"], intrinsics: SelfCalibration | None) -> None:
-        """Keep what the adjustment found beside the poses."""
+        """Store the adjustment's results other than the poses."""
         self.sigma.copy_(sigma)
         if intrinsics is not None:
             self.intrinsics_change.copy_(intrinsics.change)
             self.intrinsics_covariance.copy_(intrinsics.covariance)
 
     def self_calibration(self) -> SelfCalibration | None:
-        """What the adjustment found about the intrinsics; None where nothing was adjusted."""
+        """The adjustment's self-calibration of the intrinsics; None if nothing was adjusted."""
         found = SelfCalibration(self.intrinsics_change.cpu(), self.intrinsics_covariance.cpu())
         return found if found.known else None
 
@@ -101,7 +101,7 @@ class RigPoseParameters(PoseParameters):
 
 
 class StaticProjectorParameters(PoseParameters):
-    """`T_scene_camera = exp(delta) base`, and a projector that stays where it is: only cameras move about it."""
+    """`T_scene_camera = exp(delta) base`, and a projector that does not move."""
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See PoseParameters."""
@@ -117,7 +117,7 @@ class IndependentPoseParameters(PoseParameters):
 
 
 class CoupledPoseParameters(PoseParameters):
-    """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres and take their projectors along."""
+    """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres, and their projectors move with them."""
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See PoseParameters."""
@@ -130,7 +130,7 @@ def make_pose_parameters(
     T_scene_camera: Float[Tensor, "frames 4 4"],
     T_scene_projector: Float[Tensor, "frames 4 4"],
 ) -> PoseParameters:
-    """The parameters that fit what is free (`refine_poses`) and how it is refined (`pose_method`)."""
+    """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
     free, independent = settings.refine_poses, settings.pose_method == "render-independently"
     if free == "static-projector":
         kind = StaticProjectorParameters

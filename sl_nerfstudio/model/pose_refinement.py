@@ -1,4 +1,4 @@
-"""From the table of pixels to adjusted poses: what stands between a training run and the bundle adjustment."""
+"""From the table of pixels to adjusted poses: the link between a training run and the bundle adjustment."""
 
 from dataclasses import dataclass
 
@@ -25,29 +25,29 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan, measured_length
 
-_LEAST_SIGMA = 1e-9  # scene units and radian: stands for a pose that is known exactly, and keeps equations solvable
+_LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable
 
 
 @dataclass
 class PriorConfig:
-    """1 sigma of intrinsics, and of starting poses where the scan does not state it by `sl_pose_sigma`."""
+    """1 sigma of intrinsics, and of starting poses if the scan does not state it in `sl_pose_sigma`."""
 
     frame_rotation_deg: float = 2.0
     """Orientation of a frame in the world, in degrees."""
     frame_translation: float = 0.1
     """Position of a frame's part of the surface, as a share of the object's radius."""
     relative_rotation_deg: float = 0.3
-    """Orientation of the projector against the camera, in degrees."""
+    """Orientation of the projector relative to the camera, in degrees."""
     relative_translation: float = 0.05
-    """Position of the projector against the camera, as a share of the baseline."""
+    """Position of the projector relative to the camera, as a share of the baseline."""
     intrinsics: float = INTRINSICS_SIGMA
-    """Focal lengths and principal points of both devices, as a share of the focal length; they widen the stated
+    """Focal lengths and principal points of both devices, as a share of the focal length; they increase the stated
     uncertainty of the poses."""
 
 
 @dataclass(frozen=True)
 class ScanAdjustment:
-    """Adjusted poses in the scene frame, or the starting ones where adjusting did not help."""
+    """Adjusted poses in the scene frame, or the starting ones if adjusting did not help."""
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
@@ -67,7 +67,7 @@ def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
 
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
-    """Stated uncertainty of each frame's starting pose, else the defaults; in scene units and radian."""
+    """Uncertainty of each frame's starting pose, as stated or else by default; in scene units and radian."""
     rows = []
     for frame, length in zip(scan.frames, scan.poses.baseline * S_scene_world.scale, strict=True):
         stated = frame.pose_sigma
@@ -115,7 +115,7 @@ def adjust_scan(
 
 @dataclass(frozen=True)
 class Found:
-    """An adjustment in the scan's gauge, not judged yet."""
+    """An adjustment in the scan's gauge, before cross-validation."""
 
     rig: Rig
     sigma: Float[Tensor, "frames 12"]
@@ -132,14 +132,14 @@ def adjusted(
     prior: PosePrior,
     settings: AdjustmentSettings,
 ) -> Found:
-    """Adjust the scan's poses from `start`, and give them the scan's lengths."""
+    """Adjust the scan's poses from `start`, and restore the scan's lengths."""
     found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     return Found(rig, found.sigma, found.noise_px, found.intrinsics)
 
 
 def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
-    """The factor by which the adjusted rig gets the scan's lengths; a known rig keeps its baselines."""
+    """The factor that restores the scan's lengths in the adjusted rig; a known rig keeps its baselines."""
     known = scan.scale
     if known.baseline_of is not None:
         return baseline_scale(start, rig, scan.index_of(known.baseline_of))
@@ -154,7 +154,7 @@ def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Ri
 def maps_and_held_out(
     scan: Scan, samples: PixelSamples, settings: AdjustmentSettings
 ) -> tuple[CoordinateMaps, HeldOutPixels]:
-    """Coordinate images without the held-out pixels, and some of those."""
+    """Coordinate images without the held-out pixels, and a selection of the held-out pixels."""
     images, frames, uv_camera, uv_projector, blocks = [], [], [], [], []
     for number, frame in enumerate(scan.frames):
         rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
@@ -180,5 +180,5 @@ def maps_and_held_out(
 
 
 def sigmas_in_scan_units(sigma: Float[Tensor, "frames 12"], S_scene_world: Similarity) -> Float[ndarray, "frames 4"]:
-    """RMS per axis: frame translation (scan units), frame rotation (degree), the same for the relative pose."""
+    """RMS per axis: frame translation (scan units), frame rotation (degrees), the same for the relative pose."""
     return frame_sigmas(sigma, 1 / S_scene_world.scale)

@@ -20,23 +20,23 @@ class SLModelSettings(ModelConfig):
     """A signed distance field seen as projector coordinates and pattern intensity, with the poses of both devices."""
 
     enable_collider: bool = False
-    """Must stay off: the scene is a unit sphere and rays are cut to it."""
+    """Must be off: the scene is a unit sphere, and rays are clipped to it."""
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once outside training."""
     schedule_iterations: int = 1000
-    """Steps over which annealing proceeds; filled in by the trainer with the length of the run."""
+    """Number of annealing steps; the trainer sets it to the length of the run."""
     refine_poses: RefinePoses = "free"
     """What is refined: `free` (camera and projector of every frame), `rigid-rig` (frames, and one relative pose for
     all of them), `known-rig` (frames only), `static-projector` (frames, and a projector that never moves), `off`."""
     pose_method: PoseMethod = "adjust"
     """How poses are refined: `adjust` (bundle adjustment before the first step), `adjust-and-render` (the rendering
-    losses go on moving them), `render` (rendering losses alone), `render-independently` (the same, each device by
-    itself)."""
+    losses then continue to refine them), `render` (only the rendering losses), `render-independently` (the same, with
+    each device independent of the others)."""
     refine_intrinsics: bool = False
-    """Where the captures contradict focal lengths and principal points, change those before training, if that makes
-    held-out pixels agree better; the scan folder stays as it is."""
+    """If the captures contradict focal lengths and principal points, change these before training, provided that
+    held-out pixels then agree better; the scan folder is not changed."""
     warm_start: float = 0.15
-    """Share of the run in which the field is fitted to triangulated points before anything is rendered."""
+    """Share of the run during which the field is only fitted to triangulated points, without rendering."""
     sdf: FieldConfig = field(default_factory=FieldConfig)
     """The signed distance field."""
     losses: LossConfig = field(default_factory=LossConfig)
@@ -44,15 +44,15 @@ class SLModelSettings(ModelConfig):
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Samples along rays."""
     annealing: AnnealingConfig = field(default_factory=AnnealingConfig)
-    """Sharpness and detail over the run."""
+    """Sharpness and level of detail over the run."""
     prior: PriorConfig = field(default_factory=PriorConfig)
-    """Uncertainty of the starting poses where the scan does not state it."""
+    """Uncertainty of the starting poses if the scan does not state it, and of the intrinsics."""
     adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
-    """Size of the bundle adjustment."""
+    """Settings of the bundle adjustment."""
 
     @property
     def sdf_field(self) -> FieldConfig:
-        """`sdf` under the name that `ns-export marching-cubes` looks for."""
+        """`sdf` under the name that `ns-export marching-cubes` uses."""
         return self.sdf
 
     @property

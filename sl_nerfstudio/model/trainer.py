@@ -1,4 +1,4 @@
-"""What happens before training starts: faults are found before anything is written."""
+"""Checks before training starts: faults are found before anything is written."""
 
 import sys
 from dataclasses import dataclass, replace
@@ -22,16 +22,16 @@ from sl_nerfstudio.scan import require_valid
 
 @dataclass
 class SLTrainerConfig(TrainerConfig):
-    """nerfstudio's settings of a run, checked before the run begins."""
+    """nerfstudio's settings of a run, checked before the run starts."""
 
     schedule_iterations: int | None = None
-    """Length over which learning rates decay and annealing proceeds: by default --max-num-iterations, and for a
-    resumed run that of the run it resumes."""
+    """Number of steps over which learning rates decay and annealing takes place: by default --max-num-iterations, or
+    for a resumed run the length of the run that it resumes."""
 
     def set_timestamp(self) -> None:
-        """Nerfstudio calls this first of all, before it writes the run's folder: the place to refuse a run.
+        """Check the run; nerfstudio calls this first, before it writes the run's folder.
 
-        A fault of the user is printed without a traceback and ends the process with status 1.
+        An error that the user can fix is printed without a traceback and ends the process with status 1.
         """
         try:
             self.prepare()
@@ -41,7 +41,7 @@ class SLTrainerConfig(TrainerConfig):
         super().set_timestamp()
 
     def prepare(self) -> None:
-        """Check scan, device and checkpoint; make paths absolute; fill in intrinsics and the length of the schedules.
+        """Check scan, device and checkpoint; make paths absolute; set intrinsics and the length of the schedules.
 
         Raises UserError.
         """
@@ -55,7 +55,7 @@ class SLTrainerConfig(TrainerConfig):
         dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
         model: SLModelConfig = self.pipeline.model  # type: ignore[assignment]
         dataparser.intrinsics_change = _intrinsics_change(root, dataparser.intrinsics_change, begun, model)
-        load_scan(root, dataparser.intrinsics_change)  # remembered; fails where no rays meet
+        load_scan(root, dataparser.intrinsics_change)  # cached; fails if no rays meet
         self.data = root
         self.pipeline.datamanager.data = root
         self.output_dir = self.output_dir.expanduser().absolute()
@@ -73,7 +73,7 @@ class SLTrainerConfig(TrainerConfig):
         if not isinstance(dataparser, SLDataParserConfig):
             raise UserError(
                 f"{self.method_name} trains on scan folders only, which `sl-data` reads; "
-                f"{type(dataparser).__name__.removesuffix('Config')} knows no projector. Leave the dataparser out."
+                f"{type(dataparser).__name__.removesuffix('Config')} has no projector. Leave the dataparser out."
             )
         data = self.pipeline.datamanager.data or dataparser.data
         if data == Path():
@@ -84,23 +84,23 @@ class SLTrainerConfig(TrainerConfig):
 def _intrinsics_change(
     root: Path, stated: IntrinsicsChange, begun: "BegunRun | None", model: SLModelConfig
 ) -> IntrinsicsChange:
-    """The intrinsics of the run: those of the run it resumes, else as stated, refined from there on request."""
+    """The change of the intrinsics: that of the run it resumes, else the stated one, refined on request."""
     if begun is not None and begun.intrinsics_change is not None:
         if stated and stated != begun.intrinsics_change:
             raise UserError(
                 f"sl-data --intrinsics-change {stated.values}: the checkpoint was trained with "
                 f"{begun.intrinsics_change.values}\n    cause:  a run is resumed with other intrinsics\n"
-                "    remedy: leave the option out; the run goes on with its own"
+                "    remedy: leave the option out; the run then continues with the same intrinsics as before"
             )
         return begun.intrinsics_change
     if not model.refine_intrinsics:
         return stated
     if not model.adjusts_poses:
         raise UserError(
-            "--pipeline.model.refine-intrinsics: intrinsics are found together with the poses, and those are not "
+            "--pipeline.model.refine-intrinsics: intrinsics are refined together with the poses, but the poses are not "
             f"adjusted\n    cause:  --pipeline.model.refine-poses {model.refine_poses}, "
             f"--pipeline.model.pose-method {model.pose_method}\n"
-            "    remedy: leave that out, or refine-intrinsics"
+            "    remedy: leave out either these options or refine-intrinsics"
         )
     loaded = load_scan(root)
     found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
@@ -125,27 +125,27 @@ def _require_device(device_type: str) -> None:
     if not available[device_type]:
         raise UserError(
             f"--machine.device-type {device_type}: torch {torch.__version__} finds no such device on this machine. "
-            "Leave the option out to train on what there is."
+            "Leave the option out to train on an available device."
         )
 
 
 @dataclass(frozen=True)
 class BegunRun:
-    """What a checkpoint says about the run that wrote it; None where it does not say."""
+    """What a checkpoint records about the run that wrote it; None where it records nothing."""
 
     schedule_iterations: int | None
     intrinsics_change: IntrinsicsChange | None
 
 
 def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
-    """The checkpoint that nerfstudio will load, None for a fresh run. Raises UserError where it is missing."""
+    """The checkpoint that nerfstudio will load, None for a new run. Raises UserError if it is missing."""
     if load_dir is not None:
         pattern = "step-*.ckpt" if load_step is None else f"step-{load_step:09d}.ckpt"
         found = sorted(load_dir.glob(pattern))
         if not found:
             raise UserError(
                 f"--load-dir {load_dir}: no checkpoint {pattern} there. "
-                "Give the folder nerfstudio_models/ of a run, which lies beside its config.yml."
+                "Give the folder nerfstudio_models/ of a run, which is next to its config.yml."
             )
         return found[-1]
     if load_checkpoint is not None and not load_checkpoint.is_file():
@@ -154,14 +154,14 @@ def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoin
 
 
 def read_begun(checkpoint: Path) -> BegunRun:
-    """What a checkpoint says about the run that wrote it. Raises UserError if it is unreadable."""
+    """What a checkpoint records about the run that wrote it. Raises UserError if it is unreadable."""
     try:
         state = torch.load(checkpoint, map_location="cpu", mmap=True)
         schedulers, weights = state.get("schedulers", {}), state.get("pipeline", {})
     except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError) as error:
         raise UserError(
             f"{checkpoint}: cannot be read as a checkpoint ({type(error).__name__}). "
-            "It is probably cut off; name an older one with --load-step, or train again."
+            "It is probably incomplete. Choose an older one with --load-step, or train again."
         ) from error
     lengths = [rate["max_steps"] for s in schedulers.values() for rate in s.get("lr_lambdas", []) if rate]
     changes = [value for key, value in weights.items() if key.endswith("model.intrinsics_change")]

@@ -1,4 +1,4 @@
-"""Cameras and projectors in nerfstudio's viewer: where they started (grey) and where they stand now (coloured)."""
+"""Cameras and projectors in nerfstudio's viewer: their starting poses (grey) and their current poses (coloured)."""
 
 import math
 import time
@@ -37,7 +37,7 @@ class SceneView(ViewerControl):
     """
 
     def __init__(self, scan: Scan, S_scene_world: Similarity, current_poses: Callable[[], ScenePoses]) -> None:
-        """`current_poses` gives the poses of cameras and projectors in the scene."""
+        """`current_poses` returns the poses of cameras and projectors in the scene."""
         self._scan = scan
         self._initial = tuple(S_scene_world.poses(T) for T in (scan.poses.T_world_camera, scan.poses.T_world_projector))
         self._current_poses = current_poses
@@ -49,8 +49,8 @@ class SceneView(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
-        # nerfstudio takes cameras to stand within the unit box; here the object does, and they stand far outside.
-        # It draws its own frusta after this, from the same setting.
+        # nerfstudio assumes that cameras are inside the unit box; here the object is, and they are far outside.
+        # It draws its own frusta after this, with the same setting.
         distance = float(np.median(np.linalg.norm(self._initial[0][:, :3, 3], axis=1)))
         viewer.config.camera_frustum_scale *= _FRUSTUM_SIZE * distance * VISER_NERFSTUDIO_SCALE_RATIO
         scale = viewer.config.camera_frustum_scale
@@ -75,11 +75,11 @@ class SceneView(ViewerControl):
         client.camera.look_at = (0.0, 0.0, 0.0)
 
     def update(self, force: bool = False) -> None:
-        """Move the coloured frusta to the current poses; at most twice a second, and only while somebody looks."""
+        """Move the coloured frusta to the current poses; at most twice a second, and only if a client is connected."""
         if not self._refined[0] or not (force or self._is_due()):
             return
         self._last_update = time.monotonic()
-        # nerfstudio's own frusta carry the captured images; it would leave them at the starting poses
+        # nerfstudio's own frusta show the captured images; it would leave them at the starting poses
         stock = getattr(self.viewer, "camera_handles", {})
         camera_poses, projector_poses = self._numpy_poses()
         with self.viser_server.atomic():
@@ -126,7 +126,7 @@ class SceneView(ViewerControl):
 
 
 def first_viewpoint(T_scene_camera: Float[ndarray, "4 4"]) -> Float[ndarray, "3"]:
-    """Near the object, a little beside and above the line to the first camera."""
+    """A viewpoint near the object, a little beside and above the line to the first camera."""
     towards = T_scene_camera[:3, 3] / np.linalg.norm(T_scene_camera[:3, 3])
     azimuth = math.atan2(towards[1], towards[0]) + _VIEWING_ANGLES[0]
     elevation = min(math.asin(towards[2]) + _VIEWING_ANGLES[1], 1.2)

@@ -1,6 +1,7 @@
-"""Losses on triangulated points: the field is zero where camera ray and projector ray meet.
+"""Losses on triangulated points: the field should be zero where camera ray and projector ray meet.
 
-They need no rendering, and their gradient reaches far: they shape the surface, and rendering only polishes it.
+They need no rendering, and their gradient acts over large distances: they shape the surface, and rendering only refines
+it.
 """
 
 from dataclasses import dataclass
@@ -19,15 +20,15 @@ from sl_nerfstudio.rendering.settings import LossConfig
 
 _GATE = 4.0  # sigmas of the epipolar residual beyond which a decoding counts as wrong
 _BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = 4.0, 0.006, 0.03
-"""Nearer to the measured surface than this, in sigmas of its depth and within bounds in scene units, no sign is
-required. A wider band leaves space for a surface that is folded within it, and meets the points inside out."""
-_NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # of the points in front, this share within so many bands of the surface
+"""Closer to the measured surface than this, in sigmas of its depth and within bounds in scene units, no sign is
+required. A wider band would allow a surface that is folded within it and passes through the points inside out."""
+_NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # this share of the points in front is within so many bands of the surface
 _WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
 
 
 @dataclass(frozen=True)
 class DecodingNoise:
-    """How well coordinates are decoded, and what a pattern pixel is worth."""
+    """How well coordinates are decoded, and how pattern pixels relate to lengths."""
 
     px: float | Tensor  # 1 sigma of the epipolar residual, pattern pixels
     px_per_length: float | Tensor  # median slope of the coordinate along camera rays, pattern pixels per scene unit
@@ -35,7 +36,7 @@ class DecodingNoise:
 
 @dataclass(frozen=True)
 class MeasuredRays:
-    """Camera rays of some pixels, and where the pattern was decoded there; scene frame."""
+    """Camera rays of some pixels and the pattern coordinates decoded there; scene frame."""
 
     origins: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
@@ -57,7 +58,7 @@ def random_points(count: int, device: torch.device) -> Float[Tensor, "n 3"]:
 
 
 def field_losses(field: SignedDistance, points: Float[Tensor, "n 3"], weights: LossConfig) -> dict[str, Tensor]:
-    """The Eikonal term alone, at some points of the scene."""
+    """Only the Eikonal term, at some points of the scene."""
     return {"eikonal": weights.eikonal * eikonal_loss(field.sdf_and_gradient(points)[1])}
 
 
@@ -102,7 +103,7 @@ def direct_losses(
 def _either_side(
     near: Float[Tensor, "n"], depth: Float[Tensor, "n"], band: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Random distances along rays: anywhere before the band around a measured depth, and just behind it."""
+    """Random distances along rays: anywhere in front of the band around a measured depth, and just behind it."""
     u, v = torch.rand(2, *depth.shape, device=depth.device)
     anywhere = near + (depth - band - near).clamp_min(0) * u
     close = (depth - band * (1 + (_NEAR_BANDS - 1) * u)).maximum(near)

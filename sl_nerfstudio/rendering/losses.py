@@ -1,4 +1,4 @@
-"""What training minimises.
+"""The losses of training.
 
 Lengths are in scene units (the object's radius is about one), so nothing depends on the scan's unit.
 """
@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-_LEAST_DESCENT = 0.05  # cosine between ray and surface normal that even grazing rays have
+_LEAST_DESCENT = 0.05  # smallest cosine between ray and surface normal, for grazing rays
 
 
 def coordinate_loss(
@@ -32,21 +32,21 @@ def eikonal_loss(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
 
 
 def surface_loss(sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: float) -> Float[Tensor, ""]:
-    """Robust mean of |f| at points that were measured to lie on the surface.
+    """Robust mean of |f| at points that were measured on the surface.
 
-    Charbonnier, bent to `width * (1 - exp(-|f| / width))`: linear for errors well below `width`, deaf to
-    those far above, which are wrong decodings.
+    Charbonnier, modified to `width * (1 - exp(-|f| / width))`: linear for errors well below `width`, insensitive
+    to those far above, which are wrong decodings.
     """
     return (weight * width * (1 - torch.exp(-sdf.abs() / width))).sum() / weight.sum().clamp_min(1e-9)
 
 
 def free_space_loss(sdf: Float[Tensor, "n"], at_least: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean shortfall of the distance at points that a ray passed before it met the surface."""
+    """Mean amount by which the field is below `at_least` at points that a ray passed before it met the surface."""
     return (at_least - sdf).clamp_min(0).mean()
 
 
 def behind_loss(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean excess over zero just behind the surface."""
+    """Mean of the field's positive part just behind the surface."""
     return sdf.clamp_min(0).mean()
 
 
@@ -55,8 +55,8 @@ def facing_loss(
 ) -> Float[Tensor, ""]:
     """Weighted mean by which the field rises along rays at points where they meet the surface.
 
-    A camera sees surfaces from outside only. Without this term a narrow valley can end as three sheets, the middle one
-    through the measured points with its inside out: |f| and the Eikonal term have nothing against it.
+    A camera sees surfaces only from outside. Without this term a narrow valley can become three sheets, the middle one
+    inside out through the measured points: |f| and the Eikonal term do not prevent that.
     """
     rise = (gradient * direction).sum(-1)
     return (weight * (rise + _LEAST_DESCENT).clamp_min(0)).sum() / weight.sum().clamp_min(1e-9)

@@ -12,8 +12,8 @@ def sphere_interval(
 ) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"], Bool[Tensor, "rays"]]:
     """Distances at which unit rays enter and leave the scene's sphere, and whether they meet it in front.
 
-    A ray that misses, or grazes it on a chord shorter than the radius, gets an interval as long as the radius around
-    its point nearest to the centre (in front of the origin), so that everything stays finite.
+    A ray that misses it, or grazes it on a chord shorter than the radius, gets an interval as long as the radius around
+    its point closest to the centre (in front of the origin), so that everything stays finite.
     """
     b = (origins * directions).sum(-1)
     discriminant = b * b - (origins * origins).sum(-1) + radius * radius
@@ -25,7 +25,7 @@ def sphere_interval(
 def uniform_samples(
     near: Float[Tensor, "rays"], far: Float[Tensor, "rays"], count: int, jitter: bool
 ) -> Float[Tensor, "rays count"]:
-    """Distances in equal strata of [near, far]: their middles, or random places in them."""
+    """Distances in equal strata of [near, far]: their midpoints, or random positions in them."""
     steps = torch.arange(count, device=near.device, dtype=near.dtype)
     offset = torch.rand(len(near), count, device=near.device, dtype=near.dtype) if jitter else 0.5
     return near[:, None] + (far - near)[:, None] * (steps + offset) / count

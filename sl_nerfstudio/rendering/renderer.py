@@ -1,4 +1,4 @@
-"""Rays through a field: where to sample them, what they see, and which surface points the projector lights."""
+"""Rays through a field: where they are sampled, what they see, and which surface points the projector lights."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ _SHADOW_SAMPLES = 32
 
 @dataclass(frozen=True)
 class Renderer:
-    """A field under one projector. Its cached grid must be fresh where samples follow the surface."""
+    """A field lit by one projector. Its cached grid must be up to date if samples follow the surface."""
 
     field: SignedDistance
     cache: CachedGrid
@@ -35,7 +35,7 @@ class Renderer:
         samples: int,
         jitter: bool,
     ) -> Rendered:
-        """Volume render rays as projector coordinates and pattern, with `samples` samples a ray."""
+        """Volume render rays as projector coordinates and pattern, with `samples` samples per ray."""
         t = self._distances(origins, directions, samples, jitter)
         p = origins[:, None] + t[..., None] * directions[:, None]
         sdf = self.field.sdf(p.reshape(-1, 3)).reshape(t.shape)
@@ -57,7 +57,7 @@ class Renderer:
     def is_lit(
         self, p: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], projector_centre: Float[Tensor, "n 3"]
     ) -> Bool[Tensor, "n"]:
-        """Whether surface points see the projector: nothing is between, and the surface faces it."""
+        """Whether surface points are lit by the projector: nothing is in between, and the surface faces it."""
         to_projector = torch.nn.functional.normalize(projector_centre - p, dim=-1)
         start = p + 2 * self.cache.cell * normal
         _, far, _ = sphere_interval(start, to_projector)

@@ -1,4 +1,4 @@
-"""What changes while training proceeds: sharpness of the surface and the levels of the grid."""
+"""What changes during training: sharpness of the surface and the levels of the grid."""
 
 import math
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ class AnnealingConfig:
     kappa_per_step: float = 0.02
     """Increase of kappa in each step where growth is linear."""
     anneal_kappa: bool = True
-    """Off: kappa has its end value all the time."""
+    """Off: kappa has its end value throughout."""
     coarse_to_fine: bool = True
-    """Fade the grid's finer levels in one after the other; off: all levels from the first step on."""
+    """Fade in the grid's finer levels one after the other; off: use all levels from the first step."""
     levels_at_start: int = 2
-    """Levels of the grid that are there from the first step on."""
+    """Levels of the grid that are used from the first step."""
     all_levels_at: float = 0.4
-    """Share of the run after which all levels are there."""
+    """Share of the run after which all levels have full weight."""
 
 
 def kappa_at(config: AnnealingConfig, step: int, total: int) -> float:

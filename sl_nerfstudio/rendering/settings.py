@@ -11,11 +11,11 @@ class LossConfig:
     coordinates: float = 0.1
     """Weight of the rendered coordinates' L1 error, converted to a length by the scan's median depth sensitivity."""
     coordinates_per_pixel: float | None = None
-    """If set, the weight of the coordinates' L1 error in pattern pixels, in place of `coordinates`."""
+    """If set, the weight of the coordinates' L1 error in pattern pixels, used instead of `coordinates`."""
     pattern: float = 0.005
     """Weight of the pattern term, 1 - cosine of rendered and captured intensities."""
     eikonal: float = 0.1
-    """Weight of the Eikonal term, the mean squared departure of the field's slope from one."""
+    """Weight of the Eikonal term, the mean squared difference between the field's slope and one."""
     surface: float = 1.0
     """Weight of the direct term |f| at triangulated points."""
     free_space: float = 1.0
@@ -34,10 +34,10 @@ class SamplingConfig:
     strategy: Literal["surface", "uniform"] = "surface"
     """`surface`: around the crossing found in a cached coarse grid; `uniform`: along the whole ray."""
     samples: int = 16
-    """Samples a ray for volume rendering."""
+    """Samples per ray for volume rendering."""
     half_width: float = 4.0
     """Half the interval sampled around the surface, in units of 1 / kappa (plus one cell of the cached grid)."""
     render_rays: int = 256
-    """Rays of a batch that are volume rendered; all of the batch's decoded rays serve the direct terms."""
+    """Rays of a batch that are volume rendered; the direct terms use all of the batch's decoded rays."""
     eikonal_points: int = 1024
     """Random points of the scene at which the Eikonal term is evaluated, besides the surface points."""

@@ -5,10 +5,10 @@
 
 (NeuS, Wang et al. 2021, eq. 13; the paper, section 3.3.) `c` is taken at the middle of an interval.
 
-What is lit: a point behind the projector has no pattern coordinate, so it carries no weight, and what
-remains is divided by the weight that counts. Outside the pattern the coordinate goes on, the intensity
-is 0. Whether something stands between projector and point does not matter here: training pixels lie inside
-the mask, where the pattern was seen; for pictures see `Renderer.is_lit`.
+What is lit: a point behind the projector has no pattern coordinate, so it has no weight, and the rest is
+divided by the remaining weight. Outside the pattern the coordinate continues, and the intensity is 0. Occlusion
+between projector and point is ignored here: training pixels are inside the mask, where the pattern was seen.
+For images see `Renderer.is_lit`.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ def interval_weights(
     log_phi = F.logsigmoid(kappa * sdf)
     log_transparency = (log_phi[:, 1:] - log_phi[:, :-1]).clamp_max(0.0)
     alpha = -torch.expm1(log_transparency)
-    before = F.pad(torch.cumsum(log_transparency[:, :-1], -1), (1, 0))  # never above 0, whatever the rounding
+    before = F.pad(torch.cumsum(log_transparency[:, :-1], -1), (1, 0))  # never above 0, with any rounding
     return alpha * before.exp()
 
 

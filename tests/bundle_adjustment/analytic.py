@@ -1,4 +1,4 @@
-"""Rigs and coordinate maps by formula: balls over a disk, rays met exactly in float64."""
+"""Analytic rigs and coordinate maps: balls over a disk, with exact ray intersections in float64."""
 
 from dataclasses import dataclass
 from math import cos, radians, sin
@@ -21,7 +21,7 @@ PROJECTORS = {
 
 
 def camera_of(size: int) -> Device:
-    """A square camera whose image the scene fills, seen from three scene units away."""
+    """A square camera whose image is filled by the scene, three scene units away."""
     return Device(size, size, 1.35 * size, 1.35 * size, size / 2, size / 2)
 
 
@@ -62,7 +62,7 @@ def static_rig(frames: int, size: int) -> Rig:
 
 
 def cast(o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance of unit rays to what they meet first (infinite: nothing), and which part of the scene it is."""
+    """Distance of unit rays to what they hit first (infinite: nothing), and which part of the scene that is."""
     distances = []
     for *centre, radius in BALLS:
         m = o - o.new_tensor(centre)
@@ -77,7 +77,7 @@ def cast(o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def seen(rig: Rig, frame: Tensor, uv_camera: Tensor) -> tuple[Tensor, Tensor]:
-    """Pattern coordinates of camera pixels (NaN: nothing, shadow, off the pattern) and the part of the scene."""
+    """Pattern coordinates of camera pixels (NaN: nothing, shadow, outside the pattern) and the part of the scene."""
     o, d = pixel_rays(rig.camera[frame], rig.T_world_camera[frame], uv_camera)
     t, part = cast(o, d)
     p = o + t[:, None].nan_to_num(posinf=1.0) * d
@@ -92,7 +92,7 @@ def seen(rig: Rig, frame: Tensor, uv_camera: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def images_of(rig: Rig, size: int) -> list[Tensor]:
-    """What an errorless decoder gives: one coordinate image for each frame."""
+    """The output of a perfect decoder: one coordinate image for each frame."""
     uv = pixel_centres(camera_of(size), torch.float64).reshape(-1, 2)
     out = [seen(rig, torch.full((len(uv),), k), uv)[0].reshape(size, size, 2).float() for k in range(rig.frames)]
     return out
@@ -126,7 +126,7 @@ class ExactMaps(CoordinateMaps):
 
 
 def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03, relative: float = 0.0) -> Rig:
-    """Each frame turned and shifted as a whole (RMS), its projector by a share `relative` of that."""
+    """Each frame rotated and shifted as a whole (RMS), its projector by a share `relative` of that."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(2, rig.frames, 6, generator=generator, dtype=torch.float64)
     x = x / x.reshape(2, -1, 2, 3).pow(2).sum(-1).mean(1).sqrt().repeat_interleave(3, -1)[:, None]

@@ -1,4 +1,4 @@
-"""The adjustment recovers true poses, holds what is not free, and is not misled by wrong decodings."""
+"""The adjustment recovers true poses, keeps fixed what is not free, and withstands wrong decodings."""
 
 from dataclasses import dataclass, replace
 from math import degrees, radians
@@ -55,15 +55,15 @@ def known_rig(true) -> Adjustment:
     return adjust(disturbed(true), ExactMaps.around(true, SIZE), prior_of(FRAMES), "known-rig", QUICK)
 
 
-def test_disturbed_frames_come_back(true, known_rig):
+def test_disturbed_frames_are_recovered(true, known_rig):
     assert errors(disturbed(true), true)[0] > 1 and errors(disturbed(true), true)[1] > 0.03
     turn, shift = errors(known_rig.rig, true)
     assert turn < 1e-2 and shift < 1e-3
     assert known_rig.median_before_px > 0.5 and known_rig.median_after_px < 1e-3
 
 
-def test_disturbed_projectors_come_back_from_exact_look_ups(true):
-    """Frames and projectors disturbed, no pixels between the poses and the truth: nothing is lost but rounding."""
+def test_disturbed_projectors_are_recovered_from_exact_look_ups(true):
+    """Frames and projectors are disturbed; without pixels, only rounding separates the result from the truth."""
     start = disturbed(true, 1, relative=0.1)
     found = adjust(start, ExactMaps.around(true, SIZE), prior_of(FRAMES), "free", replace(QUICK, max_iterations=24))
     turn, shift = errors(found.rig, true)
@@ -71,7 +71,7 @@ def test_disturbed_projectors_come_back_from_exact_look_ups(true):
     assert found.median_after_px < 0.02
 
 
-def test_a_known_rig_keeps_every_relative_pose_bit_by_bit(true, known_rig):
+def test_a_known_rig_keeps_every_relative_pose_bit_for_bit(true, known_rig):
     assert torch.equal(known_rig.rig.T_camera_projector, true.T_camera_projector)
 
 
@@ -87,7 +87,7 @@ def test_a_rigid_rig_moves_all_projectors_alike(true, maps):
     assert not torch.allclose(moved[0], torch.eye(4, dtype=torch.float64), atol=1e-4)
 
 
-def test_a_static_projector_stays_in_one_place_while_cameras_come_back():
+def test_a_static_projector_stays_in_one_place_while_cameras_are_recovered():
     true = static_rig(FRAMES, SIZE)
     start = constrained("static-projector", disturbed(true, 3, relative=0.1))
     there = start.T_world_projector
@@ -115,7 +115,7 @@ def test_exact_starts_stay_where_they_are(true):
 
 @dataclass(frozen=True)
 class SpoiltMaps(ExactMaps):
-    """Exact but for some pixels, which show coordinates from elsewhere."""
+    """Exact except for some pixels, which show coordinates from elsewhere."""
 
     wrong: Tensor  # bool (frames, h, w)
 
@@ -147,8 +147,8 @@ def test_one_seed_one_result(true, maps):
     assert not torch.equal(a.T_world_camera, c.T_world_camera)
 
 
-def test_frames_that_share_nothing_stay_where_they_are(true, maps):
-    """One frame alone, and frames of which one decoded nothing: no exception, no NaN."""
+def test_frames_that_share_nothing_do_not_move(true, maps):
+    """A single frame, and frames of which one decoded nothing: no exception, no NaN."""
     one = Rig(true.camera[:1], true.projector, true.T_world_camera[:1], true.T_camera_projector[:1])
     alone = adjust(one, CoordinateMaps.of(images_of(one, SIZE)), prior_of(1), "free", QUICK)
     assert torch.equal(alone.rig.T_world_camera, one.T_world_camera)
@@ -189,8 +189,8 @@ def test_free_directions_of_each_mode(mode, columns):
         assert torch.allclose(stays, rig.T_world_projector, rtol=0, atol=1e-9)
 
 
-def test_prior_equations_are_derivatives_of_the_weighted_departure():
-    """First order in the departure, which is what a Gauss-Newton step asks of them."""
+def test_prior_equations_are_derivatives_of_the_weighted_difference():
+    """To first order in the difference from the start, which is what a Gauss-Newton step needs."""
     n = 2
     true = rig_of(n, SIZE)
     sigmas = [torch.rand(n, dtype=torch.float64, generator=torch.Generator().manual_seed(s)) + 0.1 for s in range(4)]

@@ -1,4 +1,4 @@
-"""Look-ups between pixels: exact where a map is plane, refused where it is torn, undecoded or not there."""
+"""Look-ups between pixels: exact where a map is a plane, invalid where it is discontinuous, undecoded or missing."""
 
 import numpy as np
 import pytest
@@ -31,12 +31,12 @@ def positions(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def window_pixels(frame: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
-    """Pixels of a 7 x 7 window that lie in the image."""
+    """Pixels of a 7 x 7 window that are inside the image."""
     size, at = torch.tensor(SIZES)[frame], uv.long()
     return ((at + 4).minimum(size) - (at - 3).clamp_min(0)).prod(-1)
 
 
-def test_a_plane_is_met_exactly_everywhere_with_its_slope():
+def test_a_plane_is_reproduced_exactly_everywhere_with_its_slope():
     frame, uv = positions()
     found = CoordinateMaps.of(plane_images()).look_up(frame, uv)
     expected = (SLOPES[frame] @ uv[..., None]).squeeze(-1) + CONSTANTS[frame]
@@ -46,7 +46,7 @@ def test_a_plane_is_met_exactly_everywhere_with_its_slope():
     assert torch.allclose(found.jacobian[enough], SLOPES[frame][enough], rtol=0, atol=1e-9)
 
 
-def test_a_paraboloid_is_met_exactly_with_its_slope():
+def test_a_paraboloid_is_reproduced_exactly_with_its_slope():
     bend = torch.tensor([[0.25, -0.125, 0.0625], [-0.5, 0.25, 0.125]], dtype=torch.float64)  # xx, xy, yy
 
     def value(uv: torch.Tensor) -> torch.Tensor:
@@ -87,7 +87,7 @@ def test_outside_the_image_nothing_is_valid(uv):
     assert maps.decoded_at(frame, at).isnan().all()
 
 
-def test_torn_undecoded_and_narrow_windows_are_refused():
+def test_discontinuous_undecoded_and_narrow_windows_are_invalid():
     images = plane_images()
     images[0][:, 15:] += 40  # a depth edge between columns 14 and 15
     images[1][5:, :] = NAN
@@ -106,8 +106,8 @@ def test_torn_undecoded_and_narrow_windows_are_refused():
     assert not valid(1, 6.5, 17.5)
 
 
-def test_pixels_on_a_conic_give_no_slope():
-    """Two rows, however long: a bend across them cannot be told from a slope."""
+def test_pixels_on_a_conic_determine_no_slope():
+    """Two rows, however long: curvature across them cannot be distinguished from a slope."""
     image = torch.full((9, 40, 2), NAN)
     image[3:5] = 1.0
     maps = CoordinateMaps.of([image])
@@ -140,14 +140,14 @@ def test_drawn_pixels_are_decoded_spread_out_and_the_same_for_one_seed():
     assert maps.__class__.of(images).draw(0, 40, torch.Generator()).shape == (0, 2)
 
 
-def test_maps_that_are_noisy_all_over_are_used_and_their_tears_still_found():
+def test_maps_that_are_noisy_everywhere_are_used_and_their_discontinuities_still_found():
     rng = np.random.default_rng(2)
     y, x = np.mgrid[:80, :80]
     image = np.stack([2.0 * x + 0.01 * x * y, 2.0 * y], -1) + rng.normal(0, 2.0, (80, 80, 2))
-    image[:, 40:] += 60  # a tear
+    image[:, 40:] += 60  # a discontinuity
     maps = CoordinateMaps.of([torch.from_numpy(image)])
     uv = torch.from_numpy(rng.uniform(5, 75, (500, 2)))
     valid = maps.look_up(torch.zeros(500, dtype=torch.int64), uv).valid
-    torn = (uv[:, 0] - 40).abs() < 2
+    discontinuous = (uv[:, 0] - 40).abs() < 2
     assert valid[(uv[:, 0] - 40).abs() > 5].float().mean() > 0.99
-    assert not valid[torn].any()
+    assert not valid[discontinuous].any()

@@ -1,4 +1,4 @@
-"""Stated uncertainty against the errors that are really made, over many noisy scans of one scene."""
+"""Stated uncertainty against the actual errors, over many noisy scans of one scene."""
 
 from math import radians
 
@@ -22,18 +22,18 @@ SETTINGS = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_it
 
 
 def independent(generator: torch.Generator) -> Tensor:
-    """Every pixel errs by itself."""
+    """The errors of all pixels are independent."""
     return 0.5 * torch.randn(FRAMES, SIZE, SIZE, 2, generator=generator)
 
 
 def smooth(generator: torch.Generator) -> Tensor:
-    """Corners of images err as wholes, as where a lens is modelled a little wrong."""
+    """Errors are shared by whole corners of images, as with a lens that is modelled slightly wrong."""
     coarse = 0.3 * torch.randn(FRAMES, 2, 6, 6, generator=generator)
     return torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bicubic").permute(0, 2, 3, 1)
 
 
 @pytest.mark.parametrize("errors", [independent, smooth])
-def test_errors_of_frames_are_of_the_size_that_is_stated(errors):
+def test_errors_of_frames_are_as_large_as_stated(errors):
     true = rig_of(FRAMES, SIZE)
     images = images_of(true, SIZE)
     generator = torch.Generator().manual_seed(0)
@@ -46,4 +46,4 @@ def test_errors_of_frames_are_of_the_size_that_is_stated(errors):
         off = delta - G @ torch.linalg.lstsq(G, delta).solution
         found.append(off / one.covariance.diagonal()[: 6 * FRAMES].sqrt())
     rms = float(torch.stack(found).pow(2).mean().sqrt())
-    assert 0.4 < rms < 2.7  # on images this small, windows overlap and slopes are noisy: stated a little small
+    assert 0.4 < rms < 2.7  # in such small images windows overlap and slopes are noisy: sigma is a bit too small

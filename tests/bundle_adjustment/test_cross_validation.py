@@ -1,4 +1,4 @@
-"""Held-out pixels judge poses: a disturbed rig loses, chance and wrong decodings decide nothing."""
+"""Held-out pixels judge poses: a disturbed rig is rejected, chance and wrong decodings decide nothing."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def test_a_disturbed_rig_is_worse_than_the_true_one(true, maps, held_out, kind, 
     rig = disturbed(true, seed, **small) if kind == "frames" else disturbed(true, seed, **small, relative=1.0)
     better, worse = cross_validate(rig, true, held_out, maps, NOISE), cross_validate(true, rig, held_out, maps, NOISE)
     assert better.better and not worse.better
-    assert better.after_px < 0.9 * better.before_px  # what is hidden in another frame costs the same in both
+    assert better.after_px < 0.9 * better.before_px  # pixels hidden in another frame cost the same in both
     assert (better.before_px, better.after_px) == pytest.approx((worse.after_px, worse.before_px))
     assert better.before_px <= WIDTH
 
@@ -64,7 +64,7 @@ def test_wrong_decodings_do_not_decide(true, maps, held_out, share):
 
 
 def test_a_rig_that_sees_nothing_is_the_worst(true, maps, held_out):
-    """Cameras turned away: no residual can be formed, which is no excuse."""
+    """Cameras look away, so no residual can be formed: that must not count as agreement."""
     away = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     blind = Rig(true.camera, true.projector, true.T_world_camera @ away, true.T_camera_projector)
     found = cross_validate(true, blind, held_out, maps, NOISE)
@@ -72,7 +72,7 @@ def test_a_rig_that_sees_nothing_is_the_worst(true, maps, held_out):
 
 
 def test_a_difference_within_its_standard_error_decides_nothing(true, maps, held_out):
-    """Poses that differ by much less than the decoding noise: kept as they were, whichever way chance leans."""
+    """Poses that differ by much less than the decoding noise: the old ones are kept, whichever chance favours."""
     generator = torch.Generator().manual_seed(3)
     noisy = replace(
         held_out, uv_projector=held_out.uv_projector + torch.randn(len(held_out.frame), 2, generator=generator).double()
@@ -84,7 +84,7 @@ def test_a_difference_within_its_standard_error_decides_nothing(true, maps, held
 
 
 def test_the_standard_error_is_that_of_independent_blocks():
-    """Values that are the same all over a block count as one: against the spread over many draws."""
+    """Values that are the same throughout a block count as one; checked against the spread over many draws."""
     generator = torch.Generator().manual_seed(0)
     block = torch.arange(40).repeat_interleave(25)
     means, errors = [], []

@@ -38,7 +38,7 @@ def test_a_changed_gauge_is_undone(known):
 
 
 @pytest.mark.parametrize("known", [None, 1])
-def test_the_known_baseline_or_the_mean_is_kept_exactly(known):
+def test_the_known_baseline_or_the_mean_is_kept(known):
     start = rig_of(FRAMES, SIZE)
     rig = scaled(disturbed(start, 1, relative=1.0), 0.8, TWIST)
     before, after = start.baseline, restore(start, rig, baseline_scale(start, rig, known)).baseline
@@ -57,7 +57,7 @@ def prior_of(frame_translation: float, relative_translation: float) -> PosePrior
 
 @pytest.mark.parametrize("frames, relative", [(0.05, 0.05), (0.3, 0.01), (0.01, 0.3), (1e-6, 1.0), (1.0, 1e-6)])
 def test_the_scale_that_agrees_best_is_the_weighted_least_squares_one(frames, relative):
-    # baselines 3 % too long beside the cameras' places: the two speak for different scales
+    # baselines are 3 % too long relative to the cameras' positions: the two imply different scales
     start, long = rig_of(FRAMES, SIZE), 1.03
     rig = rig_of(FRAMES, SIZE)
     rig.T_camera_projector[:, :3, 3] *= long

@@ -59,8 +59,8 @@ def test_a_step_lowers_data_and_prior_together(scene, mode, weight):
         state = after
 
 
-def test_a_step_that_only_the_data_want_is_not_taken(scene):
-    """The prior holds all poses: judged by the data alone, steps away from it would go on for ever."""
+def test_a_step_that_lowers_only_the_data_cost_is_not_taken(scene):
+    """The prior holds all poses: judged by the data alone, steps away from it would continue forever."""
     true, maps, rig, anchors, rows = scene
     kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
     prior = prior_of(1.0, rig, scale=1e-7)

@@ -14,7 +14,7 @@ FRAMES, SIZE = 3, 60
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_eliminated_depths_change_no_step(seed):
-    """Dense equations of poses and depths together, their Schur complement, and the depths that go with a step."""
+    """Dense equations of poses and depths together, their Schur complement, and the depths that follow from a step."""
     true = rig_of(FRAMES, SIZE)
     maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(seed)
     rig = disturbed(true, seed, degrees=0.3, shift=0.01, relative=0.5)

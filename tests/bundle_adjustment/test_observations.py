@@ -1,4 +1,4 @@
-"""Which pixels take part, and who else sees them: against ray casting of a scene by formula."""
+"""Which pixels take part, and which other frames see them: against ray casting of an analytic scene."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def test_anchors_lie_on_the_surface_with_its_normal(scene):
     assert torch.stack(flat).median() < 1e-3 and ((normal * direction).sum(-1) < 0).all()
 
 
-def test_frames_that_decoded_the_place_are_found_and_no_others(scene):
+def test_frames_that_decoded_the_point_are_found_and_no_others(scene):
     rig, maps, anchors = scene
     rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(1))
     assert (anchors.frame[rows.anchor] != rows.frame).all()
@@ -54,8 +54,8 @@ def test_frames_that_decoded_the_place_are_found_and_no_others(scene):
     way = p[a] - rig.T_world_camera[j, :3, 3]
     length = way.norm(dim=-1)
     met = cast(rig.T_world_camera[j, :3, 3], way / length[:, None])[0]
-    seen = (met - length).abs() < 1e-5  # nothing is between camera and place
-    assert seen.double().mean() > 0.97  # the rest lies within the gate of an edge
+    seen = (met - length).abs() < 1e-5  # nothing is between camera and point
+    assert seen.double().mean() > 0.97  # the rest is within the gate of an edge
 
 
 def test_surfaces_seen_at_a_flat_angle_are_left_out(scene):
@@ -80,7 +80,7 @@ def test_no_anchor_is_looked_up_more_often_than_wanted(scene, most):
     assert torch.equal(count, everything.clamp_max(most))
 
 
-def test_around_one_frame_is_all_that_it_takes_part_in(scene):
+def test_around_one_frame_selects_all_observations_that_involve_it(scene):
     rig, maps, anchors = scene
     generator = torch.Generator().manual_seed(1)
     rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator)

@@ -1,4 +1,4 @@
-"""Frames in a wrong minimum are found by their residuals and placed where the others support them."""
+"""Frames in a wrong minimum are found by their residuals and moved to where the others support them."""
 
 from dataclasses import replace
 from math import radians
@@ -43,14 +43,14 @@ def test_a_lost_frame_is_placed_and_no_other_moves(true, mode):
     assert float(log_so3(off[:3, :3]).norm()) < radians(0.01) and float(off[:3, 3].norm()) < 1e-3
 
 
-def test_where_all_agree_no_frame_is_searched(true):
+def test_no_frame_is_searched_if_all_agree(true):
     assert torch.equal(relocalised(true, true).T_world_camera, true.T_world_camera)
 
 
-def test_lost_frames_are_those_with_little_support_the_best_first():
+def test_lost_frames_are_those_with_little_support_best_first():
     shares = torch.tensor([0.8, 0.3, 0.85, 0.5, float("nan"), 0.9, 0.8], dtype=torch.float64)
     assert find_lost_frames(shares, SETTINGS).tolist() == [3, 1]
     alike = torch.tensor([0.8, 0.8, 0.78, 0.8, 0.8], dtype=torch.float64)
-    assert not len(find_lost_frames(alike, SETTINGS))  # 2.5 % below frames that are all alike is nothing
+    assert not len(find_lost_frames(alike, SETTINGS))  # 2.5 % below equally good frames is not lost
     alike[2] = 0.7
     assert find_lost_frames(alike, SETTINGS).tolist() == [2]

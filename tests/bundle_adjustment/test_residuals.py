@@ -1,4 +1,4 @@
-"""Residuals vanish at the truth; derivatives are those of the residuals; the gauge is free."""
+"""Residuals vanish at the truth, derivatives are those of the residuals, and the gauge is free."""
 
 import pytest
 import torch
@@ -41,10 +41,10 @@ def test_residuals_of_a_true_rig_are_zero(scene):
     assert r.own.abs().max() < 1e-8 and r.cross[counts].abs().max() < 1e-7
 
 
-def test_windows_of_pixels_instead_of_rays_cost_a_fraction_of_a_pixel(scene):
+def test_windows_of_pixels_in_place_of_rays_cost_a_fraction_of_a_pixel(scene):
     rig, maps, anchors, observations = scene
     r = residuals_of(rig, anchors, observations, maps)
-    # a window of 5 x 5 pixels is a ninth of a ball's width here: its plane cuts the ball's curvature off
+    # a window of 5 x 5 pixels is a ninth of a ball's width here: its plane ignores the ball's curvature
     assert r.own.abs().median() < 0.1 and r.cross[r.cross_valid].abs().median() < 0.5
 
 
@@ -72,7 +72,7 @@ def single(rig: Rig, which: int, frame: int, index: int, step: float) -> Rig:
 
 
 def test_jacobians_are_central_differences_of_the_residuals(scene):
-    """At a disturbed rig. A window's plane is the same all over its pixel, so the derivative is exact there."""
+    """At a disturbed rig. A window's plane is the same throughout its pixel, so the derivative is exact there."""
     true, maps, anchors, observations = scene
     rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
     linear = linearise(rig, anchors, observations, maps)
@@ -117,7 +117,7 @@ def equations_of(rig, maps, anchors, observations, seed: int = 0):
 
 
 def test_normal_equations_are_those_of_the_dense_system(scene):
-    """Poses and depths solved together, by lstsq on the whole Jacobian, give the same step."""
+    """Solving for poses and depths together, by lstsq on the whole Jacobian, gives the same step."""
     true, maps, anchors, observations = scene
     rig = disturbed(true, 4, degrees=0.2, shift=0.003, relative=1.0)
     linear, own, cross, equations = equations_of(rig, maps, anchors, observations)
@@ -150,7 +150,7 @@ def test_normal_equations_are_those_of_the_dense_system(scene):
 
 
 def test_the_gauge_and_nothing_else_is_free(scene):
-    """Seven directions that H does not feel, at any rig; all others it does."""
+    """At any rig, H is zero along seven directions and positive along all others."""
     true, maps, anchors, observations = scene
     rig = disturbed(true, 5, degrees=0.5, shift=0.01, relative=0.5)
     _, _, _, equations = equations_of(rig, maps, anchors, observations)

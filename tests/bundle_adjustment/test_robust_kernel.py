@@ -1,4 +1,4 @@
-"""Geman-McClure's kernel: weights are the derivative of the cost, widths follow the residuals down."""
+"""The Geman-McClure kernel: weights are the derivative of the cost, widths shrink with the residuals."""
 
 import pytest
 import torch
@@ -28,7 +28,7 @@ def kernel(*widths: float) -> Kernel:
 
 @given(st.integers(0, 50), st.floats(0.05, 20.0), st.booleans())
 def test_weights_are_the_derivative_of_the_cost(seed, size, invalid):
-    """Half the gradient of the cost is weight times residual: what makes a step of the normal equations descend."""
+    """Half the gradient of the cost is weight times residual, so a step of the normal equations descends."""
     r, k = residuals(seed, size, invalid), kernel(0.5, 2.0, 1.0)
     own, cross = r.own.clone().requires_grad_(), r.cross.clone().requires_grad_()
     (w_own, w_cross), own2, cross2 = k.weights(r), k.width[FRAME] ** 2, k.width[PAIR].amax(0) ** 2
@@ -40,19 +40,19 @@ def test_weights_are_the_derivative_of_the_cost(seed, size, invalid):
     assert torch.allclose(g_cross / 2, w_cross[:, None] * r.cross, rtol=1e-10, atol=1e-14)
 
 
-def test_a_gross_error_costs_the_same_whatever_the_width():
+def test_a_gross_error_costs_the_same_at_any_width():
     far = Residuals(*(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)), torch.ones(5, dtype=torch.bool))
     assert kernel(0.5, 2.0, 1.0).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
     assert kernel(0.5, 0.5, 0.5).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
 
 
-def test_rows_that_cannot_be_seen_weigh_nothing():
+def test_rows_that_cannot_be_seen_have_no_weight():
     r = residuals(1, invalid=True)
     weight = kernel(1.0, 1.0, 1.0).weights(r)[1]
     assert weight[3] == 0 and (weight[r.cross_valid] > 0).all()
 
 
-def test_medians_are_of_what_a_frame_takes_part_in():
+def test_medians_are_of_the_residuals_that_involve_a_frame():
     r = residuals(2)
     size = r.cross.norm(dim=-1)
     found = frame_medians(r, PAIR, 4)
@@ -65,7 +65,7 @@ def column(value: float) -> torch.Tensor:
 
 
 @given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
-def test_widths_narrow_gently_and_never_widen(width, target):
+def test_widths_narrow_gradually_and_never_widen(width, target):
     found = float(narrowed(column(width), column(target), SETTINGS))
     assert found == pytest.approx(min(width, max(target, width / SETTINGS.fastest)), rel=1e-12)
     first = narrowed(column(float("inf")), column(target), SETTINGS)

@@ -1,4 +1,4 @@
-"""Intrinsics as unknowns: derivatives are those of the residuals; wrong ones are found out, right ones are believed."""
+"""Intrinsics as unknowns: derivatives are those of the residuals; wrong ones are detected, correct ones accepted."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def changed(devices: Intrinsics, change: tuple[float, ...]) -> Intrinsics:
 
 
 def with_change(rig: Rig, anchors: Anchors, which: int, size: float) -> tuple[Rig, Anchors]:
-    """One of the six changed; the anchors' pixels stay, their rays do not."""
+    """Change one of the six; the anchors keep their pixels, but not their rays."""
     values = [0.0] * 6
     values[which] = size
     camera = changed(rig.camera, tuple(values[:3]))
@@ -73,18 +73,18 @@ def adjusted(
     sigma: float,
     refined: IntrinsicsChange = UNCHANGED,
 ) -> Adjustment:
-    """Poses adjusted to errorless coordinates with other intrinsics than those that made them."""
+    """Poses adjusted to perfect coordinates with other intrinsics than those that made them."""
     true = rig_of(FRAMES, SIZE)
-    told = replace(
+    stated = replace(
         true, camera=changed(true.camera, camera_change), projector=changed(true.projector, projector_change)
     )
     parts = (torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.03, 0.02, 0.05, 0.02))
     settings = AdjustmentSettings(anchors_per_frame=60, frames_per_anchor=3, max_iterations=14)
-    return adjust(told, ExactMaps.around(true, SIZE), PosePrior(*parts, sigma, refined), "free", settings)
+    return adjust(stated, ExactMaps.around(true, SIZE), PosePrior(*parts, sigma, refined), "free", settings)
 
 
 def off(found: Adjustment) -> torch.Tensor:
-    """Errors of (delta, rho) without the freedom of the whole scene."""
+    """Errors of (delta, rho) without the gauge freedom."""
     true = rig_of(FRAMES, SIZE)
     delta = log_se3(found.rig.T_world_camera @ inverse(true.T_world_camera)).reshape(-1)
     rho = log_se3(found.rig.T_camera_projector @ inverse(true.T_camera_projector)).reshape(-1)
@@ -93,7 +93,7 @@ def off(found: Adjustment) -> torch.Tensor:
     return error - G @ torch.linalg.lstsq(G, error[:, None]).solution[:, 0]
 
 
-def test_right_intrinsics_are_not_contradicted():
+def test_correct_intrinsics_are_not_contradicted():
     found = adjusted((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.01)
     assert found.intrinsics is not None and not found.intrinsics.contradicts()
     assert found.intrinsics.change.abs().max() < 4e-4
@@ -112,14 +112,14 @@ def test_wrong_intrinsics_are_contradicted(camera, projector):
     assert float((off(found) / found.covariance.diagonal().sqrt()).pow(2).mean().sqrt()) < 1.5
 
 
-def test_poses_found_with_wrong_intrinsics_that_are_taken_for_exact_are_stated_too_well():
+def test_poses_from_wrong_intrinsics_assumed_exact_have_too_small_an_uncertainty():
     found = adjusted(*WRONG[0], 0.0)
     assert float((off(found) / found.covariance.diagonal().sqrt()).pow(2).mean().sqrt()) > 3
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
-def test_a_change_already_made_is_held_back_by_what_was_stated(share):
-    """Where the captures say little, the way back to the stated values is as strong as the way on was."""
+def test_the_prior_pulls_a_change_already_made_back_to_the_stated_values(share):
+    """If the captures say little, the step back to the stated values is as large as the change was."""
     far = 0.01 * share
     held = adjusted((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1e-6).intrinsics
     gone = adjusted(

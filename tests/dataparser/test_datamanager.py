@@ -15,7 +15,7 @@ from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, Intrin
 from sl_nerfstudio.geometry.se3 import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
-# nerfstudio's Cameras index in a way that torch has deprecated
+# nerfstudio's Cameras use a way of indexing that torch has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:Using a non-tuple sequence for multidimensional indexing:UserWarning")
 
 SKEWED = Device(w=48, h=40, fl_x=90.0, fl_y=92.0, cx=23.0, cy=21.0, k1=-0.2, k2=0.05, p1=0.003, p2=-0.002)
@@ -31,8 +31,8 @@ def datamanager(tiny_root: Path) -> SLDataManager:
     return manager(tiny_root, train_num_rays_per_batch=200)
 
 
-def test_batch_belongs_to_its_rays(datamanager: SLDataManager) -> None:
-    """Independent of the samples: the sphere is hit where the coordinates say, read from the files."""
+def test_batch_matches_its_rays(datamanager: SLDataManager) -> None:
+    """Independent of the table of pixels: rays hit the sphere where the coordinates in the files say."""
     rays, batch = datamanager.next_train(0)
     loaded = datamanager.dataparser.loaded
     assert {k: tuple(v.shape) for k, v in batch.items()} == {
@@ -51,7 +51,7 @@ def test_batch_belongs_to_its_rays(datamanager: SLDataManager) -> None:
         assert batch["pattern"][i, 0].item() == pytest.approx(frame.read_pattern()[row, column], rel=1e-3)
         assert rays.metadata["sl_view"][i].tolist() == [number]
         assert rays.metadata["sl_uv"][i].tolist() == [column + 0.5, row + 0.5]
-        # the ray, taken back to the world and into the camera, ends at the pixel's centre
+        # the ray, transformed back to the world and into the camera, ends at the pixel's centre
         p_world = loaded.S_scene_world.inverse().points((rays.origins[i] + 0.7 * rays.directions[i]).double().numpy())
         p_camera = transform(inverse(torch.from_numpy(frame.T_world_camera)), torch.from_numpy(p_world))
         uv, in_front = project(Intrinsics.of(frame.camera, torch.float64), p_camera)
@@ -70,7 +70,7 @@ def test_rays_are_nerfstudios_rays(tmp_path: Path, camera: Device) -> None:
     torch.testing.assert_close(rays.origins, stock.origins, rtol=0, atol=1e-6)
     torch.testing.assert_close(rays.directions, stock.directions, rtol=0, atol=2e-6)
     torch.testing.assert_close(rays.metadata["sl_view"], stock.metadata["sl_view"])
-    # the solid angle of a pixel, to the order of magnitude that the lens distorts it
+    # the solid angle of a pixel, with a tolerance for lens distortion
     torch.testing.assert_close(rays.pixel_area, stock.pixel_area, rtol=0.3, atol=0)
 
 
@@ -97,7 +97,7 @@ def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
     for step in range(3):
         one.next_train(step)
     assert torch.equal(one.next_train(7)[1]["indices"], other.next_train(7)[1]["indices"])
-    # asked again for the same step, as ns-export pointcloud does, there are new pixels
+    # a second call for the same step, as by ns-export pointcloud, draws new pixels
     assert not torch.equal(other.next_train(7)[1]["indices"], one.next_train(8)[1]["indices"])
     first = one.next_train(9)[1]["indices"]
     assert not torch.equal(first, one.next_train(9)[1]["indices"])
@@ -148,7 +148,7 @@ def test_images_of_any_depth_and_colour(tmp_path: Path, bits: int, channels: int
     np.testing.assert_array_equal(as_bytes, np.round(expected * 255).astype(np.uint8))
 
 
-def test_downscaled_frames_keep_their_pixels_coordinates(tiny_root: Path) -> None:
+def test_downscaled_frames_keep_the_coordinates_of_their_pixels(tiny_root: Path) -> None:
     config = SLDataManagerConfig(data=tiny_root)
     assert isinstance(config.dataparser, SLDataParserConfig)
     config.dataparser.downscale_factor = 2.0
@@ -159,11 +159,11 @@ def test_downscaled_frames_keep_their_pixels_coordinates(tiny_root: Path) -> Non
     # nearest pixel: at most half a pixel of the full image away
     full = m.dataparser.loaded.scan.frames[0].read_coords()
     np.testing.assert_array_equal(item["coords"].numpy(), full[1::2, 1::2])
-    # training still sees the full resolution
+    # training still uses the full resolution
     assert int(m.next_train(0)[1]["indices"][:, 2].max()) > 24
 
 
-def test_world_coordinates_come_back_through_nerfstudios_transform(datamanager: SLDataManager) -> None:
+def test_nerfstudios_transform_restores_world_coordinates(datamanager: SLDataManager) -> None:
     loaded = datamanager.dataparser.loaded
     poses = datamanager.train_dataparser_outputs.transform_poses_to_original_space(
         datamanager.train_dataset.cameras.camera_to_worlds, camera_convention="opengl"
@@ -171,7 +171,7 @@ def test_world_coordinates_come_back_through_nerfstudios_transform(datamanager: 
     np.testing.assert_allclose(poses.numpy(), loaded.scan.poses.T_world_camera[:, :3], atol=1e-3)
 
 
-def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
+def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
     m = manager(tiny_root)
     before, _ = m.next_train(0)
     assert "sl_refined" not in before.metadata
@@ -199,7 +199,7 @@ def test_cameras_stand_at_refined_poses_everywhere(tiny_root: Path) -> None:
     assert camera.metadata is not None and camera.metadata["sl_refined"].tolist() == [[True]]
 
 
-def test_own_intrinsics_of_a_frame(tmp_path: Path) -> None:
+def test_a_frame_with_its_own_intrinsics(tmp_path: Path) -> None:
     root = TinyScan().write(tmp_path / "scan")
     content = json.loads((root / "transforms.json").read_text())
     own = {key: [content[key]] * 3 for key in ("fl_x", "cx")}
@@ -231,13 +231,13 @@ def test_scan_is_read_once_and_again_when_it_changes(tmp_path: Path) -> None:
 WRONG = (0.02, -0.01, 0.004, -0.015, 0.002, 0.006)
 
 
-def mended() -> IntrinsicsChange:
-    """The change that takes WRONG back: shares of a focal length that is itself wrong."""
+def correction() -> IntrinsicsChange:
+    """The change that cancels WRONG, in shares of a focal length that is itself wrong."""
     a, b, c, d, e, f = WRONG
     return IntrinsicsChange.of((-a / (1 + a), -b / (1 + a), -c / (1 + a), -d / (1 + d), -e / (1 + d), -f / (1 + d)))
 
 
-def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_right_scan(tmp_path: Path) -> None:
+def test_a_scan_with_wrong_intrinsics_and_their_correction_equals_the_correct_scan(tmp_path: Path) -> None:
     right = manager(TinyScan().write(tmp_path / "right"))
     root = TinyScan().write(tmp_path / "wrong")
     content = json.loads((root / "transforms.json").read_text())
@@ -245,39 +245,39 @@ def test_a_scan_with_wrong_intrinsics_and_the_change_that_mends_them_is_the_righ
         fields.update(cx=fields["cx"] + x * fields["fl_x"], cy=fields["cy"] + y * fields["fl_x"])
         fields.update(fl_x=fields["fl_x"] * (1 + f), fl_y=fields["fl_y"] * (1 + f))
     (root / "transforms.json").write_text(json.dumps(content))
-    found = manager(root, dataparser=SLDataParserConfig(intrinsics_change=mended()))
+    found = manager(root, dataparser=SLDataParserConfig(intrinsics_change=correction()))
     (rays, batch), (other_rays, other_batch) = found.next_train(3), right.next_train(3)
     torch.testing.assert_close(rays.directions, other_rays.directions, rtol=0, atol=1e-6)
     torch.testing.assert_close(batch, other_batch, rtol=0, atol=0, equal_nan=True)
     loaded, other = found.dataparser.loaded, right.dataparser.loaded
-    assert loaded.scan.intrinsics_change == mended() and other.scan.intrinsics_change == UNCHANGED
+    assert loaded.scan.intrinsics_change == correction() and other.scan.intrinsics_change == UNCHANGED
     assert loaded.scan.projector.fl_x == pytest.approx(other.scan.projector.fl_x, rel=1e-14)
     np.testing.assert_allclose(loaded.S_scene_world.matrix(), other.S_scene_world.matrix(), atol=1e-9)
     cameras = [m.train_dataset.cameras for m in (found, right)]
     torch.testing.assert_close(cameras[0].fx, cameras[1].fx)
     torch.testing.assert_close(cameras[0].cy, cameras[1].cy)
-    wrong = manager(root)  # the same folder, as it is stated: not what was remembered with the change
+    wrong = manager(root)  # the same folder without the change: the cached scan with the change is not used
     assert (wrong.next_train(3)[0].directions - other_rays.directions).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("which, value", [(3, -1.0), (1, 40.0), (4, float("nan"))])
-def test_a_change_in_percent_or_pixels_is_refused(tiny_root: Path, which: int, value: float) -> None:
+def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, value: float) -> None:
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
 
 
-def test_transforms_json_itself_may_be_named(tiny_root: Path) -> None:
+def test_data_may_be_the_transforms_json_itself(tiny_root: Path) -> None:
     assert sl_data.config.__class__ is SLDataParserConfig
     assert len(manager(tiny_root / "transforms.json").train_dataset) == 3
 
 
-def test_other_dataparsers_are_refused(tiny_root: Path) -> None:
+def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
     config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
     with pytest.raises(UserError, match="does not describe a projector"):
         config.setup(device="cpu")
 
 
-def test_a_folder_that_is_no_scan(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_a_scan(tmp_path: Path) -> None:
     with pytest.raises(ScanError, match=r"transforms\.json"):
         manager(tmp_path)

@@ -30,6 +30,6 @@ def test_frames_hold_out_different_blocks_and_hashes_are_uniform() -> None:
 
 
 def test_the_choice_never_changes() -> None:
-    # frozen: checkpoints of older runs must not meet pixels they were trained on
+    # frozen: checkpoints of older runs must not be tested on pixels they were trained on
     held = np.argwhere(held_out_pixels(3, 160, 160)[::BLOCK, ::BLOCK])
     assert held.tolist() == [[3, 1], [6, 16], [7, 8], [10, 11], [18, 13]]

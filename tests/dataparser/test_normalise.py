@@ -29,11 +29,11 @@ def normalise(root: Path) -> tuple[Scan, Similarity]:
     return scan, normalisation(scan, build_samples(scan))
 
 
-def test_the_object_lies_in_the_sphere_of_radius_08(tiny_root: Path) -> None:
+def test_the_object_is_inside_the_sphere_of_radius_08(tiny_root: Path) -> None:
     _, S = normalise(tiny_root)
     sphere = RADIUS * directions(2000, 0)
     r = np.linalg.norm(S.points(sphere), axis=1)
-    assert 0.6 < r.max() < 1.0  # only the lit half was seen, so the centre is off by some of the radius
+    assert 0.6 < r.max() < 1.0  # only the lit half was seen, so the centre is off by part of the radius
     assert S.scale == pytest.approx(0.8 / RADIUS, rel=0.15)
 
 
@@ -58,7 +58,7 @@ def test_unit_and_world_frame_do_not_matter(
 
 
 def test_the_viewers_up_is_the_cameras_up(tiny_root: Path) -> None:
-    # the cameras stand around the y axis and look down by 0.3 rad
+    # the cameras are around the y axis and look down by 0.3 rad
     scan, S = normalise(tiny_root)
     y_scene = S.R @ [0.0, 1.0, 0.0]
     ups = scan.poses.T_world_camera[:, :3, 1]
@@ -83,13 +83,13 @@ def test_upright_is_a_rotation_and_turns_with_the_world(vectors: ndarray, count:
     np.testing.assert_allclose(upright(turned) @ turn, axes, atol=1e-9)
 
 
-def test_cameras_without_a_common_up_take_the_first_ones() -> None:
+def test_cameras_without_a_common_up_use_that_of_the_first() -> None:
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])  # rolled by half a turn
     np.testing.assert_allclose(upright(T), [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def test_a_first_camera_on_its_side_still_gives_axes() -> None:
+def test_axes_exist_for_a_first_camera_on_its_side() -> None:
     roll = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # its right is the others' up
     T = np.tile(np.eye(4), (4, 1, 1))
     T[0, :3, :3] = roll
@@ -97,7 +97,7 @@ def test_a_first_camera_on_its_side_still_gives_axes() -> None:
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
 
 
-def test_one_pixel_in_ten_wrong_changes_little(tmp_path: Path, tiny_root: Path) -> None:
+def test_one_wrong_pixel_in_ten_changes_little(tmp_path: Path, tiny_root: Path) -> None:
     _, clean = normalise(tiny_root)
     _, noisy = normalise(TinyScan(wrong=0.1).write(tmp_path / "scan"))
     assert noisy.scale == pytest.approx(clean.scale, rel=0.1)
@@ -105,7 +105,7 @@ def test_one_pixel_in_ten_wrong_changes_little(tmp_path: Path, tiny_root: Path) 
     assert np.linalg.norm(moved) < 0.1
 
 
-def test_enclosing_sphere_of_a_lopsided_cloud() -> None:
+def test_enclosing_sphere_of_an_asymmetric_cloud() -> None:
     # a unit sphere and, with most of the points, a unit disc at z = 0.9: the smallest ball around both has its
     # centre at z = c with c + 1 = sqrt(1 + (0.9 - c)^2)
     disc = directions(8000, 2) * [1, 1, 0] + [0, 0, 0.9]
@@ -115,16 +115,16 @@ def test_enclosing_sphere_of_a_lopsided_cloud() -> None:
     assert 0.97 < radius / (3 * (1 + c)) < 1.01
 
 
-def test_lonely_points_are_dropped_and_no_others() -> None:
+def test_isolated_points_are_dropped_and_no_others() -> None:
     rng = np.random.default_rng(0)
     plane = np.concatenate([rng.random((3000, 2)), np.zeros((3000, 1))], 1)
-    stray = rng.random((60, 3)) * 20 + [0, 0, 1]
-    kept = without_lonely(np.concatenate([plane, stray]))
+    isolated = rng.random((60, 3)) * 20 + [0, 0, 1]
+    kept = without_lonely(np.concatenate([plane, isolated]))
     assert (kept[:, 2] == 0).all()
     assert len(kept) > 2980
 
 
-def test_poses_that_look_away_are_refused_with_the_likely_cause(tmp_path: Path) -> None:
+def test_poses_that_look_away_are_rejected_with_the_likely_cause(tmp_path: Path) -> None:
     root = TinyScan().write(tmp_path / "scan")
     scan = read_scan(root)
     turned = [f.T_world_camera @ np.diag([1.0, -1, -1, 1]) for f in scan.frames]

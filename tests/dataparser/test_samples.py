@@ -23,7 +23,7 @@ def samples(scan: Scan) -> PixelSamples:
     return build_samples(scan)
 
 
-def test_every_masked_pixel_once_with_its_own_values(scan: Scan, samples: PixelSamples) -> None:
+def test_every_masked_pixel_occurs_once_with_its_own_values(scan: Scan, samples: PixelSamples) -> None:
     assert samples.first.tolist() == np.cumsum([0, *(f.read_mask().sum() for f in scan.frames)]).tolist()
     for number, frame in enumerate(scan.frames):
         pixels = samples.at(torch.arange(int(samples.first[number]), int(samples.first[number + 1])))
@@ -92,7 +92,7 @@ def test_a_scan_too_small_for_the_hash_still_holds_out_one_block(tmp_path: Path)
     assert len(held.frame.unique()) == len((held.row // 8).unique()) == len((held.column // 8).unique()) == 1
 
 
-def test_empty_masks_are_refused(tmp_path: Path) -> None:
+def test_empty_masks_are_rejected(tmp_path: Path) -> None:
     scan = read_scan(TinyScan().write(tmp_path / "scan"))
     for frame in scan.frames:
         assert frame.mask_path is not None

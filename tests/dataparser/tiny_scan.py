@@ -1,4 +1,4 @@
-"""A sphere under a moving projector, computed by formula and written file by file: a scan folder in 50 ms."""
+"""A sphere under a moving projector, computed analytically and written file by file: a scan folder in 50 ms."""
 
 import json
 from dataclasses import asdict, dataclass, field

@@ -1,4 +1,4 @@
-"""Fields with lively features, and the field's formula written a second time, for torch's own derivatives."""
+"""Fields with large features, and a second implementation of the field's formula for torch's own derivatives."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ def make_field(backend: str, dtype: torch.dtype = torch.float32, seed: int = 0, 
 
 
 def plain_sdf(field: SDFField, p: Tensor) -> Tensor:
-    """The field by differentiable torch operations alone."""
+    """The field from differentiable torch operations only."""
     q = p.clamp(-1, 1)
     encoding = field.encoding
     h = torch.cat([q, encode(encoding.layout, encoding.table, encoding.level_weights, q)], -1)
@@ -37,7 +37,7 @@ def plain_sdf(field: SDFField, p: Tensor) -> Tensor:
 
 
 def points_around(n: int, seed: int = 1) -> Tensor:
-    """Points in the box and about it, in float64 that float32 holds exactly."""
+    """Points inside and around the box, in float64, with values that float32 can represent."""
     generator = torch.Generator().manual_seed(seed)
     return (torch.rand(n, 3, generator=generator) * 2.6 - 1.3).double()
 

@@ -23,7 +23,7 @@ def test_the_papers_grid_has_levels_16_to_256_and_hashes_the_two_finest() -> Non
     assert all(size >= (r + 1) ** 3 for size, r in zip(LAYOUT.sizes[:3], LAYOUT.resolutions, strict=False))
 
 
-def test_levels_follow_one_another_in_the_table_at_whole_cache_lines() -> None:
+def test_levels_are_consecutive_in_the_table_and_start_at_whole_cache_lines() -> None:
     ends = [offset + size for offset, size in zip(LAYOUT.offsets, LAYOUT.sizes, strict=True)]
     assert LAYOUT.offsets == (0, *ends[:-1])
     assert ends[-1] == LAYOUT.rows
@@ -84,7 +84,7 @@ def test_smoothstep_has_no_slope_at_the_faces_of_cells() -> None:
 
 
 @pytest.mark.parametrize("p", [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 0.0]])
-def test_the_borders_corner_belongs_to_the_last_cell(p: list[float]) -> None:
+def test_the_corner_at_the_border_is_in_the_last_cell(p: list[float]) -> None:
     layout = small()
     cell, weight, _ = corner_weights(layout, 2, torch.tensor([p], dtype=torch.float64))
     expected = [min(int((x + 1) * 8), 15) for x in p]
@@ -101,12 +101,12 @@ def test_level_weights_scale_their_own_features_only() -> None:
     torch.testing.assert_close(faded, full * torch.tensor([1, 0.25, 0], dtype=torch.float64)[:, None])
 
 
-def test_level_weights_of_the_wrong_number_are_refused() -> None:
-    with pytest.raises(ValueError, match="3 level weights wanted, got \\(2,\\)"):
+def test_a_wrong_number_of_level_weights_is_rejected() -> None:
+    with pytest.raises(ValueError, match="expected 3 level weights, got \\(2,\\)"):
         HashGrid(small()).set_level_weights(torch.ones(2))
 
 
 @pytest.mark.parametrize("arguments", [(0, 16, 256, 8), (5, 16, 8, 8), (5, 0, 8, 8), (5, 16, 32, 0)])
-def test_an_impossible_grid_is_refused(arguments: tuple[int, int, int, int]) -> None:
-    with pytest.raises(ValueError, match="no such grid"):
+def test_an_invalid_grid_is_rejected(arguments: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ValueError, match="invalid grid"):
         GridLayout.build(*arguments, 19, smooth=False)

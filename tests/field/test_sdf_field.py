@@ -103,7 +103,7 @@ def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_nan_points_give_nan_values_and_harm_nobody_else(backend: str) -> None:
+def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> None:
     field = make_field(backend)
     p = points_around(200).float()
     clean = field.sdf(p).detach()
@@ -144,10 +144,10 @@ def test_more_points_than_a_batch_and_two_threads_give_the_same_gradients() -> N
         torch.set_num_threads(1)
     for one, two, again in zip(*results, strict=True):
         assert relative(two, one) < 1e-5
-        assert torch.equal(two, again)  # whatever the threads' timing
+        assert torch.equal(two, again)  # independent of the threads' timing
 
 
-def test_points_that_cannot_matter_are_left_out_but_those_that_can_are_not() -> None:
+def test_negligible_points_are_left_out_and_no_others() -> None:
     p, g = points_around(1000).float(), torch.randn(1000)
     g[::2] *= 1e-14
     compiled, plain = make_field("numba"), make_field("torch")
@@ -161,7 +161,7 @@ def test_points_that_cannot_matter_are_left_out_but_those_that_can_are_not() -> 
     assert all(bool(x.isnan().any()) for x in gradients(compiled))
 
 
-def test_a_switched_off_level_gets_no_gradient_and_says_nothing() -> None:
+def test_a_switched_off_level_gets_no_gradient_and_has_no_effect() -> None:
     field = make_field("numba")
     field.set_level_weights(torch.tensor([1.0, 1.0, 0.0, 0.0]))
     p = points_around(100).float()
@@ -175,7 +175,7 @@ def test_a_switched_off_level_gets_no_gradient_and_says_nothing() -> None:
     assert torch.equal(field.sdf(p).detach(), before)
 
 
-def test_backward_accumulates_and_starts_afresh_after_zero_grad() -> None:
+def test_backward_accumulates_and_starts_from_zero_after_zero_grad() -> None:
     field, p = make_field("numba"), points_around(100).float()
 
     def gradient(times: int) -> Tensor:
@@ -220,7 +220,7 @@ def test_autograd_grad_of_points_alone_touches_no_parameter() -> None:
     assert all(x.grad is None for x in field.parameters())
 
 
-def test_a_frozen_table_lets_the_mlp_learn_and_the_reverse() -> None:
+def test_the_mlp_learns_with_a_frozen_table_and_vice_versa() -> None:
     p = points_around(100).float()
     for frozen in ("encoding", "mlp"):
         field = make_field("numba")
@@ -232,7 +232,7 @@ def test_a_frozen_table_lets_the_mlp_learn_and_the_reverse() -> None:
             assert (parameter.grad is None) == name.startswith(frozen)
 
 
-def test_a_parameter_changed_between_forward_and_backward_is_noticed() -> None:
+def test_a_parameter_changed_between_forward_and_backward_is_detected() -> None:
     field, p = make_field("numba"), points_around(10).float()
     f = field.sdf(p).sum()
     with torch.no_grad():
@@ -251,9 +251,10 @@ def test_state_dict_and_copies_carry_the_whole_field() -> None:
     assert torch.equal(copy.deepcopy(field).sdf(p), field.sdf(p))
 
 
-def test_numba_that_cannot_serve_is_refused_by_name_and_replaced_by_auto() -> None:
+def test_numba_is_rejected_by_name_and_replaced_by_auto_if_it_does_not_support_a_field() -> None:
     p = points_around(10)
-    with pytest.raises(UserError, match="wants 8 features a level, the field has 4; choose the backend auto or torch"):
+    refusal = "needs 8 features per level, the field has 4; choose the backend auto or torch"
+    with pytest.raises(UserError, match=refusal):
         make_field("numba", features=4).sdf(p.float())
     with pytest.raises(UserError, match="computes in float32"):
         make_field("numba", torch.float64).sdf(p)
@@ -261,13 +262,13 @@ def test_numba_that_cannot_serve_is_refused_by_name_and_replaced_by_auto() -> No
     assert make_field("auto", torch.float64).sdf(p).dtype == torch.float64
 
 
-def test_auto_takes_the_compiled_kernels_on_a_cpu() -> None:
+def test_auto_uses_the_compiled_kernels_on_a_cpu() -> None:
     p = points_around(10).float()
     assert torch.equal(make_field("auto").sdf(p), make_field("numba").sdf(p))
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_mixed_precision_does_not_reach_the_field(backend: str) -> None:
+def test_mixed_precision_does_not_affect_the_field(backend: str) -> None:
     field, p = make_field(backend), points_around(50).float()
     exact = field.sdf(p)
     with torch.autocast("cpu", torch.bfloat16):

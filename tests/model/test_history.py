@@ -1,4 +1,4 @@
-"""Curves of a run of any length stay small, whole and in order, through a checkpoint."""
+"""Curves of a run of any length stay small, complete and in order, also across a checkpoint."""
 
 import math
 from itertools import pairwise
@@ -16,7 +16,7 @@ def filled(count: int) -> History:
 
 
 @pytest.mark.parametrize("count", [0, 1, 511, 512, 513, 10_000])
-def test_the_table_keeps_its_bounds_and_its_order(count):
+def test_the_table_stays_within_bounds_and_in_order(count):
     history = filled(count)
     curves = history.curves()
     assert list(curves) == ["step", "loss", "rmse"]
@@ -27,7 +27,7 @@ def test_the_table_keeps_its_bounds_and_its_order(count):
     assert curves["rmse"] == steps and curves["loss"] == [1.0 / (1 + s) for s in steps]
 
 
-def test_entries_get_rarer_as_a_run_gets_longer():
+def test_entries_get_sparser_as_a_run_gets_longer():
     history, added = History(["loss"]), 0
     for step in range(10_000):
         if step % history.every == 0:
@@ -35,11 +35,11 @@ def test_entries_get_rarer_as_a_run_gets_longer():
             added += 1
     steps = history.curves()["step"]
     assert added < 1200 and history.every == 20
-    assert {b - a for a, b in pairwise(steps)} == {20.0}  # even all along
+    assert {b - a for a, b in pairwise(steps)} == {20.0}  # evenly spaced throughout
     assert steps[0] == 0 and steps[-1] >= 10_000 - 20
 
 
-def test_a_checkpoint_goes_on_as_if_nothing_had_happened():
+def test_a_checkpoint_continues_without_a_difference():
     whole, first = filled(1000), filled(600)
     second = History(["loss", "rmse"])
     second.load_state_dict(first.state_dict())
@@ -49,7 +49,7 @@ def test_a_checkpoint_goes_on_as_if_nothing_had_happened():
     assert second.curves() == whole.curves() and second.every == whole.every
 
 
-def test_missing_values_are_nan_and_unknown_names_do_not_matter():
+def test_missing_values_are_nan_and_unknown_names_are_ignored():
     history = History(["loss", "rmse"])
     history.add(3, {"loss": 2.0, "other": 1.0})
     curves = history.curves()

@@ -1,4 +1,4 @@
-"""The same scan in other units, or in a turned and shifted world, gives the same surface."""
+"""The same scan in other units, or in a rotated and shifted world, gives the same surface."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +65,7 @@ def in_mm(tmp_path_factory) -> np.ndarray:
 
 
 def share_apart(a: np.ndarray, b: np.ndarray) -> float:
-    """99 % quantile of the distances between two vertex sets, in shares of the first one's size."""
+    """99 % quantile of the distances between two vertex sets, as a share of the first one's size."""
     size = np.linalg.norm(np.ptp(a, axis=0))
     both = np.concatenate([KDTree(a).query(b)[0], KDTree(b).query(a)[0]])
     return float(np.quantile(both, 0.99) / size)
@@ -77,7 +77,7 @@ def test_units_do_not_matter(in_mm, tmp_path, units, mm):
     assert share_apart(in_mm, other) < 0.01
 
 
-def test_a_turned_and_shifted_world_does_not_matter(in_mm, tmp_path):
+def test_a_rotated_and_shifted_world_does_not_matter(in_mm, tmp_path):
     folder = small_scan(tmp_path / "turned", world_turn=5)
     turned = surface(folder)
     truth, start = (read_ground_truth(load_scan(f).scan) for f in (folder, small_scan(tmp_path / "plain")))

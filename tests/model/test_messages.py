@@ -1,4 +1,4 @@
-"""What a training run says about poses and intrinsics."""
+"""Messages of a training run about poses and intrinsics."""
 
 import torch
 
@@ -14,7 +14,7 @@ CAMERAS = [Device(800, 600, focal, focal, 400.0, 300.0) for focal in (500.0, 600
 PROJECTOR = Device(1000, 800, 1200.0, 1200.0, 500.0, 400.0)
 
 
-def test_a_contradiction_names_devices_units_and_remedy():
+def test_a_contradiction_is_reported_with_devices_units_and_remedy():
     change = IntrinsicsChange.of((-0.0068, 0.0, 0.001, 0.0005, 0.0, 0.002))
     found = SelfCalibration.of(change, torch.eye(6, dtype=torch.float64) * 0.0005**2)
     text = contradiction_message(found, CAMERAS, PROJECTOR)
@@ -24,12 +24,12 @@ def test_a_contradiction_names_devices_units_and_remedy():
     assert "cause:" in text and "remedy:" in text and "--pipeline.model.refine-intrinsics True" in text
 
 
-def test_intrinsics_that_may_be_right_are_not_mentioned():
+def test_intrinsics_that_may_be_correct_are_not_mentioned():
     found = SelfCalibration.of(IntrinsicsChange.of((0.0005,) * 6), torch.eye(6, dtype=torch.float64) * 0.0005**2)
     assert contradiction_message(found, CAMERAS, PROJECTOR) == ""
 
 
-def test_both_figures_are_in_the_message():
+def test_both_residuals_are_in_the_message():
     rig = rig_of(3, 60)
     better = CrossValidation(before_px=3.0, after_px=0.25, difference=-8.0, standard_error=0.1, standard_errors=2.0)
     text = poses_message(ScanAdjustment(rig, torch.zeros(3, 12), better, 0.1))

@@ -50,7 +50,7 @@ def run(steps: int, state: dict | None, max_steps: int) -> tuple[list[float], di
     return rates, scheduler.state_dict()
 
 
-def test_a_resumed_run_goes_on_along_the_first_runs_schedule(tmp_path: Path) -> None:
+def test_a_resumed_run_continues_the_first_runs_schedule(tmp_path: Path) -> None:
     whole, _ = run(40, None, 40)
     first, state = run(15, None, 40)
     torch.save(state, tmp_path / "state.pt")
@@ -59,7 +59,7 @@ def test_a_resumed_run_goes_on_along_the_first_runs_schedule(tmp_path: Path) -> 
     assert first + rest == whole
 
 
-def test_a_length_is_needed() -> None:
+def test_a_missing_length_is_an_error() -> None:
     optimizer = FusedAdamOptimizerConfig().setup([torch.nn.Parameter(torch.zeros(1))])
     with pytest.raises(ValueError, match="max_steps is not set"):
         DecaySchedulerConfig().setup().get_scheduler(optimizer, 0.1)
@@ -78,7 +78,7 @@ def test_fused_adam_steps_as_adam_does() -> None:
     torch.testing.assert_close(*values, rtol=1e-5, atol=1e-6)
 
 
-def test_row_adam_takes_the_configs_rates() -> None:
+def test_row_adam_uses_the_rates_of_the_config() -> None:
     table = torch.nn.Parameter(torch.zeros(4, 2))
     optimizer = RowAdamOptimizerConfig(lr=0.5).setup([table])
     table.grad = torch.tensor([[0.0, 0], [1, -2], [0, 0], [3, 0]])

@@ -29,7 +29,7 @@ def test_one_frame_has_a_deviation_of_zero() -> None:
     assert mean_over_frames([], with_std=True) == {}
 
 
-def test_commands_to_go_on_with_survive_a_shell() -> None:
+def test_commands_to_continue_with_are_quoted_for_a_shell() -> None:
     text = what_next(Path("/a b/it's/config.yml"), Path("/scan"))
     assert """ns-viewer --load-config '/a b/it'"'"'s/config.yml'""" in text
     assert text.startswith("Result: /a b/it's\n")

@@ -1,4 +1,4 @@
-"""Poses as parameters: what an increment means, derivatives, other base poses, and what each choice holds fixed."""
+"""Poses as parameters: the meaning of an increment, derivatives, other base poses, and what each choice keeps fixed."""
 
 import pytest
 import torch
@@ -45,7 +45,7 @@ def test_without_increments_poses_are_the_base(kind):
     )
 
 
-def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_against_the_camera():
+def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_relative_to_the_camera():
     poses = make(RigPoseParameters)
     set_steps(poses)
     camera, projector = poses()
@@ -100,7 +100,7 @@ def test_gradients_are_central_differences(kind, zero):
 
 
 @KINDS
-def test_going_on_from_other_poses(kind):
+def test_continuing_from_other_poses(kind):
     poses = make(kind)
     set_steps(poses)
     poses.rebase(random_poses(5), random_poses(6))
@@ -130,7 +130,7 @@ def test_a_shared_projector_moves_alike_in_all_frames():
 
 
 @KINDS
-def test_a_checkpoint_brings_back_base_start_and_increments(kind):
+def test_a_checkpoint_restores_base_start_and_increments(kind):
     poses = make(kind)
     poses.rebase(random_poses(5), random_poses(6))
     set_steps(poses)
@@ -151,8 +151,8 @@ METHODS = ("adjust", "adjust-and-render", "render", "render-independently")
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("free", ["free", "rigid-rig", "known-rig", "static-projector", "off"])
-def test_every_choice_moves_what_it_says_and_holds_the_rest(free, method):
-    """One choice of what is free and one of how: no pair of them contradicts itself."""
+def test_every_choice_moves_what_it_says_and_keeps_the_rest_fixed(free, method):
+    """One choice of what is free and one of how it is refined: no combination contradicts itself."""
     settings = SLModelConfig(refine_poses=free, pose_method=method)
     start, light = random_poses(0), random_poses(1)
     poses = make_pose_parameters(settings, start, light).double()
@@ -161,7 +161,7 @@ def test_every_choice_moves_what_it_says_and_holds_the_rest(free, method):
     assert poses.camera_step.requires_grad == moves
     assert poses.projector_step.requires_grad == (moves and free in ("free", "rigid-rig"))
     generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():  # one step of any optimiser: along what has a gradient
+    with torch.no_grad():  # one step of any optimiser moves what has a gradient
         for step in (p for p in poses.parameters() if p.requires_grad):
             step.copy_(0.1 * torch.randn(step.shape, generator=generator, dtype=torch.float64))
     camera, projector = poses()
@@ -179,7 +179,7 @@ def test_every_choice_moves_what_it_says_and_holds_the_rest(free, method):
         assert (after - before).abs().flatten(1).amax(1).min() > 1e-3  # every frame's own
 
 
-def test_what_the_adjustment_found_travels_with_the_poses():
+def test_results_of_the_adjustment_are_saved_with_the_poses():
     poses = make(RigPoseParameters)
     assert poses.self_calibration() is None
     sigma, found = torch.rand(FRAMES, 12), SelfCalibration(torch.rand(6).double(), torch.eye(6).double())

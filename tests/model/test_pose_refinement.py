@@ -1,4 +1,4 @@
-"""From a scan on disk to refined poses: right ones in, right ones out; useless ones refused."""
+"""From a scan on disk to refined poses: disturbed ones are corrected; results that do not improve are rejected."""
 
 import copy
 from dataclasses import replace
@@ -56,7 +56,7 @@ def in_mm(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_poses(scan: Scan, rig: Rig) -> Scan:
-    """The same files, other starting poses."""
+    """The same files with other starting poses."""
     poses = zip(scan.frames, *in_mm(rig), strict=True)
     return replace(scan, frames=tuple(replace(f, T_world_camera=c, T_world_projector=p) for f, c, p in poses))
 
@@ -107,7 +107,7 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
 
 
 def adjusted_poses(scan: Scan, samples: PixelSamples) -> Found:
-    """What the adjustment finds, whatever held-out pixels say of it."""
+    """The result of the adjustment without cross-validation."""
     maps, _ = maps_and_held_out(scan, samples, QUICK)
     prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
     return adjusted(scan, S_SCENE_WORLD, scene_rig(scan, S_SCENE_WORLD), maps, "free", prior, QUICK)
@@ -118,7 +118,7 @@ def adjusted_poses(scan: Scan, samples: PixelSamples) -> Found:
     [(Scale(True, "given camera poses"), 1.0), (Scale(True, "a ruler", baseline_of="frame_00001"), 1.02)],
 )
 def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
-    """Cameras stand where they are said to stand; all baselines are said to be 2 % longer than they are."""
+    """Camera positions are stated correctly; all baselines are stated 2 % longer than they are."""
     start = rig_of(FRAMES, SIZE)
     start.T_camera_projector[:, :3, 3] *= 1.02
     sigma = PoseSigma(0.05, 0.05, 1.0, 0.3)
@@ -135,7 +135,7 @@ def in_world(found: Found) -> DevicePoses:
 
 
 def test_without_an_earlier_frame_the_same_baseline_is_kept(scan, true):
-    """The scan names the frame, so the second of six frames stays the one that counts when the first is removed."""
+    """The scan names the frame, so the same frame's baseline is used when the frame before it is removed."""
     start = with_poses(scan, disturbed(true, 1, relative=1.0))
     fewer = replace(start, frames=start.frames[1:])
     found = adjusted_poses(fewer, build_samples(fewer))
@@ -145,7 +145,7 @@ def test_without_an_earlier_frame_the_same_baseline_is_kept(scan, true):
 
 
 def test_a_scale_bar_has_its_length_after_the_adjustment(scan, true):
-    """The starting poses are 3 % too small, and the bar says so."""
+    """The lengths of the starting poses are 3 % too small, as the bar shows."""
     ends = (PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0)))
     length = measured_length(scan, ScaleBar(ends, 1.0), scan.poses)
     bar = ScaleBar(ends, length)
@@ -160,8 +160,8 @@ def test_a_scale_bar_has_its_length_after_the_adjustment(scan, true):
     assert float(apart[0] / apart[1]) == pytest.approx(1, abs=5e-3)
 
 
-def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
-    """`off` changes nothing, so nothing is better."""
+def test_poses_that_do_not_improve_are_kept_bit_for_bit(scan, true):
+    """`off` changes nothing, so the result is no better."""
     found = adjust_scan(
         scan, S_SCENE_WORLD, build_samples(scan), "off", PriorConfig(), replace(QUICK, max_iterations=1)
     )
@@ -169,12 +169,12 @@ def test_poses_that_do_not_improve_are_kept_bit_by_bit(scan, true):
     assert not found.adjusted and torch.equal(found.rig.T_world_camera, rig.T_world_camera)
     assert torch.equal(found.rig.T_world_projector, rig.T_world_projector)
     prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
-    assert torch.equal(found.sigma[:, 0], prior.frame_translation)  # nothing was learnt
+    assert torch.equal(found.sigma[:, 0], prior.frame_translation)  # no information was added
     assert torch.equal(found.sigma[:, 11], prior.relative_rotation)
     assert poses_message(found).startswith("Poses NOT changed")
 
 
-def test_the_prior_is_what_the_scan_states_else_the_defaults(scan, true):
+def test_the_prior_is_the_stated_one_else_the_default(scan, true):
     stated = PoseSigma(
         camera_translation=2.0, camera_rotation_deg=1.5, relative_translation=0.0, relative_rotation_deg=0.1
     )
@@ -183,13 +183,13 @@ def test_the_prior_is_what_the_scan_states_else_the_defaults(scan, true):
     first = [float(s[0]) for s in (prior.frame_translation, prior.frame_rotation)]
     assert first == pytest.approx([2.0 / MM, radians(1.5)])
     assert float(prior.relative_rotation[0]) == pytest.approx(radians(0.1))
-    assert 0 < float(prior.relative_translation[0]) < 1e-6  # known exactly, but not infinitely so
+    assert 0 < float(prior.relative_translation[0]) < 1e-6  # known exactly, but the sigma is not zero
     assert float(prior.frame_translation[1]) == 0.1 and float(prior.frame_rotation[1]) == pytest.approx(radians(2))
     baseline = float(true.T_camera_projector[1, :3, 3].norm())
     assert float(prior.relative_translation[1]) == pytest.approx(0.05 * baseline)
 
 
-def test_sigmas_in_units_for_people():
+def test_sigmas_in_scan_units_and_degrees():
     sigma = torch.tensor([[3.0, 4.0, 0.0, 0.1, 0.1, 0.1, 0.0, 0.0, 6.0, 0.0, 0.2, 0.0]]) / 100
     found = sigmas_in_scan_units(sigma, S_SCENE_WORLD)[0]
     degree = 180 / np.pi / 100
@@ -198,11 +198,11 @@ def test_sigmas_in_units_for_people():
     )
 
 
-MENDABLE = IntrinsicsChange.of((-0.009, 0.003, 0.0, 0.007, 0.0, -0.004))
+CORRECTABLE = IntrinsicsChange.of((-0.009, 0.003, 0.0, 0.007, 0.0, -0.004))
 
 
 def stated_with(scan: Scan, change: IntrinsicsChange) -> LoadedScan:
-    """The scan as a folder that states other intrinsics would be loaded."""
+    """The scan as it would be loaded from a folder with other intrinsics."""
     wrong = replace(scan.with_intrinsics_change(change), intrinsics_change=UNCHANGED)
     return LoadedScan(wrong, build_samples(scan), S_SCENE_WORLD)
 
@@ -212,48 +212,48 @@ def relative_error(found: Found, true: Rig) -> float:
 
 
 @pytest.fixture(scope="module")
-def mended(scan) -> RefinedIntrinsics:
-    return refine_intrinsics(stated_with(scan, MENDABLE), UNCHANGED, "free", PriorConfig(), QUICK)
+def corrected(scan) -> RefinedIntrinsics:
+    return refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
 
 
 def cameras_of(scan: Scan) -> list[Device]:
     return [frame.camera for frame in scan.frames]
 
 
-def test_wrong_intrinsics_are_taken_back_and_poses_with_them(scan, true, mended):
-    """In images of 80 pixels one cannot see that both focal lengths are too long, but that one is against the other."""
-    loaded = stated_with(scan, MENDABLE)
-    assert mended.before.intrinsics is not None and mended.before.intrinsics.contradicts()
-    assert mended.changed and mended.cross_validation.better
-    changed = loaded.scan.with_intrinsics_change(mended.change)
+def test_wrong_intrinsics_are_corrected_and_poses_with_them(scan, true, corrected):
+    """In images of 80 pixels only the ratio of the focal lengths is observable, not whether both are too long."""
+    loaded = stated_with(scan, CORRECTABLE)
+    assert corrected.before.intrinsics is not None and corrected.before.intrinsics.contradicts()
+    assert corrected.changed and corrected.cross_validation.better
+    changed = loaded.scan.with_intrinsics_change(corrected.change)
     ratio = changed.frames[0].camera.fl_x / scan.frames[0].camera.fl_x / (changed.projector.fl_x / scan.projector.fl_x)
-    assert abs(ratio - 1) < 0.1 * abs((1 + MENDABLE.camera.focal) / (1 + MENDABLE.projector.focal) - 1)
-    assert relative_error(mended.after, true) < 0.15 * relative_error(mended.before, true)
-    text = refined_intrinsics_message(mended, cameras_of(loaded.scan), loaded.scan.projector)
+    assert abs(ratio - 1) < 0.1 * abs((1 + CORRECTABLE.camera.focal) / (1 + CORRECTABLE.projector.focal) - 1)
+    assert relative_error(corrected.after, true) < 0.15 * relative_error(corrected.before, true)
+    text = refined_intrinsics_message(corrected, cameras_of(loaded.scan), loaded.scan.projector)
     assert text.startswith("Intrinsics changed (chi square ") and "camera: focal length +0." in text
     assert "projector: focal length -" in text
 
 
-def test_right_intrinsics_stay_exactly_as_they_are(scan):
+def test_correct_intrinsics_do_not_change_at_all(scan):
     found = refine_intrinsics(stated_with(scan, UNCHANGED), UNCHANGED, "free", PriorConfig(), QUICK)
     assert found.change == UNCHANGED and found.after is found.before and not found.changed
     text = refined_intrinsics_message(found, cameras_of(scan), scan.projector)
     assert text.startswith("Intrinsics NOT changed: the captures agree with them (chi square ")
 
 
-def test_a_change_that_is_stated_is_where_refinement_starts(scan, mended):
-    """What was found once is contradicted no more, and stays."""
-    found = refine_intrinsics(stated_with(scan, MENDABLE), mended.change, "free", PriorConfig(), QUICK)
-    assert found.change == mended.change and not found.changed
+def test_refinement_starts_from_a_stated_change(scan, corrected):
+    """Intrinsics that were refined once are not contradicted again, and do not change."""
+    found = refine_intrinsics(stated_with(scan, CORRECTABLE), corrected.change, "free", PriorConfig(), QUICK)
+    assert found.change == corrected.change and not found.changed
 
 
-def test_held_out_pixels_decide_once_about_intrinsics(scan, mended, monkeypatch):
-    """Asked again and again on the same pixels, chance would say yes one day."""
-    asked = []
+def test_held_out_pixels_decide_once_about_intrinsics(scan, corrected, monkeypatch):
+    """With repeated decisions on the same pixels, one would be positive by chance."""
+    calls = []
     real = intrinsics_refinement.cross_validate
-    monkeypatch.setattr(intrinsics_refinement, "cross_validate", lambda *a: asked.append(a) or real(*a))
-    refine_intrinsics(stated_with(scan, MENDABLE), UNCHANGED, "free", PriorConfig(), QUICK)
-    assert len(asked) == 1
+    monkeypatch.setattr(intrinsics_refinement, "cross_validate", lambda *a: calls.append(a) or real(*a))
+    refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
+    assert len(calls) == 1
 
 
 def settings_for(scan: Scan, **model: object) -> SLTrainerConfig:
@@ -265,22 +265,22 @@ def settings_for(scan: Scan, **model: object) -> SLTrainerConfig:
     return config
 
 
-def test_a_run_takes_the_change_into_its_settings(scan, mended, monkeypatch, capsys):
-    """Everything that opens the run later reads those, and so the same devices."""
-    asked = []
+def test_a_run_stores_the_change_in_its_settings(scan, corrected, monkeypatch, capsys):
+    """Everything that opens the run later reads these settings, and so uses the same devices."""
+    calls = []
 
-    def found(*question) -> RefinedIntrinsics:
-        asked.append(question)
-        return mended
+    def found(*arguments) -> RefinedIntrinsics:
+        calls.append(arguments)
+        return corrected
 
     monkeypatch.setattr("sl_nerfstudio.model.trainer.refine_intrinsics", found)
     config = settings_for(scan, refine_intrinsics=True, refine_poses="rigid-rig")
     config.prepare()
-    assert config.pipeline.datamanager.dataparser.intrinsics_change == mended.change != UNCHANGED
-    ((loaded, *question),) = asked
+    assert config.pipeline.datamanager.dataparser.intrinsics_change == corrected.change != UNCHANGED
+    ((loaded, *arguments),) = calls
     model = config.pipeline.model
-    assert loaded.scan.root == scan.root and question == [UNCHANGED, "rigid-rig", model.prior, model.adjustment]
-    assert model.refine_intrinsics  # what the user asked for stays as it was
+    assert loaded.scan.root == scan.root and arguments == [UNCHANGED, "rigid-rig", model.prior, model.adjustment]
+    assert model.refine_intrinsics  # the user's own setting does not change
     assert "Intrinsics changed" in capsys.readouterr().out
 
 
@@ -293,21 +293,22 @@ def checkpoint_of(folder: Path, change: IntrinsicsChange) -> Path:
     return folder
 
 
-def test_a_resumed_run_has_the_intrinsics_of_its_checkpoint(scan, mended, tmp_path, monkeypatch):
-    """Nothing is refined a second time, and the flag need not be taken back."""
+def test_a_resumed_run_has_the_intrinsics_of_its_checkpoint(scan, corrected, tmp_path, monkeypatch):
+    """Nothing is refined a second time, and the flag may remain set."""
     monkeypatch.setattr("sl_nerfstudio.model.trainer.refine_intrinsics", lambda *_: pytest.fail("refined again"))
     config = settings_for(scan, refine_intrinsics=True)
-    config.load_dir = checkpoint_of(tmp_path / "models", mended.change)
+    config.load_dir = checkpoint_of(tmp_path / "models", corrected.change)
     config.prepare()
-    assert config.pipeline.datamanager.dataparser.intrinsics_change == mended.change
+    assert config.pipeline.datamanager.dataparser.intrinsics_change == corrected.change
     assert config.schedule_iterations == 700
-    config.pipeline.datamanager.dataparser.intrinsics_change = MENDABLE
-    with pytest.raises(UserError, match=r"the checkpoint was trained with(.|\n)*remedy: leave the option out"):
+    config.pipeline.datamanager.dataparser.intrinsics_change = CORRECTABLE
+    remedy = "remedy: leave the option out; the run then continues with the same intrinsics"
+    with pytest.raises(UserError, match=rf"the checkpoint was trained with(.|\n)*{remedy}"):
         config.prepare()
 
 
 @pytest.mark.parametrize("settings", [{"refine_poses": "off"}, {"pose_method": "render"}])
 def test_intrinsics_are_not_refined_without_poses(scan, settings):
     config = settings_for(scan, refine_intrinsics=True, **settings)
-    with pytest.raises(UserError, match=r"--pipeline\.model\.refine-intrinsics: .*those are not adjusted"):
+    with pytest.raises(UserError, match=r"--pipeline\.model\.refine-intrinsics: .*but the poses are not adjusted"):
         config.prepare()

@@ -1,4 +1,4 @@
-"""Losses on triangulated points, with a sphere by formula in place of the trained field."""
+"""Losses on triangulated points, with an analytic sphere in place of the trained field."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def projector_pose() -> Tensor:
 
 @pytest.fixture
 def rays() -> MeasuredRays:
-    """Rays from (0, 0, 3) that meet the sphere, and what an errorless decoder says there."""
+    """Rays from (0, 0, 3) that meet the sphere, and the output of a perfect decoder there."""
     axis = torch.linspace(-0.25, 0.25, 12, dtype=torch.float64)
     aim = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     o = torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand(len(aim), 3)
@@ -76,12 +76,12 @@ def test_the_true_field_costs_nothing(rays):
 
 
 @pytest.mark.parametrize("step", [0, 500, 1000])
-def test_a_field_that_is_off_by_a_constant_costs_the_kernel_of_it(rays, step):
+def test_a_field_with_a_constant_error_costs_the_kernel_of_that_error(rays, step):
     found = losses(Sphere(RADIUS + 0.02), rays, step)["surface"]
     assert float(found) == pytest.approx(kernel(0.02, step), rel=1e-6)
 
 
-def test_a_field_inside_out_costs_signs_but_no_surface(rays):
+def test_a_field_inside_out_costs_in_its_signs_but_not_at_the_surface(rays):
     found = losses(Sphere(sign=-1.0), rays)
     assert float(found["free_space"]) > 0.01 and float(found["surface"]) < 1e-9
 
@@ -109,7 +109,7 @@ class Folded(Sphere):
 
 
 @pytest.mark.parametrize("half", [0.002, 0.01, 0.02])
-def test_a_surface_that_is_folded_about_the_measured_points_costs_signs(rays, half):
+def test_a_surface_that_is_folded_around_the_measured_points_costs_in_its_signs(rays, half):
     found = losses(Folded(half), rays)
     assert float(found["surface"]) < 1e-9 and float(found["eikonal"]) < 1e-9
     assert float(found["free_space"]) > 0.05
@@ -131,7 +131,7 @@ def test_without_direct_terms_only_the_slope_counts():
     assert not LossConfig(surface=0.0, free_space=0.0).direct and LossConfig().direct
 
 
-def test_the_gradient_by_the_projector_s_pose_is_a_central_difference(rays):
+def test_the_gradient_by_the_pose_of_the_projector_is_a_central_difference(rays):
     def surface(xi: Tensor) -> Tensor:
         T = exp_se3(xi) @ projector_pose()
         turned = replace(rays, T_scene_projector=T.expand(len(rays.origins), 4, 4))

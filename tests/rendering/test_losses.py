@@ -1,4 +1,4 @@
-"""Values by hand, invariances, and deafness to what is far off."""
+"""Values computed by hand, invariances, and insensitivity to gross errors."""
 
 import pytest
 import torch
@@ -51,7 +51,7 @@ def test_slope_one_costs_nothing():
     assert float(eikonal_loss(0.5 * gradient)) == pytest.approx(0.25, rel=1e-5)
 
 
-def test_measured_points_pull_when_near_and_not_when_far():
+def test_measured_points_attract_the_surface_when_near_and_not_when_far():
     width = 0.1
     sdf = torch.tensor([1e-4, -1e-4, 0.1, 1.0, -3.0], dtype=torch.float64, requires_grad=True)
     one = torch.ones(5, dtype=torch.float64)
@@ -76,7 +76,7 @@ def test_weights_of_measured_points_are_shares():
     assert float(surface_loss(sdf, 0 * weight, 0.1)) == 0
 
 
-def test_signs_on_the_way_and_behind():
+def test_signs_in_front_of_the_surface_and_behind():
     sdf, least = torch.tensor([0.5, 0.1, -0.2]), torch.tensor([0.2, 0.2, 0.1])
     assert float(free_space_loss(sdf, least)) == pytest.approx((0 + 0.1 + 0.3) / 3)
     assert float(behind_loss(sdf)) == pytest.approx(0.6 / 3)

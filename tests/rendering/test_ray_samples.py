@@ -50,7 +50,7 @@ def test_samples_are_ascending_one_in_each_stratum():
     assert (jittered.diff(dim=-1) > 0).all()
 
 
-def test_a_plane_is_met_exactly():
+def test_the_crossing_of_a_plane_is_exact():
     o, d = random_rays(50)
     normal = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     t_true = (0.2 - o @ normal) / (d @ normal)
@@ -63,7 +63,7 @@ def test_a_plane_is_met_exactly():
     assert torch.allclose(t[found], t_true[found], atol=1e-9)
 
 
-def test_the_first_of_two_balls_is_met_and_leaving_one_does_not_count():
+def test_the_first_of_two_balls_is_found_and_leaving_one_does_not_count():
     centres = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
 
     def sdf(p: torch.Tensor) -> torch.Tensor:

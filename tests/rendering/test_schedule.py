@@ -1,4 +1,4 @@
-"""Sharpness and levels over a run: end points, monotony, switches."""
+"""Sharpness and levels over a run: end points, monotonicity, switches."""
 
 from itertools import pairwise
 
@@ -20,7 +20,7 @@ def test_sharpness_grows_from_start_to_end(growth):
     assert kappa_at(config, 500, TOTAL) == pytest.approx(30 if growth == "geometric" else 60)
 
 
-def test_linear_growth_does_not_know_the_length_of_the_run():
+def test_linear_growth_does_not_depend_on_the_length_of_the_run():
     config = AnnealingConfig(kappa_start=10.0, kappa_end=1e6, kappa_growth="linear", kappa_per_step=0.02)
     assert {kappa_at(config, 100, total) for total in (1, 100, 10**6)} == {12.0}
 

@@ -88,7 +88,7 @@ def test_a_ball_converges_to_ray_casting():
     uv, in_front = project(PROJECTOR, transform(T[None], o + depth[:, None] * d))
     pattern = torch.rand(48, 64, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert in_front.all() and ((uv > 0) & (uv < uv.new_tensor([64.0, 48.0]))).all(-1).any()
-    errors = []  # of the last, most is the 1e-6 that keeps empty rays finite
+    errors = []  # the last one is mostly the 1e-6 that keeps empty rays finite
     for kappa, samples in ((50.0, 100), (400.0, 800), (4000.0, 8000)):
         r = rendered(kappa, samples, T, pattern)
         errors.append([float((r.depth - depth).abs().max()), float((r.coordinates - uv).abs().max())])
@@ -110,7 +110,7 @@ def test_behind_the_projector_nothing_is_lit_but_there_is_depth():
 
 
 def test_only_what_is_in_front_of_the_projector_makes_the_coordinate():
-    """Two walls of weight about one half: the near one behind the projector, the far one before it."""
+    """Two walls of weight about one half: the near one behind the projector, the far one in front of it."""
     t = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
     o, d = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
     sdf = torch.tensor([[0.0, -np.log(3.0), -9e9]], dtype=torch.float64)  # Phi: 1/2, 1/4, 0
@@ -123,7 +123,7 @@ def test_only_what_is_in_front_of_the_projector_makes_the_coordinate():
     assert float(r.pattern) == pytest.approx(0.5, abs=1e-5)
 
 
-def test_beside_the_pattern_coordinates_go_on_and_the_intensity_is_zero():
+def test_outside_the_pattern_coordinates_continue_and_the_intensity_is_zero():
     r = rendered(400.0, 400, projector_pose(x=2.5))
     assert (r.coordinates[:, 0] < -2).all() and (r.lit > 0.999).all()
     assert torch.equal(r.pattern, torch.zeros_like(r.pattern))
@@ -141,7 +141,7 @@ def test_a_ray_through_nothing_has_no_weight_and_no_nan():
     assert sdf.grad is not None and sdf.grad.isfinite().all()
 
 
-def test_the_pattern_between_pixels_is_scipys():
+def test_the_pattern_between_pixels_equals_scipys():
     pattern = torch.rand(7, 11, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     uv = torch.rand(500, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 16 - 2.5
     expected = map_coordinates(

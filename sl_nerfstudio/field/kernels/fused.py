@@ -1,8 +1,8 @@
 """The whole field in numba: value, gradient, and their pull-backs, for a range of points.
 
-Each kernel encodes a chunk of points, runs the MLP on it and throws everything away again: recomputing a chunk in the
-core's cache is cheaper than keeping and re-reading its activations. Whatever is summed over points goes into buffers
-of the range, so that ranges can run in parallel and results do not depend on how they were scheduled.
+Each kernel encodes a chunk of points, runs the MLP on it and discards everything: recomputing a chunk in the core's
+cache is cheaper than storing and re-reading its activations. Sums over points go into buffers of the range, so that
+ranges can run in parallel and results do not depend on how they were scheduled.
 
 The gradient's pull-back rests on this: for a constant direction v, `v . grad f` is the directional derivative of f,
 so its parameter gradient is one more reverse sweep through the pair (f, directional derivative of f).
@@ -29,7 +29,7 @@ _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
 
 @part
 def distance_to_box(p, i):
-    """Distance of point i from [-1, 1]^3; not zero (NaN) for NaN."""
+    """Distance of point i from [-1, 1]^3; NaN (so not zero) for NaN."""
     square = _ZERO
     for a in range(3):
         step = p[i, a] - clamped(p[i, a])
@@ -56,14 +56,14 @@ def apply_jacobian(network, scratch, count, p, start, out):
 def add_outside(p, i, weight, out):
     """Add `weight` times the gradient of the distance to the box."""
     distance = distance_to_box(p, i)
-    if distance != _ZERO:  # true for NaN, too
+    if distance != _ZERO:  # also true for NaN
         for a in range(3):
             out[i, a] += weight * (p[i, a] - clamped(p[i, a])) / distance
 
 
 @kernel
 def evaluate(grid, network, scratch, p, start, stop, f, gradient, want_gradient):
-    """Values `f[start:stop]`, and if wanted gradients `gradient[start:stop]`, of points `p` [n, 3]."""
+    """Values `f[start:stop]` and, on request, gradients `gradient[start:stop]` of points `p` [n, 3]."""
     hidden, last = network.hidden, network.weights.last
     top = scratch.a[(network.layers - 1) * POINTS * hidden :]
     for first in range(start, stop, POINTS):
@@ -95,10 +95,10 @@ def spread_levels(network, rows_of, out, first, count):
 
 @kernel
 def pull_back(grid, network, scratch, p, start, stop, g, weights, levels, offset, want_parameters, dp, want_dp):
-    """Pull `g`, the gradient of a loss with respect to the values, back.
+    """Pull back `g`, the gradient of a loss with respect to the values.
 
-    If wanted, adds to the MLP gradients `weights` and writes those of the level features to `levels` [levels, n, 8]
-    (point `offset` first); if wanted, writes those of the points to `dp`.
+    With `want_parameters`, adds to the MLP gradients `weights` and writes those of the level features to `levels`
+    [levels, n, 8] (point `offset` first). With `want_dp`, writes those of the points to `dp`.
     """
     hidden, size, top = network.hidden, POINTS * network.hidden, network.layers - 1
     last, d_last = network.weights.last, weights.last
@@ -166,7 +166,7 @@ def pull_back_gradient(grid, network, scratch, p, start, stop, g, v, weights, le
             d_last[hidden] += gi
             for j in range(hidden):
                 d_last[j] += gi * a[i * hidden + j] + a_dot[i * hidden + j]
-                d[i * hidden + j] = gi * last[j]  # still of the activations
+                d[i * hidden + j] = gi * last[j]  # at this point with respect to the activations
         for layer in range(top, -1, -1):
             t, h, z_dot = scratch.t[layer * size :], scratch.h[layer * size :], scratch.z_dot[layer * size :]
             for i in range(count * hidden):

@@ -1,4 +1,4 @@
-"""The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features a level.
+"""The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features per level.
 
 A chunk of points is encoded into `e` [POINTS, depth]: columns 0..2 the point, 3 the constant 1 (it carries the first
 layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS, 3, depth]
@@ -23,10 +23,10 @@ from sl_nerfstudio.field.kernels.simd import (
 )
 
 POINTS = 128
-"""Points a chunk: its activations stay in the core's own cache."""
+"""Points per chunk: its activations stay in the core's own cache."""
 FIRST = 8
 """Column of the first level."""
-_AHEAD = 8  # points: so early are rows asked for
+_AHEAD = 8  # points: rows are prefetched this far ahead
 _Y, _Z = np.int64(PRIMES[1]), np.int64(PRIMES[2])
 _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
 
@@ -37,7 +37,7 @@ class Grid(NamedTuple):
     table: ndarray
     """float32 [rows * 8], flat."""
     weights: ndarray
-    """float32 [levels]; levels of weight 0 are not touched."""
+    """float32 [levels]; levels of weight 0 are skipped."""
     resolutions: ndarray
     """int64 [levels]."""
     offsets: ndarray
@@ -59,7 +59,7 @@ def clamped(x):
 
 @part
 def inside(x):
-    """1 where `clamped` is the identity, else 0: its derivative."""
+    """Derivative of `clamped`: 1 where it is the identity, else 0."""
     return _ONE if -_ONE <= x <= _ONE else _ZERO
 
 
@@ -74,7 +74,7 @@ def along(x, resolution):
 
 @part
 def eased(t, smooth):
-    """`t` and its slope 1, or with `smooth` = 1 (instead of 0) smoothstep `3 t^2 - 2 t^3` and its slope."""
+    """For `smooth` = 0, `t` and its slope 1; for `smooth` = 1, smoothstep `3 t^2 - 2 t^3` and its slope."""
     bent = t * t * (np.float32(3) - np.float32(2) * t)
     return t + smooth * (bent - t), _ONE + smooth * (np.float32(6) * t * (_ONE - t) - _ONE)
 
@@ -116,7 +116,7 @@ def locate(px, py, pz, level):
 
 @part
 def level_of(grid, level):
-    """What `locate` needs to know of a level."""
+    """The description of a level that `locate` needs."""
     return grid.resolutions[level], grid.offsets[level], grid.sizes[level], grid.hashed[level]
 
 
@@ -161,7 +161,7 @@ def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
 def encode(grid, p, start, count, e, depth, used, jac, want_jacobian):
     """Encode points `start .. start + count` of `p` [n, 3] into `e`, and their derivatives into `jac`.
 
-    Columns from `used` (see `Network`) up to the next multiple of 16 are zero, further ones are left as they are.
+    Columns from `used` (see `Network`) up to the next multiple of 16 are zero, later ones are left unchanged.
     """
     end = min((used + 15) // 16 * 16, depth)
     for i in range(count):

@@ -18,7 +18,7 @@ class Weights(NamedTuple):
     """The MLP's weights, or their gradients, in the kernels' layout; all flat float32.
 
     `first` [depth, hidden] (row 3: bias), `middle` [layers - 1, hidden, hidden] (input, output), `bias`
-    [layers - 1, hidden], `last` [hidden + 1] (its bias last). Widths are padded to multiples of 16.
+    [layers - 1, hidden], `last` [hidden + 1] (its bias at the end). Widths are padded to multiples of 16.
     """
 
     first: ndarray
@@ -43,7 +43,7 @@ class Network(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Buffers of one thread for one chunk; [POINTS, width] each, those of the layers stacked."""
+    """Buffers of one thread for one chunk; [POINTS, width] each; those of the layers are stacked."""
 
     e: ndarray
     """Encoded points."""
@@ -52,21 +52,21 @@ class Scratch(NamedTuple):
     a: ndarray
     """Activations of each layer."""
     t: ndarray
-    """Where on the activation's corner they are, 0 .. 1; see `activate`."""
+    """Their position on the activation's corner, 0 .. 1; see `activate`."""
     u: ndarray
     """Derivative of f with respect to each layer's pre-activations."""
     h: ndarray
-    """The same with respect to its activations."""
+    """The same with respect to each layer's activations."""
     z_dot: ndarray
     """Directional derivative of each layer's pre-activations."""
     a_dot: ndarray
-    """The same of its activations."""
+    """The same of each layer's activations."""
     e_dot: ndarray
     """The same of the encoded points."""
     d: ndarray
     """Adjoint of the current layer's pre-activations."""
     d2: ndarray
-    """The one of the layer before it."""
+    """The same of the layer before it."""
     de: ndarray
     """Adjoint of the encoded points."""
     ue: ndarray
@@ -87,7 +87,7 @@ def slope(t):
 
 @part
 def activate(z, at, bias, rows, hidden, knee, with_bias):
-    """Replace `z + bias` by `knee(z)`, and put the place on the corner into `at`.
+    """Replace `z + bias` by `knee(z)`, and store the position on the corner in `at`.
 
     With `t = clamp((z + w) / 2 w, 0, 1)` the slope is smoothstep, `3 t^2 - 2 t^3`, and `knee(z) = w t^3 (2 - t) +
     max(z - w, 0)`: 0 below -w, z above w, twice continuously differentiable.

@@ -14,7 +14,7 @@ from sl_nerfstudio.field.kernels.simd import FEATURES
 
 
 def pack_grid(layout: GridLayout, state: FieldState) -> Grid:
-    """The grid; the table is shared, not copied."""
+    """The grid for the kernels; the table is shared, not copied."""
     return Grid(
         table=state.table.detach().numpy().reshape(-1),
         weights=state.level_weights.numpy(),
@@ -31,7 +31,7 @@ def pack_network(layout: GridLayout, state: FieldState, knee: float) -> Network:
     matrices, biases = [w.detach().numpy() for w in state.mlp[0::2]], [b.detach().numpy() for b in state.mlp[1::2]]
     width, layers = matrices[0].shape[0], len(matrices) - 1
     depth, hidden = _padded(FIRST + layout.width), _padded(width)
-    first = np.zeros((hidden, depth), np.float32)  # (output, input), as torch has it
+    first = np.zeros((hidden, depth), np.float32)  # (output, input), as in torch
     first[:width, :3] = matrices[0][:, :3]
     first[:width, 3] = biases[0]
     first[:width, FIRST : FIRST + layout.width] = matrices[0][:, 3:]
@@ -57,7 +57,7 @@ def pack_network(layout: GridLayout, state: FieldState, knee: float) -> Network:
 
 
 def zero_gradients(network: Network) -> Weights:
-    """Gradients of the MLP, to be summed up."""
+    """Gradients of the MLP, initially zero, for kernels to add to."""
     return Weights(*(np.zeros_like(w) for w in network.weights))
 
 

@@ -1,7 +1,7 @@
 """Kernels over the marked rows of the table: clear a gradient, and Adam.
 
-A batch of points marks a small part of the rows, scattered all over: what costs time is waiting for memory, so the
-marked rows are listed first, and asked for before their turn.
+A batch of points marks a small part of the rows, scattered throughout the table. Most of the time is spent waiting for
+memory, so the marked rows are listed first and prefetched before they are used.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ _ONE, _ZERO = np.float32(1), np.float32(0)
 
 @part
 def list_marked(marks, start, stop, rows):
-    """Take marks away, from `start` on, until `rows` is full; gives the number of rows and where to go on."""
+    """List and clear marks, from `start` on, until `rows` is full; returns the number of rows and where to continue."""
     words, n, row = marks.view(np.int64), 0, start
     while row < stop and n <= len(rows) - 8:
         if words[row // 8] != 0:
@@ -31,7 +31,7 @@ def list_marked(marks, start, stop, rows):
 
 @kernel
 def clear(gradient, marks, start, stop, rows):
-    """Zero the marked rows `start .. stop` of a flat gradient, and their marks; `start` is a multiple of 8."""
+    """Zero the marked rows in `start .. stop` of a flat gradient, and their marks; `start` is a multiple of 8."""
     while start < stop:
         n, start = list_marked(marks, start, stop, rows)
         for k in range(n):
@@ -46,7 +46,7 @@ def adam(table, gradient, moments, steps, marks, start, stop, rows, corrections,
     """One step of Adam for every marked row whose gradient is not exactly zero; clears the gradient and the marks.
 
     `moments` [row, 2, 8], flat: mean and mean square of the gradient. `steps` counts the steps of each row, and
-    `corrections[t]` holds what step t's mean, and the root of its mean square, are multiplied with.
+    `corrections[t]` holds the factors of step t's mean and of the root of its mean square.
     """
     last = len(corrections) - 1
     while start < stop:

@@ -20,7 +20,7 @@ from numba.extending import intrinsic as _intrinsic
 
 from sl_nerfstudio.field import hash_grid
 
-intrinsic: Any = _intrinsic  # callers pass the arguments without the typing context; type checkers cannot know
+intrinsic: Any = _intrinsic  # callers omit the typing context, which type checkers cannot know
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 FEATURES = 8
 """Numbers per table row: one vector."""
@@ -29,14 +29,14 @@ WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 """Shape of a tile: up to 3 vectors of WIDTH numbers times ROWS rows (24 of 32 registers, or 12 of 16)."""
 
 
-_njit: Any = njit  # its overloads do not know of options in a dictionary
+_njit: Any = njit  # its overloads do not accept options in a dictionary
 _OPTIONS = {"nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile with numba as a part of kernels: cannot be called from Python.
+    """Compile a function for use in kernels with numba; it cannot be called from Python.
 
-    Run-time type checkers wrap functions before this decorator sees them; numba wants the bare one.
+    Run-time type checkers wrap functions before this decorator sees them, but numba needs the unwrapped one.
     """
     return _njit(inspect.unwrap(function), no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 
@@ -55,7 +55,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 @lru_cache(maxsize=1)
 def _sources() -> str:
-    """Digest of all that compiled kernels are made from."""
+    """Digest of all sources of the compiled kernels."""
     files = [*sorted(Path(__file__).parent.glob("*.py")), Path(hash_grid.__file__)]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
@@ -184,7 +184,7 @@ def _lerp(builder: Any, a: Any, b: Any, t: Any) -> tuple[Any, Any]:
 
 @intrinsic
 def prefetch(typing: Any, table: Any, positions: Any):
-    """Ask for what lies at some positions of an array, to be read or written soon."""
+    """Prefetch some positions of an array, to be read or written soon."""
     signature = types.void(table, positions)
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -221,7 +221,7 @@ def gather(typing: Any, table: Any, corners: Any, t: Any, weight: Any, out: Any,
 
 @intrinsic
 def gather_jacobian(typing: Any, table: Any, corners: Any, t: Any, weight: Any, out: Any, position: Any, slope: Any, jacobian: Any, at: Any, stride: Any):  # fmt: skip  # noqa: E501
-    """As `gather`, and `jacobian[at + axis * stride:] = slope[axis] * d trilinear / d t[axis]` for the three axes."""
+    """`gather`, and also `jacobian[at + axis * stride:] = slope[axis] * d trilinear / d t[axis]` for all three axes."""
     signature = types.void(table, corners, t, types.float32, out, types.int64, slope, jacobian, types.int64, types.int64)  # fmt: skip  # noqa: E501
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:

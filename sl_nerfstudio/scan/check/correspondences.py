@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.spacing import evenly_spaced
 
 SAMPLES = 400  # per frame; enough for a median, few enough to try dozens of interpretations
 
@@ -28,6 +29,6 @@ def sample_pixels(
 ) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
     """Pixel centres and coordinates at SAMPLES pixels spread evenly over `where` (some twice if it has fewer)."""
     flat = np.flatnonzero(where)
-    chosen = flat[np.linspace(0, len(flat) - 1, SAMPLES).round().astype(np.int64)]
+    chosen = flat[evenly_spaced(len(flat), SAMPLES)]
     rows, columns = np.divmod(chosen, where.shape[1])
     return np.stack([columns, rows], -1) + 0.5, coords.reshape(-1, 2)[chosen].astype(np.float64)
