@@ -142,6 +142,8 @@ def _removed(trimmed: "Trimmed | None") -> list[str]:
         if count
     ]
     lines = [f"  removed, of {trimmed.total:,} vertices: {', '.join(gone) or 'nothing'} (--keep-unobserved keeps them)"]
+    if trimmed.closed:
+        lines.append(f"  kept, though no frame observed them: {trimmed.closed:,} vertices in small gaps")
     if trimmed.residual_px == trimmed.residual_px:
         lines.append(f"  predicted and decoded pattern coordinates differ by {trimmed.residual_px:.2g} px (median)")
     if trimmed.residual_px > _SUSPICIOUS_PX:

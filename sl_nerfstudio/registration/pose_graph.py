@@ -24,7 +24,6 @@ class PoseGraphSolution:
 
     S_world_camera: Nodes
     consistent: Bool[ndarray, "edges"]  # edges that agree with the solution
-    chi2: Float64[ndarray, "edges"]  # infinite where an end has no pose
 
 
 def optimise_pose_graph(
@@ -42,11 +41,11 @@ def optimise_pose_graph(
     nodes = best_tree(edges, pivots, root, strength, weight, settings)
     inside = np.array([nodes[e.source] is not None and nodes[e.target] is not None for e in edges], dtype=bool)
     connected = [e for e, here in zip(edges, inside, strict=True) if here]
-    chi2 = np.full(len(edges), np.inf)
+    chi2 = np.full(len(edges), np.inf)  # stays infinite where an end has no pose
     if connected:
         nodes = _optimised(connected, nodes, pivots, root, weight[inside], settings)
         chi2[inside] = chi_square(connected, nodes, pivots)
-    return PoseGraphSolution(nodes, chi2 < settings.rejection_factor * settings.kernel_chi2, chi2)
+    return PoseGraphSolution(nodes, chi2 < settings.rejection_factor * settings.kernel_chi2)
 
 
 def _optimised(

@@ -15,6 +15,7 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.decoding.graycode.subcell import LEVELS, Cells, subcell_coordinates
 from sl_nerfstudio.decoding.regions import drop_small_regions
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
 from sl_nerfstudio.scan.images import as_grey
 
@@ -94,7 +95,7 @@ def separate(images: Sequence[Image], layout: GrayCode) -> Light:
             if k >= fine:
                 highest = np.maximum(highest, np.maximum(p, q))
                 lowest = np.minimum(lowest, np.minimum(p, q))
-    noise = 1.4826 / 2 * float(np.median(np.abs(sums[0] - sums[1])))
+    noise = MAD_TO_SIGMA / 2 * float(np.median(np.abs(sums[0] - sums[1])))
     ambient = 2 * np.clip(lowest - as_grey(images[1]), 0, None)
     return Light(highest - lowest, ambient, signal / sum(layout.bits), noise)
 

@@ -34,7 +34,6 @@ class Assignment:
 
     turn: int  # clockwise
     place: Int32[ndarray, "n 2"]  # (row, column); -1 where unknown
-    piece: Int32[ndarray, "n"]  # index of the connected piece; -1 where unknown
 
     @property
     def known(self) -> Bool[ndarray, "n"]:
@@ -75,7 +74,7 @@ def agree(
     for _ in range(_GROWTH):
         place = _grow(place, graph.neighbour, codes.shape)
     place = _without_contradicted(place, graph, codes)
-    return Assignment(turn, place, _pieces(place, graph.neighbour))
+    return Assignment(turn, place)
 
 
 def _without_contradicted(
