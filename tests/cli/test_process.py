@@ -1,4 +1,4 @@
-"""sl-process as a person runs it: from photographs to a scan folder, and what it says where it cannot."""
+"""sl-process on the command line: from photographs to a scan folder, and its error messages."""
 
 import json
 import shutil
@@ -135,7 +135,7 @@ def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path
         assert scan.frames[0].read_image().ndim == 3 and scan.frames[1].read_image().dtype == np.uint16
         up = scan.T_world_camera[:, :3, 1]
         assert up[0] @ up[1] > 0.5
-        assert up[0] @ up[2] < -0.5  # the third camera stands on its head
+        assert up[0] @ up[2] < -0.5  # the third camera is upside down
 
 
 def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_found(

@@ -1,4 +1,4 @@
-"""Captures of ramps on a synthetic object: two small images a frame, decoded in no time and almost exactly."""
+"""Captures of ramps on a synthetic object: two small images per frame, decoded quickly and almost exactly."""
 
 import json
 from dataclasses import dataclass
