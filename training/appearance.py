@@ -1,4 +1,4 @@
-"""Random light, texture, lens and sensor: from a surface and its pattern to what a camera delivers."""
+"""Random light, texture, lens and sensor: from a surface and its pattern to the image of a camera."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from training.surfaces import Surface
 
 @dataclass(frozen=True)
 class Difficulty:
-    """How far the disturbances reach: 1 is everything that a capture may suffer, 0 a clean one."""
+    """How strong each kind of disturbance is: 1 is as bad as a capture may get, 0 is a clean one."""
 
     texture: float
     light: float
@@ -23,14 +23,14 @@ class Difficulty:
 
 
 def random_difficulty(rng: np.random.Generator) -> Difficulty:
-    """Each kind of disturbance by itself, weak ones more often."""
+    """Independent for each kind of disturbance; weak ones are more frequent."""
     return Difficulty(*(float(value) for value in rng.random(4) ** 1.7))
 
 
 def illuminate(
     rng: np.random.Generator, surface: Surface, pattern: DrawnPattern, hard: Difficulty
 ) -> Float32[ndarray, "n n"]:
-    """Light that leaves the surface; 1 is a white one in the full light of the projector."""
+    """Light that leaves the surface; 1 is a white surface in the full light of the projector."""
     place = ((surface.coords + 0.5) * pattern.period - 0.5).astype(np.float32)
     lines = cv2.remap(pattern.picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     leak = np.float32(rng.uniform(0, 0.08))
@@ -50,7 +50,7 @@ def _small(image: Float32[ndarray, "n n"]) -> Float32[ndarray, "m m"]:
 
 
 def _albedo(rng: np.random.Generator, surface: Surface, hard: float) -> Float32[ndarray, "n n"]:
-    """Blotches, fine grain, stripes and printed patches, other ones on each layer."""
+    """Blotches, fine grain, stripes and printed patches, different on each layer."""
     n = len(surface.layer)
     albedo = np.exp(rng.uniform(0.05, 0.1 + 0.35 * hard) * smooth_field(rng, n, int(rng.integers(2, 10))))
     if rng.random() < 0.3 + 0.4 * hard:
@@ -70,13 +70,13 @@ def _albedo(rng: np.random.Generator, surface: Surface, hard: float) -> Float32[
 def photograph(
     rng: np.random.Generator, light: Float32[ndarray, "n n"], size: int, sampling: int, hard: Difficulty
 ) -> Float32[ndarray, "s s"]:
-    """Lens, exposure, noise and rounding; the camera's own pixels may be larger or smaller than the view's.
+    """Lens, exposure, noise and rounding; the camera's pixels may be larger or smaller than those of the result.
 
-    The decoder shrinks or enlarges a capture until its grid has a fixed period, so that noise and sharpness
-    depend on how fine the camera saw it: `native` is the size of the view's pixel in the camera's.
+    The decoder scales a capture until its grid has a fixed period, so noise and sharpness depend on the resolution of
+    the camera: `native` is the size of a pixel of the result in pixels of the camera.
     """
     native = log_uniform(rng, 0.55, 2.0)
-    own = max(8, round(size * min(native, 1.0)))  # finer cameras are averaged: only their noise is less
+    own = max(8, round(size * min(native, 1.0)))  # finer cameras are averaged, which only reduces their noise
     blurred = _lens(rng, light, sampling, hard.blur)
     image = cv2.resize(blurred, (own, own), interpolation=cv2.INTER_AREA)
     exposure = log_uniform(rng, 0.25, 1.5) if rng.random() < 0.8 else log_uniform(rng, 1.5, 3.5)
@@ -106,7 +106,7 @@ def _lens(
 
 
 def _speckle(rng: np.random.Generator, signal: Float32[ndarray, "n n"], hard: float) -> Float32[ndarray, "n n"]:
-    """A laser's grain: multiplies the light, by spots of about a pixel."""
+    """Laser speckle: multiplies the light, in spots of about a pixel."""
     if rng.random() > 0.3 + 0.5 * hard:
         return signal
     grain = rng.standard_normal(signal.shape, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Random captures with their truth, as the U-Net is trained on them; a second takes about fifty."""
+"""Random captures with their truth, for training the U-Net; about twenty per second."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _SAMPLING = 2
 
 @dataclass(frozen=True)
 class Capture:
-    """A view of s x s pixels, and the truth at every second place (where four pixels meet)."""
+    """An image of s x s pixels, and the truth at every second place (where four pixels meet)."""
 
     channels: Float32[ndarray, "2 s s"]
     lit: Bool[ndarray, "h h"]
@@ -31,7 +31,7 @@ def random_capture(rng: np.random.Generator, stock: PatternStock, size: int) -> 
     surface, pattern, hard = random_surface(rng, size, _SAMPLING, CELLS), stock.pick(), random_difficulty(rng)
     light = illuminate(rng, surface, pattern, hard)
     view = photograph(rng, light, size, _SAMPLING, hard)
-    bright = float(np.quantile(view, 0.995)) * log_uniform(rng, 0.9, 2.5)  # other places of the image may be brighter
+    bright = float(np.quantile(view, 0.995)) * log_uniform(rng, 0.9, 2.5)  # other parts of the image may be brighter
     coords, lit, certain = _at_corners(surface)
     node = np.clip(np.rint(coords), 0, CELLS - 1).astype(np.int64)
     return Capture(network_channels(view, bright), lit, certain, coords, pattern.codes[node[..., 1], node[..., 0]])

@@ -24,19 +24,19 @@ class Config:
     output: Path
     """folder of the weights and the log"""
     steps: int = 500
-    """number of steps, a damaged graph each"""
+    """number of steps, one damaged graph each"""
     nodes: int = 320
     """nodes of a graph that are judged in a step"""
     candidates: int = 640
-    """other places of the pattern that they are told from, besides the places of those nodes"""
+    """other places of the pattern among which they must find their own"""
     rate: float = 2e-3
     """highest learning rate, of AdamW"""
     seed: int = 0
-    """graphs and starting weights follow from it"""
+    """determines graphs and initial weights"""
     threads: int = 1
     """processor threads"""
     log_every: int = 50
-    """steps between two lines of the log"""
+    """steps per line of the log"""
 
 
 def step_loss(
@@ -56,14 +56,14 @@ def step_loss(
 
 
 def _candidate_index(graph: DamagedGraph, pattern: TurnedPattern) -> np.ndarray:
-    """Number of each node's true place among all candidates."""
+    """Index of each node's true place among all candidates."""
     same_turn = np.nonzero(pattern.turn == graph.turn)[0]
     columns = int(pattern.place[same_turn, 1].max()) + 1
     return same_turn[0] + graph.place[:, 0] * columns + graph.place[:, 1]
 
 
 def _candidate_features(network: GraphNetwork, pattern: TurnedPattern, chosen: np.ndarray) -> torch.Tensor:
-    """Features of some places: only their neighbours, and the neighbours' neighbours, are computed."""
+    """Features of some places, computed from their neighbours and the neighbours' neighbours only."""
     seen = pattern.around[chosen]
     needed = np.unique(np.concatenate([chosen, seen[seen >= 0]]))
     outer = pattern.around[needed]

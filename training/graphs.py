@@ -1,4 +1,4 @@
-"""Random damaged grid graphs: what is left of a pattern's nodes after occlusion, misreading and wrong joining."""
+"""Random damaged grid graphs: nodes of a pattern after occlusion, misread symbols and wrong edges."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from sl_nerfstudio.pattern.codes import SYMBOLS, rotate_codes
 
 @dataclass(frozen=True)
 class Damage:
-    """Shares of nodes and edges that suffer."""
+    """Shares of nodes and edges that are damaged."""
 
     misread: float  # nodes whose most probable symbol is wrong
     missing: float  # nodes not found
@@ -23,7 +23,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class DamagedGraph:
-    """A graph as `decoding.graph` would find it, and where its nodes truly are."""
+    """A graph as `decoding.grid.graph` would find it, and the true places of its nodes."""
 
     score: Float32[ndarray, "n 5"]
     neighbour: Int32[ndarray, "n 4"]
@@ -31,12 +31,12 @@ class DamagedGraph:
     place: Int32[ndarray, "n 2"]  # true (row, column) in the turned array
 
     def as_grid(self) -> GridGraph:
-        """The graph alone; places in an image mean nothing here."""
+        """The graph alone; its places in the image have no meaning here."""
         return GridGraph(self.place[:, ::-1].astype(np.float32), self.neighbour, self.score)
 
 
 def random_damage(rng: np.random.Generator) -> Damage:
-    """From hardly any to more than can be put right."""
+    """From hardly any damage to more than can be corrected."""
     return Damage(
         float(rng.uniform(0, 0.45)), float(rng.uniform(0, 0.4)), float(rng.uniform(0, 0.1)), bool(rng.random() < 0.4)
     )
@@ -64,18 +64,18 @@ def damage_graph(
 
 
 def soft_scores(rng: np.random.Generator, symbol: Int8[ndarray, "n"], misread: float) -> Float32[ndarray, "n 5"]:
-    """Probabilities as a network gives them: rather certain where right, less where wrong, not always so."""
+    """Probabilities like those of a network: usually high where it is right, and lower where it is wrong."""
     n = len(symbol)
     wrong = rng.random(n) < misread
     read = np.where(wrong, (symbol + rng.integers(1, SYMBOLS, n)) % SYMBOLS, symbol)
-    # misreading goes with doubt, but how clearly differs from image to image
-    telling = rng.uniform(0.2, 1.0)
-    doubt = np.clip(rng.beta(1.2, 3.0, n) + telling * wrong * rng.beta(2.0, 2.0, n), 0, 1)
+    # Misread symbols are less certain, by an amount that differs from image to image.
+    contrast = rng.uniform(0.2, 1.0)
+    uncertainty = np.clip(rng.beta(1.2, 3.0, n) + contrast * wrong * rng.beta(2.0, 2.0, n), 0, 1)
     rest = rng.dirichlet(np.full(SYMBOLS, 0.6), n)
     rest[np.arange(n), symbol] += wrong * rng.random(n) * 0.7  # the truth is often the second choice
     rest[np.arange(n), read] = 0
     rest /= np.maximum(rest.sum(-1, keepdims=True), 1e-9)
-    score = rest * (0.6 * doubt)[:, None]
+    score = rest * (0.6 * uncertainty)[:, None]
     score[np.arange(n), read] = 0
     others = score.max(-1)
     score[np.arange(n), read] = np.maximum(1 - score.sum(-1), others + 1e-3)
@@ -96,7 +96,7 @@ def _numbered(seen: Bool[ndarray, "rows columns"]) -> Int32[ndarray, "rows colum
 def _with_tear(
     rng: np.random.Generator, seen: Bool[ndarray, "rows columns"]
 ) -> tuple[Int32[ndarray, "rows columns"], Int32[ndarray, "n 2"]]:
-    """Beyond a curved line, nodes show another part of the pattern than their neighbours on this side expect."""
+    """On one side of a curved line, nodes belong to another part of the pattern than those on the other side."""
     rows, columns = seen.shape
     i, j = np.mgrid[:rows, :columns]
     line = rng.uniform(0.25, 0.75) * columns + 3 * np.sin(i * rng.uniform(0.1, 0.6)) + rng.uniform(-0.5, 0.5) * i

@@ -1,4 +1,4 @@
-"""Smooth random fields on a square grid, the material of surfaces and textures."""
+"""Smooth random fields on a square grid, from which surfaces and textures are made."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ from numpy import ndarray
 
 
 def smooth_field(rng: np.random.Generator, size: int, knots: int) -> Float32[ndarray, "n n"]:
-    """Random values of unit spread at `knots` x `knots` places, smoothly interpolated on `size` x `size`."""
+    """Random values of unit variance at `knots` x `knots` places, smoothly interpolated to `size` x `size`."""
     coarse = rng.standard_normal((knots + 3, knots + 3)).astype(np.float32)
     step, start = knots / size, rng.uniform(0.5, 1.5, 2)
     place = np.array([[step, 0, start[0]], [0, step, start[1]]], dtype=np.float32)
@@ -15,5 +15,5 @@ def smooth_field(rng: np.random.Generator, size: int, knots: int) -> Float32[nda
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A random number whose logarithm is even between those of `low` and `high`."""
+    """A random number whose logarithm is uniform between those of `low` and `high`."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))

@@ -1,4 +1,4 @@
-"""A stock of random grid patterns, so that no network learns one code array by heart."""
+"""A stock of random grid patterns, so that no network memorises a code array."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
 
 
 class PatternStock:
-    """Patterns to draw from; one of them is replaced at every `renew`."""
+    """Patterns to choose from; each `renew` replaces one of them."""
 
     def __init__(self, rng: np.random.Generator, count: int) -> None:
         self._rng = rng

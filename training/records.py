@@ -1,4 +1,4 @@
-"""What both trainings keep: a log with a line for every so many steps, and weights that say how they were made."""
+"""The output of both trainings: a log, and weights whose metadata say how they were trained."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from torch import nn
 
 
 def cosine_rate(highest: float, step: int, steps: int, warm_up: int) -> float:
-    """Learning rate of a step: up over `warm_up` steps, then by a cosine down to zero."""
+    """Learning rate of a step: it rises over `warm_up` steps, then falls to zero along a cosine."""
     return highest * min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 

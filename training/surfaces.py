@@ -1,8 +1,8 @@
-"""Random surfaces as a camera sees them: which place of the pattern falls on each pixel.
+"""Random surfaces as a camera sees them: which point of the pattern lights each pixel.
 
-Nothing is traced. A surface is a coordinate field: an affine map (distance, roll, foreshortening) with perspective,
-lens or diffraction distortion, and relief along one direction, as parallax has it. Several such fields lie over
-each other with sharp borders, shadows beside them, and holes.
+No ray is traced. A surface is a coordinate field: an affine map (distance, roll, foreshortening) with perspective, lens
+or diffraction distortion, and relief that shifts coordinates in one direction, like parallax. Several such fields lie
+on top of each other, with sharp borders, shadows beside them, and holes.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from numpy import ndarray
 
 from training.noise_fields import log_uniform, smooth_field
 
-LARGEST_ROLL = np.radians(40.0)  # what is left after the decoder has turned the image
+LARGEST_ROLL = np.radians(40.0)  # that remains after the decoder has turned the image
 PERIODS = (8.5, 24.0)  # pixels, before foreshortening
-_SHORTEST = 4.5  # pixels a period may measure at the steepest places
+_SHORTEST = 4.5  # period at the steepest places, pixels
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Surface:
 
 
 def random_surface(rng: np.random.Generator, size: int, sampling: int, cells: int) -> Surface:
-    """A view of `size` pixels, `sampling` places a pixel along each side, of a pattern of `cells` periods a side."""
+    """`size` pixels per side, `sampling` samples per pixel and direction, of a pattern of `cells` periods per side."""
     n = size * sampling
     place = ((np.arange(n, dtype=np.float32) + 0.5) / sampling) - size / 2
     x, y = np.meshgrid(place, place)
@@ -57,7 +57,7 @@ def random_surface(rng: np.random.Generator, size: int, sampling: int, cells: in
 
 
 def _random_jacobian(rng: np.random.Generator) -> Float32[ndarray, "2 2"]:
-    """Periods a pixel: image (x, y) to pattern (x, y)."""
+    """Periods per pixel: from image (x, y) to pattern (x, y)."""
     period = log_uniform(rng, *PERIODS)
     roll = np.clip(rng.normal(0, np.radians(16.0)), -LARGEST_ROLL, LARGEST_ROLL)
     steepest = max(period / _SHORTEST, 1.0)
@@ -66,7 +66,7 @@ def _random_jacobian(rng: np.random.Generator) -> Float32[ndarray, "2 2"]:
 
 
 def _nearby(rng: np.random.Generator, jacobian: Float32[ndarray, "2 2"]) -> Float32[ndarray, "2 2"]:
-    """The map of another surface in the same view: other slopes, much the same distance and roll."""
+    """The map of another surface in the same image: other slopes, nearly the same distance and roll."""
     turn = _rotation(rng.normal(0, np.radians(5.0)))
     steep = np.exp(abs(rng.normal(0, 0.25)))
     return (turn @ jacobian @ _stretch(rng.uniform(0, np.pi), steep) * np.exp(rng.normal(0, 0.08))).astype(np.float32)
@@ -126,7 +126,7 @@ def _relief(
 def _shading(
     rng: np.random.Generator, height: Float32[ndarray, "n n"], largest: float, n: int
 ) -> Float32[ndarray, "n n"]:
-    """Light on the slopes, as if it came from a random side, and a slow change across the view."""
+    """Light on the slopes, as if it came from a random direction, and a slow change across the image."""
     gy, gx = np.gradient(height)
     angle = rng.uniform(0, 2 * np.pi)
     slope = (np.cos(angle) * gx + np.sin(angle) * gy) / largest
@@ -153,7 +153,7 @@ def _random_shape(
 
 
 def _shadow(rng: np.random.Generator, shape: Bool[ndarray, "n n"], sampling: int) -> Bool[ndarray, "n n"]:
-    """What a shape hides from the projector: itself, moved aside."""
+    """The shadow of a shape in the projector's light: the shape itself, shifted."""
     if rng.random() < 0.3:
         return np.zeros_like(shape)
     shift = rng.normal(0, 12 * sampling, 2)
@@ -163,5 +163,5 @@ def _shadow(rng: np.random.Generator, shape: Bool[ndarray, "n n"], sampling: int
 
 
 def _holes(rng: np.random.Generator, n: int) -> Bool[ndarray, "n n"]:
-    """Patches that send no light back: dark spots, gloss, dust."""
+    """Patches that reflect no light: dark spots, gloss, dust."""
     return smooth_field(rng, n, int(rng.integers(8, 24))) > rng.uniform(1.2, 2.2)

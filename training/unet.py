@@ -2,7 +2,7 @@
 
     python -m training.unet --output outputs/training/unet
 
-writes the weights as safetensors and a log; a run that was broken off goes on from its last checkpoint.
+writes the weights as safetensors and a log; an interrupted run continues from its last checkpoint.
 """
 
 import math
@@ -36,19 +36,19 @@ class Config:
     output: Path
     """folder of weights, checkpoint and log"""
     steps: int = 4000
-    """number of steps; the learning rate falls to zero over all of them, by a cosine"""
+    """number of steps, over which the learning rate falls to zero along a cosine"""
     batch: int = 8
-    """captures a step"""
+    """captures per step"""
     size: int = 160
     """width and height of a capture, pixels"""
     rate: float = 3e-3
     """highest learning rate, of AdamW"""
     seed: int = 0
-    """captures and starting weights follow from it"""
+    """determines captures and initial weights"""
     threads: int = 1
-    """processor threads of torch; captures are made in one more"""
+    """processor threads of torch; one more generates captures"""
     log_every: int = 50
-    """steps between two lines of the log"""
+    """steps per line of the log"""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def stack(captures: list[Capture]) -> Batch:
 
 
 def losses(output: NetworkOutput, batch: Batch) -> dict[str, Tensor]:
-    """Mask, phase and symbol; the last two where the pattern falls and is not torn."""
+    """Mask, phase and symbol; the last two only where the pattern is visible on a single surface."""
     total = batch.weight.sum().clamp(min=1.0)
     mask = F.binary_cross_entropy_with_logits(output.mask, batch.lit, reduction="none")
     phase = F.smooth_l1_loss(output.phase, batch.phase, reduction="none", beta=0.2).sum(1)
@@ -97,7 +97,7 @@ def losses(output: NetworkOutput, batch: Batch) -> dict[str, Tensor]:
 
 
 def figures(output: NetworkOutput, batch: Batch) -> dict[str, float]:
-    """What a person wants to know: symbols misread at nodes, mask wrong (shares), phase error (periods)."""
+    """Figures for the log: shares of symbols misread at nodes and of wrong mask pixels, phase errors in periods."""
     with torch.no_grad():
         at_node = (batch.weight * batch.node) > 0
         right = output.symbol.argmax(1) == batch.symbol
@@ -113,7 +113,7 @@ def figures(output: NetworkOutput, batch: Batch) -> dict[str, float]:
 
 
 def batches(config: Config, first: int) -> Iterator[Batch]:
-    """The batches of steps `first` to the last; the next one is made while the last one is learned from."""
+    """The batches of steps `first` to the last; each is generated while the one before is used."""
     stock = PatternStock(np.random.default_rng([config.seed, 1, first]), 24)
 
     def make(step: int) -> Batch:
@@ -169,7 +169,7 @@ def _save(config: Config, step: int, network: UNet, optimizer: torch.optim.Optim
 
 
 def _resume(config: Config, network: UNet, optimizer: torch.optim.Optimizer) -> int:
-    """The step to begin with: 0, or where the checkpoint in the output folder stands."""
+    """The first step: 0, or that of the checkpoint in the output folder."""
     path = config.output / "checkpoint.pt"
     if not path.exists():
         return 0

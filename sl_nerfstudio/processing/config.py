@@ -16,8 +16,7 @@ class ProcessConfig:
     pattern: Path
     """pattern.json of the projected pattern, as written by sl-pattern or sl-synth"""
     intrinsics: Path
-    """file of the camera, and of the projector unless that has a file itself: .json, OpenCV .yml .xml, COLMAP
-    cameras.txt"""
+    """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt"""
     output: Path
     """scan folder to write; it must be new or empty"""
     projector_intrinsics: Path | None = None

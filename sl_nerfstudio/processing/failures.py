@@ -21,15 +21,17 @@ REPORT = "processing.html"
 _LISTED = 20  # frames in a message
 
 
-def too_few_frames(result: ProcessResult, make_report: Callable[[ProcessResult, Sequence[Preview]], str]) -> UserError:
-    """The error of a run with fewer than two usable frames; its report goes to the work folder."""
+def too_few_frames(
+    result: ProcessResult, usable: int, make_report: Callable[[ProcessResult, Sequence[Preview]], str]
+) -> UserError:
+    """The error of a run in which fewer than two frames are usable; its report goes to the work folder."""
     config = result.config
     path = config.work_folder / REPORT
     write_atomic(path, make_report(result, [Preview(None, None)] * len(result.frames)).encode())
     lost = [frame for frame in result.frames if not frame.in_scan]
     first = lost[0].reason.strip().splitlines()[1:] if lost else []
     return UserError(
-        f"{config.images}: {result.registered} of {len(result.frames)} frames can be used, a scan needs at least "
+        f"{config.images}: {usable} of {len(result.frames)} frames can be used, a scan needs at least "
         f"{FEWEST_FRAMES}\n"
         f"{_listed([f'{f.name}: {first_line(f.reason)}' for f in lost])}\n" + "\n".join(first) + f"\n    report: {path}"
     )

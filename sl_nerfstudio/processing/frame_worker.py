@@ -70,7 +70,7 @@ class FrameWorker:
         except FileError as error:
             return FrameStageResult(frame, stage="reading", reason=str(error))
         except DecodingError as error:
-            return FrameStageResult(frame, stage="decoding", reason=_with_file(frame, error))
+            return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
         share = float(decoded.mask.mean())
         return self.calibrate(FrameStageResult(frame, key, resumed, decoded.rate, share), decoded)
 
@@ -81,7 +81,7 @@ class FrameWorker:
             pose = estimate_relative_pose(*correspondences_of(coords), job.camera, job.projector, job.seed)
             cloud = frame_cloud(result.name, coords, job.camera, job.projector, pose)
         except RelativePoseError as error:
-            return replace(result, cloud=None, stage="calibrating", reason=_with_file(result.frame, error))
+            return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
         return replace(result, cloud=cloud)
 
     def load(self, result: FrameStageResult) -> Decoded:
@@ -94,8 +94,7 @@ class FrameWorker:
             )
         return decoded
 
-
-def _with_file(frame: CapturedFrame, error: UserError) -> str:
-    """The error with the file it is about: the image, or the folder of a sequence."""
-    path = frame.images[0] if len(frame.images) == 1 else frame.images[0].parent
-    return f"{path}: {error}"
+    def _with_file(self, frame: CapturedFrame, error: UserError) -> str:
+        """The error with the file it is about: the image, or the folder of a sequence."""
+        path = frame.images[0].parent if self._job.decoder.sequence else frame.images[0]
+        return f"{path}: {error}"

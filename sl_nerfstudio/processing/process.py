@@ -61,8 +61,9 @@ def _require_clouds(
     config: ProcessConfig, inputs: Inputs, results: Sequence[FrameStageResult], make_report: MakeReport
 ) -> None:
     """Raise UserError if fewer than two frames were decoded and calibrated."""
-    if len(clouds_of(results)) < FEWEST_FRAMES:
-        raise too_few_frames(summarise(config, inputs.job.decoder.name, results, None, None), make_report)
+    usable = len(clouds_of(results))
+    if usable < FEWEST_FRAMES:
+        raise too_few_frames(summarise(config, inputs.job.decoder.name, results, None, None), usable, make_report)
 
 
 def _require_registered(
@@ -73,8 +74,10 @@ def _require_registered(
     make_report: MakeReport,
 ) -> None:
     """Raise UserError if fewer than two frames were registered, or fewer than two of those with given poses."""
-    if registration.registered.sum() < FEWEST_FRAMES:
-        raise too_few_frames(summarise(config, inputs.job.decoder.name, results, registration, None), make_report)
+    usable = int(registration.registered.sum())
+    if usable < FEWEST_FRAMES:
+        result = summarise(config, inputs.job.decoder.name, results, registration, None)
+        raise too_few_frames(result, usable, make_report)
     if inputs.given is not None:
         require_given_poses(config, inputs.given, results, registration)
 

@@ -1,4 +1,4 @@
-"""Intrinsics of every format: the same lens gives the same pixels, whatever the centre of the first pixel is."""
+"""Intrinsics of every format: the same lens gives the same pixels in all of them."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""sl-process as a person runs it: from photographs to a scan folder, and what it says where it cannot."""
+"""sl-process on the command line: from photographs to a scan folder, and its error messages."""
 
 import json
 import shutil
@@ -59,9 +59,10 @@ def test_photographs_become_a_metric_scan_and_a_second_run_decodes_nothing(monke
     for frame, exact in zip(scan.frames, captures.coords, strict=True):
         coords, mask = frame.read_coords(), frame.read_mask()
         both = np.isfinite(coords).all(-1) & np.isfinite(exact).all(-1)
+        error = np.linalg.norm(coords[both] - exact[both], axis=1)
         assert both.sum() > 0.85 * np.isfinite(exact).all(-1).sum()
-        assert np.median(np.linalg.norm(coords[both] - exact[both], axis=1)) < 0.5
-        assert mask.sum() >= np.isfinite(coords).all(-1).sum()
+        assert np.median(error) < 0.5 and (error > 4).mean() < 0.01  # a cell
+        assert mask[np.isfinite(coords).all(-1)].all()
     _assert_poses(scan, captures)
     document = json.loads((out / "processing.json").read_text())
     assert all(frame["in_scan"] and frame["decode_rate"] > 0.8 for frame in document["frames"])
@@ -114,7 +115,7 @@ def test_fewer_than_two_frames_is_an_error_that_names_them_all(monkeypatch, copy
         _spoil(copy.root / "images" / f"pose {k}", np.zeros_like)
     out = tmp_path / "scan"
     said = _fails(monkeypatch, capsys, *copy.flags, "--output", out, "--work", tmp_path / "w", "--jobs", 1)
-    assert "1 of 4 frames can be used, a scan needs at least 2" in said or "0 of 4 frames can be used" in said
+    assert "1 of 4 frames can be used, a scan needs at least 2" in said
     for k in range(3):
         assert f"pose {k}: " in said
     assert "cause:" in said and "remedy:" in said
@@ -134,7 +135,7 @@ def test_colour_16_bit_and_a_camera_held_upside_down(monkeypatch, copy, tmp_path
         assert scan.frames[0].read_image().ndim == 3 and scan.frames[1].read_image().dtype == np.uint16
         up = scan.poses.T_world_camera[:, :3, 1]
         assert up[0] @ up[1] > 0.5
-        assert up[0] @ up[2] < -0.5  # the third camera stands on its head
+        assert up[0] @ up[2] < -0.5  # the third camera is upside down
 
 
 def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_found(

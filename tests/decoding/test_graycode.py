@@ -1,4 +1,4 @@
-"""Gray code: exact coordinates come back, whatever albedo and light; what cannot be read is said."""
+"""Gray code: exact coordinates under any albedo and light, and errors that say what cannot be decoded."""
 
 import os
 from pathlib import Path
@@ -97,7 +97,7 @@ def test_a_turned_camera_makes_no_difference(images, decoded):
         (lambda i: [i[0]] * len(i), "the images are not changing", "again"),
     ],
 )
-def test_what_cannot_be_read_is_said(images, change, problem, remedy):
+def test_sequences_that_cannot_be_decoded_are_explained(images, change, problem, remedy):
     with pytest.raises(DecodingError, match=problem) as caught:
         decode_gray_code(change(images), LAYOUT)
     assert remedy in caught.value.remedy and caught.value.cause

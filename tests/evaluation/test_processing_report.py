@@ -1,4 +1,4 @@
-"""The report of sl-process shows every frame and needs no network."""
+"""The report of sl-process shows every frame, and needs no network."""
 
 import re
 from pathlib import Path
@@ -30,10 +30,12 @@ def test_everything_is_shown_and_escaped():
     image = np.zeros((30, 40), dtype=np.uint8)
     coords = np.full((30, 40, 2), 100, dtype=np.float32)
     previews = [make_preview(image, coords, (800, 800)), Preview(None, None), make_preview(image, None, (800, 800))]
-    page = render_processing_report(_result(frames, recapture=("d: take it again",)), previews)
+    page = render_processing_report(_result(frames, recapture=("d: capture it again",)), previews)
     assert "a&lt;b" in page and "a<b" not in page and "is &lt;black&gt;" in page
-    assert "2 of 3 frames are in the scan; 1 were left out" in page
-    assert "d: take it again" in page and "no: decoding" in page and "remedy: light" in page
+    assert (
+        "2 of 3 frames are in the scan; 1 was left out; its lengths are in mm, known from: baseline of frame 0" in page
+    )
+    assert "d: capture it again" in page and "no: decoding" in page and "remedy: light" in page
     assert page.count("data:image/webp") == 3
     assert "84.500" in page and "93 %" in page and "0.31 px" in page and "1.50 px before and 0.40 px after" in page
     assert 'aria-label="Overlap graph"' in page and "stroke-dasharray" in page

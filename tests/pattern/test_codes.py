@@ -1,4 +1,4 @@
-"""Code arrays: every 3x3 window tells where it is."""
+"""Code arrays: every 3x3 window occurs only once, and differs enough from all others."""
 
 import itertools
 
@@ -67,7 +67,7 @@ def test_same_seed_same_array_and_other_seed_another():
     assert not np.array_equal(code_array(20, 15, 3), code_array(20, 15, 4))
 
 
-def test_an_array_too_large_for_the_margin_still_comes():
+def test_an_array_too_large_for_the_margin_gets_a_lower_one():
     codes = code_array(12, 12, margin=3, turned_margin=3)
     assert hamming_margin(codes, rotations=False) == 3
 
@@ -85,7 +85,7 @@ def test_four_quarter_turns_change_nothing():
     ]
 
 
-def test_windows_in_reading_order():
+def test_windows_are_listed_row_by_row():
     codes = np.arange(20, dtype=np.int8).reshape(4, 5) % 5
     assert windows(codes).shape == (6, 9)
     assert windows(codes)[4].tolist() == codes[1:4, 1:4].ravel().tolist()

@@ -1,4 +1,4 @@
-"""pattern.json: what is written comes back, and faults are named."""
+"""pattern.json: what is written is read back, and faults are named."""
 
 import json
 
@@ -24,7 +24,7 @@ def path(grid, tmp_path):
     return path
 
 
-def test_a_grid_comes_back(grid, path):
+def test_a_grid_is_read_back(grid, path):
     back = read_layout(path)
     assert np.array_equal(back.codes, grid.codes)
     assert np.array_equal(back.render(), grid.render())
@@ -99,7 +99,7 @@ def test_no_description_at_all(path, text):
         read_pattern(path)
 
 
-def test_a_picture_that_is_none(tmp_path):
+def test_files_that_are_no_pictures(tmp_path):
     path = tmp_path / "pattern.png"
     path.write_bytes(b"no image")
     with pytest.raises(UserError, match=r"pattern\.png"):

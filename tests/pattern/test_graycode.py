@@ -9,7 +9,7 @@ from sl_nerfstudio.pattern.files import read_layout, read_pattern
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
 
 
-def test_neighbours_differ_in_one_bit_and_numbers_come_back():
+def test_neighbours_differ_in_one_bit_and_indices_are_recovered():
     cells = np.arange(1 << 11)
     codes = gray(cells)
     assert {int(x).bit_count() for x in codes[1:] ^ codes[:-1]} == {1}
@@ -17,7 +17,7 @@ def test_neighbours_differ_in_one_bit_and_numbers_come_back():
 
 
 @pytest.mark.parametrize("layout", [GrayCode(40, 30, 2), GrayCode(37, 21, 4), GrayCode(1024, 16, 1)])
-def test_the_sequence_spells_the_cell_of_every_pixel(layout):
+def test_the_sequence_encodes_the_cell_of_every_pixel(layout):
     images = list(layout.sequence())
     assert len(images) == layout.images and images[0].min() == 255 and images[1].max() == 0
     for axis, size in ((0, layout.w), (1, layout.h)):
@@ -39,7 +39,7 @@ def test_full_hd_in_cells_of_two_pixels_is_42_images():
     assert (layout.columns, layout.rows, layout.bits, layout.images) == (960, 540, (10, 10), 42)
 
 
-def test_the_description_comes_back(tmp_path):
+def test_the_description_is_read_back(tmp_path):
     path = tmp_path / "pattern.json"
     path.write_bytes(GrayCode(1280, 720, 4).encode())
     assert read_layout(path) == GrayCode(1280, 720, 4)
@@ -55,6 +55,6 @@ def test_the_sequence_is_listed_in_the_description():
     ]  # fmt: skip
 
 
-def test_sizes_that_make_no_sequence():
+def test_sizes_that_cannot_make_a_sequence():
     with pytest.raises(ValueError, match="at least 2 x 2 cells"):
         GrayCode(3, 100, 2)

@@ -1,4 +1,4 @@
-"""Local normalisation: the pattern comes back whatever light, albedo and exposure did to it."""
+"""Local normalisation: the pattern is recovered under any light, albedo and exposure."""
 
 import numpy as np
 import pytest

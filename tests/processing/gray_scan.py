@@ -19,7 +19,7 @@ LAYOUT = GrayCode(800, 800, 4)
 
 @dataclass(frozen=True)
 class GrayScan:
-    """Where the captures lie, and what is true."""
+    """Where the captures are, and what is true."""
 
     root: Path
     T_world_camera: np.ndarray
@@ -28,7 +28,7 @@ class GrayScan:
 
     @property
     def flags(self) -> list[str]:
-        """Those that every call of sl-process needs but for --output."""
+        """The flags that every call of sl-process needs, except --output."""
         names = ("images", "pattern", "intrinsics")
         files = ("images", "pattern.json", "intrinsics.json")
         return [word for n, f in zip(names, files, strict=True) for word in (f"--{n}", str(self.root / f))]

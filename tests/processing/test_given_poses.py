@@ -1,4 +1,4 @@
-"""Rough poses are matched by name, checked, and give the scan its axes."""
+"""Rough poses are matched by name and checked, and they define the axes of the scan."""
 
 import json
 
@@ -35,7 +35,7 @@ def test_frames_are_matched_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_alignment_brings_axes_and_scale_back(count):
+def test_alignment_recovers_axes_and_scale(count):
     T = _poses(count)
     registered = np.ones(count, dtype=bool)
     given = GivenPoses(T.copy(), "mm")

@@ -1,4 +1,4 @@
-"""Decoded frames come back, and only for the images and the decoder they were made with."""
+"""Decoded frames are loaded again, but only for the same images and the same decoder."""
 
 import json
 
@@ -28,7 +28,7 @@ def decoded():
     return Decoded(coords, rng.random((5, 7)) > 0.3, rng.random((5, 7)).astype(np.float32))
 
 
-def test_a_frame_comes_back_as_it_was_given(tmp_path, frame, decoded):
+def test_a_frame_is_loaded_as_it_was_saved(tmp_path, frame, decoded):
     store = DecodedStore(tmp_path / "work", "a decoder")
     key = store.key(frame)
     assert store.load(frame, key) is None
@@ -60,7 +60,7 @@ def test_damaged_files_count_as_not_decoded(tmp_path, frame, decoded):
         assert store.load(frame, key) is None
 
 
-def test_patterns_have_keys_of_their_own():
+def test_every_pattern_has_its_own_key():
     keys = {
         DECODERS["graycode"](GrayCode(32, 24, 2)).key,
         DECODERS["graycode"](GrayCode(32, 24, 4)).key,
@@ -70,7 +70,7 @@ def test_patterns_have_keys_of_their_own():
     assert len(keys) == 4
 
 
-def test_the_manifest_says_what_was_done_and_survives_damage(tmp_path):
+def test_the_manifest_is_kept_and_survives_damage(tmp_path):
     Manifest(tmp_path, {"decoder": "graycode"}).note("a", "k1", "decoded")
     second = Manifest(tmp_path, {"decoder": "graycode"})
     second.note("b", "", "failed in reading", "b.png: is empty")

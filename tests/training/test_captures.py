@@ -1,4 +1,4 @@
-"""Random captures: what is learned from must be true."""
+"""Random captures and graphs: the truth that comes with them is right."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ def test_captures_are_complete_and_finite(captures):
     assert 0.3 < np.mean([capture.lit.mean() for capture in captures]) < 0.95
 
 
-def test_lines_are_bright_where_the_truth_says_that_they_are(captures):
-    """Correlation of the contrast with nearness to a line, over all captures: also hard ones."""
+def test_lines_are_bright_where_the_truth_has_lines(captures):
+    """Correlation of contrast and distance from a line, over all captures, difficult ones included."""
     near, seen = [], []
     for capture in captures:
         where = capture.lit & capture.certain
@@ -37,7 +37,7 @@ def test_lines_are_bright_where_the_truth_says_that_they_are(captures):
     assert np.corrcoef(np.concatenate(near), np.concatenate(seen))[0, 1] > 0.35
 
 
-def test_the_same_seed_draws_the_same():
+def test_the_same_seed_gives_the_same():
     def draw():
         rng = np.random.default_rng(4)
         return random_capture(rng, PatternStock(rng, 1), 48)
@@ -46,7 +46,7 @@ def test_the_same_seed_draws_the_same():
     assert np.array_equal(a.channels, b.channels) and np.array_equal(a.coords, b.coords)
 
 
-def test_drawn_patterns_have_their_nodes_where_they_say():
+def test_nodes_of_drawn_patterns_are_where_the_codes_say():
     pattern = draw_pattern(np.random.default_rng(0))
     middle = np.rint((np.arange(CELLS) + 0.5) * pattern.period).astype(int)
     plain = pattern.codes == 0
@@ -67,7 +67,7 @@ def test_damaged_graphs_are_parts_of_the_turned_pattern(turn):
     assert neighbourhoods(graph.neighbour).max() < len(graph.place)
 
 
-def test_as_many_symbols_are_misread_as_asked():
+def test_the_stated_share_of_symbols_is_misread():
     symbol = np.random.default_rng(0).integers(0, 5, 4000).astype(np.int8)
     score = soft_scores(np.random.default_rng(1), symbol, 0.3)
     assert np.allclose(score.sum(-1), 1, atol=1e-5) and score.min() >= 0

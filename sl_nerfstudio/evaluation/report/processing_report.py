@@ -1,4 +1,4 @@
-"""The report of `sl-process`: what became of every capture, as one HTML file that needs no network."""
+"""The report of `sl-process`: what happened to every capture, as one HTML file that needs no network."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ _MANY_WEAK = 0.25  # of the frames
 
 @dataclass(frozen=True)
 class FrameRow:
-    """A frame as the page shows it."""
+    """A frame with its pictures."""
 
     record: FrameRecord
     image: str  # data addresses; "" where there is no picture
@@ -58,10 +58,11 @@ def _sentence(result: ProcessResult) -> str:
     begin = f"{result.registered} of {len(result.frames)} frames are in the scan"
     if result.registered < 2:
         return f"{begin}: no scan could be written."
-    length = f"its lengths are {result.units}, known by {result.scale_source}" if result.scale_source else (
-        "no length is known, so its unit is arbitrary"
-    )  # fmt: skip
-    return f"{begin}{f'; {lost} were left out' if lost else ''}; {length}."
+    left_out = "" if not lost else "; 1 was left out" if lost == 1 else f"; {lost} were left out"
+    length = "no length is known, so its unit is arbitrary"
+    if result.scale_source:
+        length = f"its lengths are in {result.units}, known from: {result.scale_source}"
+    return f"{begin}{left_out}; {length}."
 
 
 def _charts(result: ProcessResult) -> list[tuple[str, str]]:
@@ -72,14 +73,14 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
         return [math.nan if getattr(f, key) is None else factor * getattr(f, key) for f in frames]
 
     drawn = [
-        ("Decode rate: share of the pattern seen in the image that has coordinates", "% of the pattern",
+        ("Decode rate: share of the visible pattern that was decoded", "% of the pattern",
          [charts.Bars("decoded", values("decode_rate", 100.0))]),
-        ("Epipolar residual: how well coordinates fit the frame's own calibration", "pattern px",
+        ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
          [charts.Bars("epipolar", values("epipolar_px"))]),
-        ("Calibration uncertainty (1 sigma): projector against camera", "degrees",
+        ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
          [charts.Bars("rotation", values("sigma_rotation_deg")),
           charts.Bars("baseline's direction", values("sigma_direction_deg"))]),
-        ("Agreement with the frames it overlaps", "% of the points",
+        ("Agreement with overlapping frames", "% of the points",
          [charts.Bars("agreement", values("fitness", 100.0))]),
     ]  # fmt: skip
     known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]

@@ -1,0 +1,135 @@
+"""Decoders behind one interface: how one is chosen, when its key changes, and that a new one is a file and an entry."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.decoders import DECODERS, choose_decoder
+from sl_nerfstudio.decoding.graycode.decode import decode_gray_code
+from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.files import LAYOUTS
+from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.images import encode_png
+from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
+from tests.decoding.ramps_decoder import RampsDecoder
+from tests.pattern.ramps import Ramps
+
+GRID = GridPattern(w=160, h=120)
+GRAY = GrayCode(32, 24, 2)
+
+
+def write_images(folder, images):
+    paths = [folder / f"{k:02d}.png" for k in range(len(images))]
+    for path, image in zip(paths, images, strict=True):
+        path.write_bytes(encode_png(image))
+    return paths
+
+
+def test_every_kind_of_pattern_has_a_default_decoder(tmp_path):
+    assert choose_decoder(GRID, None, tmp_path).name == "network"
+    assert choose_decoder(GRAY, None, tmp_path).name == "graycode"
+    assert {decoder.reads for decoder in DECODERS.values()} == set(LAYOUTS)
+    assert all(decoder.name == name for name, decoder in DECODERS.items())
+    assert [DECODERS[name].sequence for name in ("network", "graycode")] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("layout", "name", "message"),
+    [
+        (GRAY, "network", r"p\.json: describes a Gray-code sequence, which --decoder network does not read"),
+        (GRID, "graycode", r"p\.json: describes a coded grid, which --decoder graycode does not read"),
+        (GRID, "best", r"--decoder best: there is no decoder of this name.*\n.*\n.*one of network, graycode"),
+        (Ramps(4, 3), None, r"p\.json: describes a pair of ramps, which no decoder reads"),
+        (Ramps(4, 3), "network", r"p\.json: describes a pair of ramps, which no decoder reads"),
+    ],
+)
+def test_a_decoder_that_does_not_suit_is_refused(tmp_path, layout, name, message):
+    with pytest.raises(UserError, match=message) as caught:
+        choose_decoder(layout, name, tmp_path / "p.json")
+    assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
+
+
+def test_a_new_decoder_is_one_entry(monkeypatch, tmp_path):
+    monkeypatch.setitem(DECODERS, "ramps", RampsDecoder)
+    assert isinstance(choose_decoder(Ramps(4, 3), None, tmp_path), RampsDecoder)
+    assert isinstance(choose_decoder(Ramps(4, 3), "ramps", tmp_path), RampsDecoder)
+    assert choose_decoder(GRID, None, tmp_path).name == "network"
+
+
+def test_of_two_decoders_of_one_pattern_the_first_is_the_default_and_the_other_can_be_named(monkeypatch, tmp_path):
+    class Other(DECODERS["graycode"]):
+        name = "other"
+
+    monkeypatch.setitem(DECODERS, "other", Other)
+    assert choose_decoder(GRAY, None, tmp_path).name == "graycode"
+    assert choose_decoder(GRAY, "other", tmp_path).name == "other"
+
+
+def test_the_key_changes_with_everything_that_changes_results(monkeypatch, tmp_path):
+    def key():
+        return RampsDecoder(Ramps(40, 30)).key
+
+    first = key()
+    assert first == key() != RampsDecoder(Ramps(41, 30)).key
+    monkeypatch.setattr(RampsDecoder, "version", 2)
+    second = key()
+    weights = tmp_path / "w.safetensors"
+    weights.write_bytes(b"1")
+    monkeypatch.setattr(RampsDecoder, "weights", lambda self: [weights])
+    third = key()
+    weights.write_bytes(b"2")
+    fourth = key()
+    monkeypatch.setattr(RampsDecoder, "name", "slopes")
+    assert len({first, second, third, fourth, key()}) == 5
+
+
+def test_the_network_decoder_depends_on_both_networks():
+    assert [path.name for path in DECODERS["network"](GRID).weights()] == ["gcn.safetensors", "unet.safetensors"]
+
+
+def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_process(monkeypatch):
+    def load(*_):
+        raise AssertionError("a network was loaded")
+
+    monkeypatch.setattr("sl_nerfstudio.decoding.grid.decoder.GridImageDecoder", load)
+    decoder = DECODERS["network"](GRID)
+    again = pickle.loads(pickle.dumps(decoder))
+    assert again.key == decoder.key and np.array_equal(again.layout.codes, GRID.codes)
+
+
+def test_the_network_decoder_reads_the_one_image_of_a_frame(tmp_path):
+    grid = GridPattern(w=400, h=400)
+    image = np.rint(255 * grid.render()[40:300, 60:340]).astype(np.uint8)
+    (path,) = write_images(tmp_path, [image])
+    found, expected = DECODERS["network"](grid).decode([path]), GridImageDecoder(grid).decode(image)
+    np.testing.assert_array_equal(found.coords, expected.coords)
+    np.testing.assert_array_equal(found.pattern, expected.pattern)
+    x, y = np.meshgrid(np.arange(280) + 60.5, np.arange(260) + 40.5)
+    error = np.linalg.norm(found.coords - np.stack([x, y], -1), axis=-1)[10:-10, 10:-10]
+    assert np.isfinite(error).mean() > 0.95 and np.nanmax(error) < 1 and np.nanmedian(error) < 0.1
+
+
+def test_the_gray_code_decoder_reads_a_sequence_in_order(tmp_path):
+    images = photographs(exact_coords())
+    paths = write_images(tmp_path, images)
+    found, expected = DECODERS["graycode"](LAYOUT).decode(paths), decode_gray_code(images, LAYOUT)
+    np.testing.assert_array_equal(found.coords, expected.coords)
+
+
+def test_images_are_counted_before_they_are_read(tmp_path):
+    with pytest.raises(DecodingError, match="holds 3 images, the sequence of the pattern has 18"):
+        DECODERS["graycode"](GRAY).decode([tmp_path / "missing.png"] * 3)
+
+
+@pytest.mark.parametrize(("name", "layout", "count"), [("network", GRID, 1), ("graycode", GRAY, GRAY.images)])
+def test_a_broken_file_is_named(tmp_path, name, layout, count):
+    paths = [tmp_path / f"{k}.png" for k in range(count)]
+    for path in paths:
+        path.write_bytes(b"no image")
+    with pytest.raises(FileError, match=r"0\.png"):
+        DECODERS[name](layout).decode(paths)

@@ -1,0 +1,66 @@
+"""Captures of ramps on a synthetic object: two small images per frame, decoded quickly and almost exactly."""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.frame_worker import FrameJob
+from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.writing import device_fields
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.setup import make_setup
+from tests.decoding.ramps_decoder import RampsDecoder
+from tests.pattern.ramps import Ramps
+
+LAYOUT = Ramps(800, 800)
+NAMES = ("a 1", "a 2", "a 3", "a 10")
+
+
+@dataclass(frozen=True)
+class RampScan:
+    """Where the captures are, and what is true."""
+
+    root: Path
+    camera: Device
+    projector: Device
+    T_world_camera: np.ndarray
+    coords: tuple[np.ndarray, ...]
+
+    def config(self, output: Path, **changes) -> ProcessConfig:
+        files = [self.root / name for name in ("images", "pattern.json", "intrinsics.json")]
+        return ProcessConfig(*files, output, **{"jobs": 1, **changes})
+
+    def job(self, work: Path) -> FrameJob:
+        return FrameJob(work, RampsDecoder(LAYOUT), self.camera, self.projector, 0)
+
+    def flags(self, output: Path) -> list[str]:
+        files = {"images": "images", "pattern": "pattern.json", "intrinsics": "intrinsics.json"}
+        given = [word for flag, name in files.items() for word in (f"--{flag}", str(self.root / name))]
+        return [*given, "--output", str(output), "--jobs", "1"]
+
+
+@cache
+def _rendered():
+    setup = make_setup(SynthConfig(scene="head", frames=22, resolution=130, seed=3))
+    return setup, tuple(setup.render(k, 1).coords for k in range(len(NAMES)))
+
+
+def make_ramp_scan(root: Path) -> RampScan:
+    """Neighbouring frames of a walk around the head."""
+    setup, coords = _rendered()
+    for name, uv in zip(NAMES, coords, strict=True):
+        folder = root / "images" / name
+        folder.mkdir(parents=True)
+        for axis, size in enumerate((LAYOUT.w, LAYOUT.h)):
+            value = np.clip(np.nan_to_num(uv[..., axis]) / size, 0, 1)
+            (folder / f"{axis}.png").write_bytes(encode_png(np.rint(65535 * value).astype(np.uint16)))
+    (root / "pattern.json").write_bytes(LAYOUT.encode())
+    camera, projector = setup.devices.camera, setup.devices.projector
+    document = {"camera": device_fields(camera, "model"), "projector": device_fields(projector, "model")}
+    (root / "intrinsics.json").write_text(json.dumps(document))
+    return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(NAMES)], coords)

@@ -1,0 +1,147 @@
+"""The frame stage with a third decoder: decoding, resuming, and frames that fail."""
+
+import json
+import os
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.cli.process import main
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage, run_frames
+from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
+from sl_nerfstudio.scan import check_scan, read_scan
+from sl_nerfstudio.scan.images import encode_png
+from tests.decoding.ramps_decoder import RampsDecoder
+from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
+
+
+class KilledDecoder(RampsDecoder):
+    """As if the system had run out of memory."""
+
+    def decode(self, paths):
+        os._exit(9)
+
+
+@pytest.fixture
+def copy(ramp_scan, tmp_path):
+    """Captures that a test may spoil."""
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    return RampScan(tmp_path / "c", *list(vars(ramp_scan).values())[1:])
+
+
+def _captures(scan):
+    return find_captures(scan.root / "images", True)
+
+
+def test_a_third_decoder_goes_all_the_way_to_a_scan(monkeypatch, ramps_registered, ramp_scan, tmp_path, capsys):
+    out = tmp_path / "scan"
+    monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(out)])
+    main()
+    assert "decoder ramps" in capsys.readouterr().out
+    assert check_scan(out) == []
+    scan = read_scan(out)
+    assert [frame.name for frame in scan.frames] == list(NAMES)
+    for frame, exact in zip(scan.frames, ramp_scan.coords, strict=True):
+        coords = frame.read_coords()
+        both = np.isfinite(coords).all(-1) & np.isfinite(exact).all(-1)
+        assert both.sum() > 0.99 * np.isfinite(exact).all(-1).sum()
+        assert np.abs(coords[both] - exact[both]).max() < 800 / 65535
+    assert json.loads((out / "pattern.json").read_text())["kind"] == "ramps"
+    np.testing.assert_allclose(scan.read_pattern(), LAYOUT.render(), atol=0.6 / 255)
+    document = json.loads((out / "processing.json").read_text())
+    assert document["decoder"] == "ramps"
+    assert [frame["decode_rate"] for frame in document["frames"]] == [1.0] * 4
+
+
+def test_the_default_decoder_of_a_pattern_can_be_named_and_another_is_refused(
+    monkeypatch, ramps_registered, ramp_scan, tmp_path, capsys
+):
+    monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(tmp_path / "s"), "--decoder", "network"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "describes a pair of ramps, which --decoder network does not read" in capsys.readouterr().err
+    assert not (tmp_path / "s").exists()
+
+
+def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_time(ramp_scan, tmp_path):
+    config, job, captures = ramp_scan.config(tmp_path / "s"), ramp_scan.job(tmp_path / "w"), _captures(ramp_scan)
+    first = run_frame_stage(config, job, captures)
+    second = run_frame_stage(config, job, captures)
+    assert [r.name for r in first] == [r.name for r in second] == list(NAMES)
+    for a, b, exact in zip(first, second, ramp_scan.coords, strict=True):
+        assert not a.resumed and b.resumed and a.key == b.key and a.stage == b.stage == ""
+        assert a.decode_rate == b.decode_rate == 1
+        assert a.mask_share == pytest.approx(np.isfinite(exact).all(-1).mean(), abs=1e-3)
+        np.testing.assert_array_equal(a.cloud.coords, b.cloud.coords)
+        np.testing.assert_array_equal(a.cloud.pose.T_camera_projector, b.cloud.pose.T_camera_projector)
+    assert describe_frame_stage(first).startswith("decoded and calibrated 4 of 4 frames: 100% of the pattern, epipolar")
+    assert "4 of 4 frames (4 had been decoded before): 100%" in describe_frame_stage(second)
+    frames = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
+    assert {name: frame["status"] for name, frame in frames.items()} == dict.fromkeys(NAMES, "decoded before")
+
+
+def test_a_changed_image_is_decoded_again(copy, tmp_path):
+    worker, frame = FrameWorker(copy.job(tmp_path / "w")), _captures(copy).frames[0]
+    first = worker(frame)
+    frame.images[0].write_bytes(frame.images[0].read_bytes() + b" ")
+    again = worker(frame)
+    assert again.key != first.key and not again.resumed and worker(frame).resumed
+
+
+def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, tmp_path):
+    images = copy.root / "images"
+    (images / NAMES[0] / "0.png").write_bytes(b"broken")
+    (images / NAMES[1] / "1.png").unlink()
+    (images / NAMES[2] / "0.png").write_bytes(encode_png(np.zeros((130, 130), np.uint16)))
+    speckled = np.zeros((130, 130), np.uint16)
+    speckled[60:63, 60:64] = 30000
+    (images / NAMES[3] / "0.png").write_bytes(encode_png(speckled))
+    job = copy.job(tmp_path / "w")
+    results = run_frame_stage(copy.config(tmp_path / "s"), job, _captures(copy))
+    assert [r.stage for r in results] == ["reading", "decoding", "decoding", "calibrating"]
+    assert clouds_of(results) == []
+    assert f"{NAMES[0]}/0.png: is no image" in results[0].reason
+    assert results[1].reason.startswith(f"{images / NAMES[1]}: holds 1 images, not 2\n    cause:  some are missing")
+    assert results[2].reason.startswith(f"{images / NAMES[2]}: is black")
+    assert results[3].reason.startswith(f"{images / NAMES[3]}: 12 decoded pixels are too few")
+    assert all("cause:" in r.reason and "remedy:" in r.reason for r in results)
+    assert results[3].key and not results[1].key
+    assert describe_frame_stage(results) == "decoded and calibrated 0 of 4 frames"
+    frames = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
+    assert {name: frame["status"] for name, frame in frames.items()} == {
+        NAMES[1]: "failed in decoding", NAMES[2]: "failed in decoding", NAMES[3]: "failed in calibrating",
+    }  # fmt: skip
+
+
+def test_an_image_that_breaks_after_it_was_found_is_a_failure_of_its_frame(copy, tmp_path):
+    frame = _captures(copy).frames[0]
+    frame.images[1].write_bytes(b"")
+    result = FrameWorker(copy.job(tmp_path / "w"))(frame)
+    assert result.stage == "reading" and "1.png: is empty" in result.reason and result.cloud is None
+
+
+def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
+    worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
+    result = worker(_captures(ramp_scan).frames[1])
+    assert worker.load(result).rate == 1
+    shutil.rmtree(tmp_path / "w")
+    with pytest.raises(UserError, match=f"the decoded frame {NAMES[1]} is missing\n.*cause:.*\n.*remedy: start again"):
+        worker.load(result)
+
+
+def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ramp_scan, tmp_path):
+    captures = _captures(ramp_scan)
+    results = {r.name: r for r in run_frames(ramp_scan.job(tmp_path / "two"), captures.frames, 2)}
+    alone = FrameWorker(ramp_scan.job(tmp_path / "one"))
+    for frame in captures.frames:
+        expected = alone(frame)
+        assert results[frame.name].key == expected.key
+        np.testing.assert_array_equal(results[frame.name].cloud.points, expected.cloud.points)
+    job = ramp_scan.job(tmp_path / "killed")
+    killed = type(job)(job.work, KilledDecoder(LAYOUT), job.camera, job.projector, job.seed)
+    with pytest.raises(UserError, match=r"was killed\n.*cause:  2 processes need more memory.*\n.*--jobs"):
+        list(run_frames(killed, captures.frames, 2))

@@ -1,0 +1,172 @@
+"""The stages of sl-process, one after the other, and the errors between them."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.processing import process as stages
+from sl_nerfstudio.processing.inputs import frames_by_name, read_inputs
+from sl_nerfstudio.processing.process import process
+from sl_nerfstudio.registration.known_length import parse_known_length
+from sl_nerfstudio.scan import check_scan, read_scan
+from tests.processing.ramp_scan import NAMES
+
+pytestmark = pytest.mark.usefixtures("ramps_registered")
+
+
+def _run(config):
+    log = []
+    return process(config, lambda result, previews: f"{result.registered} of {len(previews)}", log.append), log
+
+
+def _poses(path, poses, units="mm"):
+    frames = [{"file_path": f"x/{name}.png", "transform_matrix": T.tolist()} for name, T in poses.items()]
+    path.write_text(json.dumps({"units": units, "frames": frames}))
+    return path
+
+
+def _without(registration, names):
+    """The registration as if some frames had not fitted."""
+    kept = np.array([name not in names for name in registration.names])
+    reasons = {name: f"{name} fits nowhere; capture it again" for name in names}
+    nowhere = np.where(kept[:, None, None], registration.T_world_camera, np.nan)
+    return replace(registration, registered=registration.registered & kept, reasons=reasons, T_world_camera=nowhere)
+
+
+@pytest.fixture
+def lose(monkeypatch):
+    """Makes registration leave out frames."""
+
+    def lose(*names):
+        real = stages.register
+        monkeypatch.setattr(stages, "register", lambda *args: _without(real(*args), names))
+
+    return lose
+
+
+def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, tmp_path):
+    result, log = _run(ramp_scan.config(tmp_path / "s"))
+    assert log[0] == "4 frames of 130 x 130 pixels, decoder ramps"
+    assert log[1].startswith("decoded and calibrated 4 of 4 frames")
+    assert "registered 4 of 4 frames" in log and log[-1].startswith("joint adjustment: frames agree to 0.0")
+    assert check_scan(tmp_path / "s") == []
+    assert (tmp_path / "s" / "processing.html").read_text() == "4 of 4"
+    assert json.loads((tmp_path / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
+    found, true = read_scan(tmp_path / "s").T_world_camera, ramp_scan.T_world_camera
+    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
+    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
+    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 1e-3 * distance
+    turned = S.poses(found)[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
+    angles = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert angles.max() < 0.3
+
+
+def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, tmp_path):
+    lose(NAMES[3])
+    result, log = _run(ramp_scan.config(tmp_path / "s"))
+    assert "registered 3 of 4 frames" in log
+    assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES[:3])
+    assert result.frames[3].reason == f"{NAMES[3]} fits nowhere; capture it again"
+    assert f"{NAMES[3]}: capture it again; it was left out ({result.frames[3].reason})" in result.recapture
+    assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
+
+
+def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
+    lose(*NAMES[1:])
+    config = ramp_scan.config(tmp_path / "s")
+    with pytest.raises(UserError, match="1 of 4 frames can be used, a scan needs at least 2") as caught:
+        _run(config)
+    assert all(f"  {name}: {name} fits nowhere" in str(caught.value) for name in NAMES[1:])
+    assert f"  {NAMES[0]}: too few other frames could be used" in str(caught.value)
+    assert not config.output.exists() and (config.work_folder / "processing.html").read_text() == "0 of 4"
+
+
+@pytest.mark.parametrize(("given", "usable"), [((0, 1, 2), 1), ((0, 1), 0)])
+def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them(
+    monkeypatch, lose, ramp_scan, tmp_path, given, usable
+):
+    """One pose gave a scale of NaN and none a ValueError, both after the whole adjustment."""
+    lose(NAMES[0], NAMES[1])
+    monkeypatch.setattr(stages, "find_scan_poses", lambda *_: pytest.fail("adjusted before the poses were checked"))
+    rough = _poses(tmp_path / "r.json", {NAMES[k]: ramp_scan.T_world_camera[k] for k in given})
+    config = ramp_scan.config(tmp_path / "s", poses=rough)
+    with pytest.raises(UserError) as caught:
+        _run(config)
+    said = str(caught.value)
+    assert said.startswith(f"{rough}: {usable} of the {len(given)} frames with given poses could be registered")
+    for name in NAMES[:2]:
+        assert f"\n  {name}: left out in registering: {name} fits nowhere; capture it again\n" in said
+    assert (f"\n  {NAMES[2]}: registered\n" in said) == (usable == 1)
+    assert NAMES[3] not in said
+    assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
+
+
+def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tmp_path):
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    (tmp_path / "c" / "images" / NAMES[0] / "0.png").write_bytes(b"broken")
+    rough = _poses(tmp_path / "r.json", {name: ramp_scan.T_world_camera[k] for k, name in enumerate(NAMES[:2])})
+    copy = replace(ramp_scan, root=tmp_path / "c")
+    with pytest.raises(UserError, match="1 of the 2 frames with given poses could be registered") as caught:
+        _run(copy.config(tmp_path / "s", poses=rough))
+    assert f"{NAMES[0]}: left out in reading: " in str(caught.value) and "0.png: is no image" in str(caught.value)
+    assert f"{NAMES[1]}: registered" in str(caught.value)
+
+
+def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
+    turned = ramp_scan.T_world_camera.copy()
+    turned[:, :3, 3] = (1, 2, 3)
+    rough = _poses(tmp_path / "r.json", dict(zip(NAMES, turned, strict=True)))
+    with pytest.raises(UserError, match=r"are all at the same place\n.*cause:  the file holds rotations only"):
+        _run(ramp_scan.config(tmp_path / "s", poses=rough))
+
+
+@pytest.mark.parametrize("units", ["mm", "arbitrary"])
+def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
+    rough = _poses(tmp_path / "r.json", dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
+    result, _ = _run(ramp_scan.config(tmp_path / "s", poses=rough))
+    scan = read_scan(tmp_path / "s")
+    np.testing.assert_allclose(scan.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
+    assert scan.units == result.units == units
+    source = "given camera poses" if units == "mm" else ""
+    assert (scan.scale.known, result.scale_source) == (units == "mm", source)
+
+
+def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
+    rough = _poses(tmp_path / "r.json", dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
+    _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length="baseline of frame 2 = 5 cm"))
+    scan = read_scan(tmp_path / "s")
+    baseline = np.linalg.norm(scan.T_world_camera[2, :3, 3] - scan.T_world_projector[2, :3, 3])
+    assert (scan.units, scan.scale.source) == ("cm", f"baseline of frame 2 ({NAMES[2]})")
+    assert baseline == pytest.approx(5, rel=1e-5)
+
+
+def test_a_known_length_in_a_frame_that_failed_is_an_error_before_the_adjustment(monkeypatch, ramp_scan, tmp_path):
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    (tmp_path / "c" / "images" / NAMES[1] / "0.png").write_bytes(b"broken")
+    copy = replace(ramp_scan, root=tmp_path / "c")
+    monkeypatch.setattr("sl_nerfstudio.processing.scan_poses.adjust_registered", lambda *_: pytest.fail("adjusted"))
+    with pytest.raises(UserError, match=f"--known-length: {NAMES[1]} could not be used.*\n.*cause:.*\n.*remedy:"):
+        _run(copy.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm"))
+
+
+def test_frames_of_a_known_length_are_found_by_number_or_name():
+    bar = parse_known_length("distance between frame 1 (1, 2) and frame b (3, 4) = 5 mm")
+    assert frames_by_name(bar, ["a", "1", "b"]).frames == ("1", "b")  # a name counts before a number
+    assert frames_by_name(bar, ["a", "c", "b"]).frames == ("c", "b")
+    for text in ("baseline of frame 3 = 1 m", "baseline of frame x = 1 m"):
+        with pytest.raises(UserError, match=r"there is no frame.*\n.*counted from 1\n.*a number from 0 to 2"):
+            frames_by_name(parse_known_length(text), ["a", "b", "c"])
+
+
+def test_inputs_are_read_before_anything_is_written(ramp_scan, tmp_path):
+    inputs = read_inputs(ramp_scan.config(tmp_path / "s", known_length="baseline of frame 3 = 1 m"))
+    assert [frame.name for frame in inputs.captures.frames] == list(NAMES)
+    assert inputs.known.frames == (NAMES[3],) and inputs.given is None
+    assert inputs.job.decoder.name == "ramps" and inputs.job.work == tmp_path / "s.work"
+    assert (inputs.job.camera, inputs.job.projector) == (ramp_scan.camera, ramp_scan.projector)
+    assert list(tmp_path.iterdir()) == []

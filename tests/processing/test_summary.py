@@ -1,0 +1,97 @@
+"""From results of the stages to the records of the report."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.frame_worker import FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.scan_poses import find_scan_poses
+from sl_nerfstudio.processing.summary import left_out, summarise
+from sl_nerfstudio.registration.register import register
+from tests.processing.ramp_scan import NAMES
+
+
+@pytest.fixture(scope="module")
+def results(ramp_scan, tmp_path_factory):
+    worker = FrameWorker(ramp_scan.job(tmp_path_factory.mktemp("w")))
+    return [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
+
+
+@pytest.fixture(scope="module")
+def registration(results):
+    return register(clouds_of(results))
+
+
+@pytest.fixture(scope="module")
+def poses(results, registration):
+    return find_scan_poses(clouds_of(results), registration, None, None)
+
+
+@pytest.fixture
+def config(ramp_scan, tmp_path):
+    return ramp_scan.config(tmp_path)
+
+
+def _lost(stage, reason="x.png: is bad\n    cause:  a\n    remedy: b"):
+    return FrameStageResult(CapturedFrame("lost", ()), "k", False, 0.5, 0.25, None, stage, reason)
+
+
+def test_registered_frames_have_all_figures(config, results, registration, poses):
+    result = summarise(config, "ramps", results, registration, poses)
+    assert result.registered == 4 and result.decoder == "ramps"
+    assert (result.units, result.scale_source) == ("arbitrary", "")
+    baselines = [frame.baseline for frame in result.frames]
+    assert np.exp(np.mean(np.log(baselines))) == pytest.approx(1, abs=0.02)  # no length is known
+    for frame, stage in zip(result.frames, results, strict=True):
+        assert frame.in_scan and frame.stage == frame.reason == ""
+        assert (frame.decode_rate, frame.mask_share) == (stage.decode_rate, stage.mask_share)
+        assert frame.epipolar_px == stage.cloud.pose.residual_px < 0.01
+        figures = vars(frame)
+        assert figures["fitness"] > 0.9
+        assert figures["sigma_rotation_deg"] < 0.01 and figures["sigma_direction_deg"] < 0.01
+    assert result.joint_px is not None
+    before, after = result.joint_px
+    assert after < before < 0.2
+    assert {edge.frames for edge in result.edges} >= set(pairwise(NAMES))
+    assert set(result.versions) == {"sl_nerfstudio", "numpy", "torch"}
+
+
+@pytest.mark.parametrize(
+    ("stage", "rate", "share"), [("reading", None, None), ("decoding", None, None), ("calibrating", 0.5, 0.25)]
+)
+def test_a_frame_that_failed_has_only_the_figures_that_were_reached(
+    config, results, registration, poses, stage, rate, share
+):
+    lost = _lost(stage)
+    frame = summarise(config, "ramps", [lost, *results], registration, poses).frames[0]
+    assert (frame.in_scan, frame.stage, frame.reason) == (False, stage, lost.reason)
+    assert (frame.decode_rate, frame.mask_share) == (rate, share)
+    assert frame.epipolar_px is frame.baseline is frame.fitness is None
+    failure = left_out(lost, registration)
+    assert (failure.stage, failure.reason) == (stage, lost.reason)
+
+
+def test_a_frame_that_was_not_registered_says_why(config, results, registration, poses):
+    without = replace(
+        registration, registered=np.array([True, True, False, True]), reasons={NAMES[2]: "it does not fit anywhere"}
+    )
+    frame = summarise(config, "ramps", results, without, poses).frames[2]
+    assert (frame.in_scan, frame.stage, frame.reason) == (False, "registering", "it does not fit anywhere")
+    assert vars(frame)["epipolar_px"] < 0.01 and frame.baseline is None and frame.fitness is None
+    assert left_out(results[0], without) is None
+
+
+@pytest.mark.parametrize("registered", [False, True])
+def test_without_a_scan_every_frame_is_left_out_for_a_reason(config, results, registration, registered):
+    result = summarise(config, "ramps", results, registration if registered else None, None)
+    assert result.registered == 0 and result.joint_px is None and result.units == "arbitrary"
+    assert {(f.stage, f.reason) for f in result.frames} == {("registering", "too few other frames could be used")}
+
+
+def test_residuals_that_do_not_exist_are_left_out(config, results, registration, poses):
+    none = replace(poses, adjusted=replace(poses.adjusted, median_before_px=np.nan, median_after_px=np.nan))
+    result = summarise(config, "ramps", results, registration, none)
+    assert result.joint_px is None and result.document()["joint_adjustment_px"] is None
