@@ -154,6 +154,13 @@ def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytes
         *("sl-neus-paper", "--data", root, "--output-dir", tmp_path, "--max-num-iterations", 3, *SMALL),
     )
     assert list(tmp_path.glob("*/sl-neus-paper/*/nerfstudio_models/step-000000002.ckpt"))
+    (config,) = tmp_path.glob("*/sl-neus-paper/*/config.yml")
+    model = eval_setup(config)[1].model
+    cache = model.renderer.cache  # training samples whole rays and never fills it, but shadows are looked up in it
+    p = torch.tensor([[0.0, 0.0, 0.0], [0.5, -0.4, 0.3], [-0.7, 0.2, 0.6]])
+    with torch.no_grad():
+        torch.testing.assert_close(cache.look_up(p), model.sdf(p), rtol=0, atol=2 * cache.cell)
+    assert cache.look_up(p).abs().min() > 0.01
 
 
 @pytest.mark.parametrize("free", ["known-rig", "rigid-rig", "static-projector"])
