@@ -1,0 +1,91 @@
+"""Pieces of work on several threads, and compiled loops cut into pieces."""
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sl_nerfstudio.compiled import compiled_range
+from sl_nerfstudio.threads import one_torch_thread, parallel, split, threads
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 64), st.integers(1, 300))
+def test_ranges_cover_everything_once_and_begin_at_multiples(n: int, parts: int, multiple: int) -> None:
+    ranges = split(n, parts, multiple)
+    assert 1 <= len(ranges) <= parts
+    assert [i for first, last in ranges for i in range(first, last)] == list(range(n))
+    assert all(first % multiple == 0 for first, _ in ranges)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 500])
+def test_every_task_runs_once(count: int) -> None:
+    done: Counter[int] = Counter()
+    lock = threading.Lock()
+
+    def task(number: int) -> Callable[[], None]:
+        def run() -> None:
+            with lock:
+                done[number] += 1
+
+        return run
+
+    parallel([task(number) for number in range(count)])
+    assert done == Counter(range(count))
+
+
+def test_tasks_run_at_the_same_time() -> None:
+    with torch_threads(2):
+        meeting = threading.Barrier(2, timeout=20)
+        parallel([lambda: meeting.wait(), lambda: meeting.wait()])  # one after the other they would never meet
+    assert not meeting.broken
+
+
+def test_what_a_task_raises_comes_out() -> None:
+    def fail() -> None:
+        raise KeyError("from a task")
+
+    for tasks in ([fail], [fail, int], [int] * 20 + [fail]):
+        with pytest.raises(KeyError, match="from a task"):
+            parallel(tasks)
+
+
+def test_torch_has_one_thread_and_our_loops_all() -> None:
+    with torch_threads(3):
+        with pytest.raises(ValueError, match="inside"), one_torch_thread():
+            assert (torch.get_num_threads(), threads()) == (1, 3)
+            with one_torch_thread():
+                assert (torch.get_num_threads(), threads()) == (1, 3)
+            assert (torch.get_num_threads(), threads()) == (1, 3)
+            raise ValueError("inside")
+        assert (torch.get_num_threads(), threads()) == (3, 3)
+
+
+def _add_squares(first: int, last: int, values: np.ndarray, out: np.ndarray) -> None:
+    for i in range(first, last):
+        out[i] += values[i] * values[i]
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 1000])
+@pytest.mark.parametrize("used", [1, 3])
+def test_a_compiled_loop_does_each_iteration_once(count: int, used: int) -> None:
+    values, out = np.arange(1000, dtype=np.float64), np.ones(1000)
+    with torch_threads(used):
+        compiled_range(_add_squares)(count, values, out)
+    assert np.array_equal(out[:count], 1 + values[:count] ** 2)
+    assert (out[count:] == 1).all()
