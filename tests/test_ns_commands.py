@@ -33,6 +33,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
@@ -156,6 +157,7 @@ def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytes
     assert list(tmp_path.glob("*/sl-neus-paper/*/nerfstudio_models/step-000000002.ckpt"))
     (config,) = tmp_path.glob("*/sl-neus-paper/*/config.yml")
     model = eval_setup(config)[1].model
+    assert isinstance(model, SLModel)
     cache = model.renderer.cache  # training samples whole rays and never fills it, but shadows are looked up in it
     p = torch.tensor([[0.0, 0.0, 0.0], [0.5, -0.4, 0.3], [-0.7, 0.2, 0.6]])
     with torch.no_grad():

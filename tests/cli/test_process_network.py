@@ -58,7 +58,7 @@ def test_all_frames_are_in_the_scan_and_no_fault_is_found(folder):
 
 def test_poses_are_true_but_for_a_rigid_motion(folder):
     scan, true = read_scan(folder / "scan"), _true_frames(folder)
-    found = np.concatenate([scan.T_world_camera, scan.T_world_projector])
+    found = scan.poses.stacked()
     wanted = np.stack([f.T_world_camera for f in true] + [f.T_world_projector for f in true])
     S = fit_similarity(found[:, :3, 3], wanted[:, :3, 3])
     distance = np.linalg.norm(wanted[:KEPT, :3, 3] - _middle(folder), axis=1).mean()

@@ -104,7 +104,7 @@ def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, t
     results = run_frame_stage(copy.config(tmp_path / "s"), job, _captures(copy))
     assert [r.stage for r in results] == ["reading", "decoding", "decoding", "calibrating"]
     assert clouds_of(results) == []
-    assert f"{NAMES[0]}/0.png: is no image" in results[0].reason
+    assert f"{NAMES[0]}/0.png: is not an image that can be read" in results[0].reason
     assert results[1].reason.startswith(f"{images / NAMES[1]}: holds 1 images, not 2\n    cause:  some are missing")
     assert results[2].reason.startswith(f"{images / NAMES[2]}: is black")
     assert results[3].reason.startswith(f"{images / NAMES[3]}: 12 decoded pixels are too few")

@@ -13,10 +13,14 @@ from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.inputs import frames_by_name, read_inputs
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.registration.known_length import parse_known_length
+from sl_nerfstudio.registration.result import NoCommonSurface
 from sl_nerfstudio.scan import check_scan, read_scan
 from tests.processing.ramp_scan import NAMES
 
 pytestmark = pytest.mark.usefixtures("ramps_registered")
+
+
+ALONE = "no other frame shows any of its surface; capture views in between"
 
 
 def _run(config):
@@ -33,9 +37,13 @@ def _poses(path, poses, units="mm"):
 def _without(registration, names):
     """The registration as if some frames had not fitted."""
     kept = np.array([name not in names for name in registration.names])
-    reasons = {name: f"{name} fits nowhere; capture it again" for name in names}
     nowhere = np.where(kept[:, None, None], registration.T_world_camera, np.nan)
-    return replace(registration, registered=registration.registered & kept, reasons=reasons, T_world_camera=nowhere)
+    return replace(
+        registration,
+        registered=registration.registered & kept,
+        exclusions=tuple(NoCommonSurface(name) for name in names),
+        T_world_camera=nowhere,
+    )
 
 
 @pytest.fixture
@@ -57,7 +65,7 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, tmp_path):
     assert check_scan(tmp_path / "s") == []
     assert (tmp_path / "s" / "processing.html").read_text() == "4 of 4"
     assert json.loads((tmp_path / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
-    found, true = read_scan(tmp_path / "s").T_world_camera, ramp_scan.T_world_camera
+    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
     S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
     distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
     assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 1e-3 * distance
@@ -71,7 +79,7 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     result, log = _run(ramp_scan.config(tmp_path / "s"))
     assert "registered 3 of 4 frames" in log
     assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES[:3])
-    assert result.frames[3].reason == f"{NAMES[3]} fits nowhere; capture it again"
+    assert result.frames[3].reason == ALONE
     assert f"{NAMES[3]}: capture it again; it was left out ({result.frames[3].reason})" in result.recapture
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
 
@@ -81,7 +89,7 @@ def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_
     config = ramp_scan.config(tmp_path / "s")
     with pytest.raises(UserError, match="1 of 4 frames can be used, a scan needs at least 2") as caught:
         _run(config)
-    assert all(f"  {name}: {name} fits nowhere" in str(caught.value) for name in NAMES[1:])
+    assert all(f"  {name}: {ALONE}" in str(caught.value) for name in NAMES[1:])
     assert f"  {NAMES[0]}: too few other frames could be used" in str(caught.value)
     assert not config.output.exists() and (config.work_folder / "processing.html").read_text() == "0 of 4"
 
@@ -100,7 +108,7 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     said = str(caught.value)
     assert said.startswith(f"{rough}: {usable} of the {len(given)} frames with given poses could be registered")
     for name in NAMES[:2]:
-        assert f"\n  {name}: left out in registering: {name} fits nowhere; capture it again\n" in said
+        assert f"\n  {name}: left out in registering: {ALONE}\n" in said
     assert (f"\n  {NAMES[2]}: registered\n" in said) == (usable == 1)
     assert NAMES[3] not in said
     assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
@@ -113,8 +121,9 @@ def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tm
     copy = replace(ramp_scan, root=tmp_path / "c")
     with pytest.raises(UserError, match="1 of the 2 frames with given poses could be registered") as caught:
         _run(copy.config(tmp_path / "s", poses=rough))
-    assert f"{NAMES[0]}: left out in reading: " in str(caught.value) and "0.png: is no image" in str(caught.value)
-    assert f"{NAMES[1]}: registered" in str(caught.value)
+    said = str(caught.value)
+    assert f"{NAMES[0]}: left out in reading: " in said and "0.png: is not an image that can be read" in said
+    assert f"{NAMES[1]}: registered" in said
 
 
 def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
@@ -130,7 +139,7 @@ def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
     result, _ = _run(ramp_scan.config(tmp_path / "s", poses=rough))
     scan = read_scan(tmp_path / "s")
-    np.testing.assert_allclose(scan.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
+    np.testing.assert_allclose(scan.poses.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
     assert scan.units == result.units == units
     source = "given camera poses" if units == "mm" else ""
     assert (scan.scale.known, result.scale_source) == (units == "mm", source)
@@ -140,8 +149,8 @@ def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
     _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length="baseline of frame 2 = 5 cm"))
     scan = read_scan(tmp_path / "s")
-    baseline = np.linalg.norm(scan.T_world_camera[2, :3, 3] - scan.T_world_projector[2, :3, 3])
-    assert (scan.units, scan.scale.source) == ("cm", f"baseline of frame 2 ({NAMES[2]})")
+    baseline = scan.poses.baseline[2]
+    assert (scan.units, scan.scale.source) == ("cm", f"baseline of frame {NAMES[2]}")
     assert baseline == pytest.approx(5, rel=1e-5)
 
 

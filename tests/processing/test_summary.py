@@ -10,7 +10,9 @@ from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
 from sl_nerfstudio.processing.summary import left_out, summarise
+from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.registration.result import NoCommonSurface
 from tests.processing.ramp_scan import NAMES
 
 
@@ -75,11 +77,10 @@ def test_a_frame_that_failed_has_only_the_figures_that_were_reached(
 
 
 def test_a_frame_that_was_not_registered_says_why(config, results, registration, poses):
-    without = replace(
-        registration, registered=np.array([True, True, False, True]), reasons={NAMES[2]: "it does not fit anywhere"}
-    )
+    alone = NoCommonSurface(NAMES[2])
+    without = replace(registration, registered=np.array([True, True, False, True]), exclusions=(alone,))
     frame = summarise(config, "ramps", results, without, poses).frames[2]
-    assert (frame.in_scan, frame.stage, frame.reason) == (False, "registering", "it does not fit anywhere")
+    assert (frame.in_scan, frame.stage, frame.reason) == (False, "registering", exclusion_sentence(alone))
     assert vars(frame)["epipolar_px"] < 0.01 and frame.baseline is None and frame.fitness is None
     assert left_out(results[0], without) is None
 

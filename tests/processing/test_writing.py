@@ -37,8 +37,8 @@ def test_what_is_written_is_what_was_found(made, tmp_path):
     assert check_scan(tmp_path / "s") == []
     scan = read_scan(tmp_path / "s")
     assert (scan.projector, scan.units, scan.scale) == (job.projector, "arbitrary", poses.scale)
-    np.testing.assert_allclose(scan.T_world_camera, poses.adjusted.T_world_camera, atol=1e-12)
-    np.testing.assert_allclose(scan.T_world_projector, poses.adjusted.T_world_projector, atol=1e-12)
+    np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera, atol=1e-12)
+    np.testing.assert_allclose(scan.poses.T_world_projector, poses.adjusted.poses.T_world_projector, atol=1e-12)
     worker = FrameWorker(job)
     for frame, stage, sigma in zip(scan.frames, results, poses.adjusted.sigma, strict=True):
         decoded = worker.load(stage)
@@ -61,7 +61,7 @@ def test_frames_that_are_not_in_the_scan_are_only_shown(made, tmp_path):
     write_scan(tmp_path / "s", job, [*results[:3], failed], poses, some, lambda _, p: previews.extend(p) or "")
     scan = read_scan(tmp_path / "s")
     assert [frame.name for frame in scan.frames] == [NAMES[0], NAMES[2]]
-    np.testing.assert_allclose(scan.T_world_camera, poses.adjusted.T_world_camera[[0, 2]], atol=1e-12)
+    np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera[[0, 2]], atol=1e-12)
     assert [preview.coords is None for preview in previews] == [False, False, False, True]
     assert all(preview.image is not None for preview in previews)
 
