@@ -108,16 +108,18 @@ def clouds_of(root: Path, settings: RelativePoseSettings) -> list[FrameCloud]:
 
 
 @cache
-def registered(root: Path, settings: StageSettings) -> tuple[list[FrameCloud], Registration]:
+def registered(
+    root: Path, relative_pose: RelativePoseSettings, registration: RegistrationSettings
+) -> tuple[list[FrameCloud], Registration]:
     """Frames whose relative pose is found, and their registration."""
-    clouds = clouds_of(root, settings.relative_pose)
-    return clouds, register(clouds, settings=settings.registration)
+    clouds = clouds_of(root, relative_pose)
+    return clouds, register(clouds, settings=registration)
 
 
 @cache
 def errors_of(root: Path, settings: StageSettings, adjusted: bool) -> FrameErrors:
     """Errors of the registered frames of a scan, before or after bundle adjustment; none where fewer than two are."""
-    clouds, found = registered(root, replace(settings, bundle_adjustment=StageSettings().bundle_adjustment))
+    clouds, found = registered(root, settings.relative_pose, settings.registration)
     if found.registered.sum() < 2:
         return FrameErrors(*np.zeros((3, 0)))
     scan = read_scan(root)

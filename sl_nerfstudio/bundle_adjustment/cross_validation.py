@@ -65,24 +65,24 @@ def cross_validate(
     s = settings.cross_validation
     width = max(s.width_noises * noise_px, s.least_width_px)
     generator = torch.Generator().manual_seed(settings.seed)
+    sides = [(rig, _anchors(rig, held_out)) for rig in (before, after)]
     pairs = []
-    for rig in (before, after):
-        anchors = _anchors(rig, held_out)
+    for rig, anchors in sides:
         seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator)
         pairs.append(torch.stack([seen.anchor, seen.frame]))
     rows = Observations(*torch.unique(torch.cat(pairs, 1), dim=1))
     block = torch.cat([held_out.block, held_out.block[rows.anchor]])
-    losses = [_robust_squares(rig, held_out, rows, maps, width) for rig in (before, after)]
+    losses = [_robust_squares(rig, anchors, rows, maps, width) for rig, anchors in sides]
     difference, error = mean_and_error(losses[1] - losses[0], block)
     first, second = (float(loss.mean().sqrt()) for loss in losses)
     return CrossValidation(first, second, difference, error, s.standard_errors)
 
 
 def _robust_squares(
-    rig: Rig, held_out: HeldOutPixels, rows: Observations, maps: CoordinateMaps, width: float
+    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, width: float
 ) -> Float[Tensor, "residuals"]:
     """Robust squares of the own residuals, then of the cross residuals; width^2 for those that do not exist."""
-    r = residuals_of(rig, _anchors(rig, held_out), rows, maps)
+    r = residuals_of(rig, anchors, rows, maps)
     own2 = torch.nan_to_num((r.own**2).sum(-1), nan=float("inf"))
     cross2 = torch.where(r.cross_valid, (r.cross**2).sum(-1), torch.full_like(r.cross[:, 0], float("inf")))
     r2 = torch.cat([own2, torch.nan_to_num(cross2, nan=float("inf"))])

@@ -74,7 +74,7 @@ class AdjustedFrames:
 
     def scaled(self, factor: float) -> "AdjustedFrames":
         """With all lengths multiplied, which makes a scan metric."""
-        return self.mapped(Similarity(factor, np.eye(3), np.zeros(3)))
+        return self.mapped(Similarity.scaling(factor))
 
 
 def adjust_registered(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Kernel:
         own2, cross2 = self._squares()
         own = ((r.own**2).sum(-1), own2)
         cross = ((r.cross**2).sum(-1)[valid], cross2[valid])
-        return self.narrowest**2 * sum(float((r2 / (w2 + r2)).sum()) for r2, w2 in (own, cross))
+        return self.narrowest**2 * sum(float(geman_mcclure_cost(r2 / w2).sum()) for r2, w2 in (own, cross))
 
     def _squares(self) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
         return self.width[self.frame] ** 2, self.width[self.pair].amax(0) ** 2

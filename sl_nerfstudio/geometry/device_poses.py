@@ -42,7 +42,3 @@ class DevicePoses:
     def mapped(self, S_target_world: Similarity) -> "DevicePoses":
         """The same devices in other axes and another unit; orientations stay rotations."""
         return DevicePoses(S_target_world.poses(self.T_world_camera), S_target_world.poses(self.T_world_projector))
-
-    def scaled(self, factor: float) -> "DevicePoses":
-        """With all lengths multiplied."""
-        return self.mapped(Similarity(factor, np.eye(3), np.zeros(3)))

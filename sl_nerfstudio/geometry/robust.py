@@ -8,6 +8,11 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
+def geman_mcclure_cost(squared: Number) -> Number:
+    """Cost of a residual, from its square in units of the squared kernel width: at most 1, however wrong it is."""
+    return squared / (1 + squared)
+
+
 def geman_mcclure_weight(squared: Number) -> Number:
     """Weight of a residual in weighted least squares, from its square in units of the squared kernel width.
 

@@ -18,7 +18,12 @@ class Similarity:
     @staticmethod
     def identity() -> "Similarity":
         """The identity."""
-        return Similarity(1.0, np.eye(3), np.zeros(3))
+        return Similarity.scaling(1.0)
+
+    @staticmethod
+    def scaling(factor: float) -> "Similarity":
+        """All lengths multiplied by `factor`, about the origin."""
+        return Similarity(factor, np.eye(3), np.zeros(3))
 
     def points(self, p: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
         """Points of frame b in frame a."""

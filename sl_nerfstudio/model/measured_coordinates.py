@@ -1,5 +1,7 @@
 """Decoded coordinates looked up at scene points, for the residual image in the viewer."""
 
+from functools import lru_cache
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,7 +18,7 @@ class MeasuredCoordinates:
 
     def __init__(self, scan: Scan) -> None:
         self._scan = scan
-        self._images: dict[int, Float[Tensor, "h w 2"]] = {}
+        self._image = lru_cache(maxsize=_KEPT)(self._read)
 
     def at(
         self, p: Float[Tensor, "n 3"], views: Int[Tensor, "n"], T_camera_scene: Float[Tensor, "frames 4 4"]
@@ -33,11 +35,5 @@ class MeasuredCoordinates:
             result[mine] = torch.where(inside[:, None], decoded, float("nan"))
         return result
 
-    def _image(self, view: int) -> Float[Tensor, "h w 2"]:
-        image = self._images.pop(view, None)
-        if image is None:
-            image = torch.from_numpy(self._scan.frames[view].read_coords())
-        self._images[view] = image  # the most recently used one is at the end
-        for oldest in list(self._images)[:-_KEPT]:
-            del self._images[oldest]
-        return image
+    def _read(self, view: int) -> Float[Tensor, "h w 2"]:
+        return torch.from_numpy(self._scan.frames[view].read_coords())

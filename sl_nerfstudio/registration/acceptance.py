@@ -94,7 +94,7 @@ def _in_first_camera(
         return poses, baseline
     world = [node_at(nodes, k) for k in frames]
     unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
-    gauge = Similarity(1 / unit, np.eye(3), np.zeros(3)) @ Similarity(1.0, world[0].R, world[0].t).inverse()
+    gauge = Similarity.scaling(1 / unit) @ Similarity(1.0, world[0].R, world[0].t).inverse()
     for k, S in zip(frames, (gauge @ S for S in world), strict=True):
         baseline[k] = S.scale
         poses[k] = np.eye(4)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
 from sl_nerfstudio.relative_pose.sampson import moved, sampson, sampson_jacobian
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings, Separation
@@ -76,8 +76,7 @@ def fit_epipolar(
 
 
 def _cost(r: Float64[ndarray, "n"], width: float) -> float:
-    r2 = r * r
-    return float((r2 / (1 + r2 / width**2)).sum())
+    return width**2 * float(geman_mcclure_cost((r / width) ** 2).sum())
 
 
 def covariance(

@@ -78,7 +78,7 @@ def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
     """The map from the rendered scene to the written world: the unit, and a random rotation and shift on request."""
     scale = MILLIMETRES[config.units]
     if config.world_turn is None:
-        return Similarity(scale, np.eye(3), np.zeros(3))
+        return Similarity.scaling(scale)
     rng = random_stream(config.world_turn, Stream.WORLD)
     Q, upper = np.linalg.qr(rng.standard_normal((3, 3)))
     Q = Q * np.sign(np.diag(upper))

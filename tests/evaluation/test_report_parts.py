@@ -107,7 +107,7 @@ def test_the_overlap_graph_is_a_drawing_with_every_frame_and_edge() -> None:
 
 def test_a_template_with_an_unknown_value_raises() -> None:
     with pytest.raises(jinja2.UndefinedError):
-        page("report.html.j2", {name: str for name in ("number", "percent", "fixed")}, {})
+        page("report.html.j2", {})
 
 
 def test_both_templates_are_whole_pages() -> None:

@@ -45,7 +45,7 @@ def test_another_world_scales_lengths_and_leaves_relative_orientations(seed, oth
 @given(seeds, scales)
 def test_scaling_multiplies_all_positions(seed, factor):
     poses = poses_of(seed)
-    scaled = poses.scaled(factor).stacked()
+    scaled = poses.mapped(Similarity.scaling(factor)).stacked()
     np.testing.assert_allclose(scaled[:, :3, 3], factor * poses.stacked()[:, :3, 3], rtol=1e-12)
     assert np.array_equal(scaled[:, :3, :3], poses.stacked()[:, :3, :3])
 

@@ -12,6 +12,7 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, transform
 from sl_nerfstudio.rendering.renderer import Renderer
 from sl_nerfstudio.rendering.settings import SamplingConfig
+from tests.meshing.ray_cast_scan import look_at
 
 BALLS = torch.tensor([[0.0, 0.0, 0.0, 0.4], [0.45, 0.0, 0.5, 0.15]])  # centre and radius: the second shades the first
 PROJECTOR = Intrinsics.of(Device(64, 48, 100.0, 100.0, 32.0, 24.0), torch.float32)
@@ -52,16 +53,6 @@ def rays(n: int = 60) -> tuple[Tensor, Tensor]:
     return torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64).expand_as(d), d / d.norm(dim=-1, keepdim=True)
 
 
-def projector_pose() -> Tensor:
-    """T_projector_scene; it looks at the scene's centre."""
-    back = PROJECTOR_CENTRE / PROJECTOR_CENTRE.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back)
-    T = torch.eye(4)
-    T[:3, :3] = torch.stack([right / right.norm(), torch.linalg.cross(back, right / right.norm()), back], 1)
-    T[:3, 3] = PROJECTOR_CENTRE
-    return inverse(T)
-
-
 @pytest.mark.parametrize(("strategy", "samples"), [("surface", 64), ("uniform", 2000)])
 @pytest.mark.parametrize("jitter", [False, True])
 def test_rays_see_the_first_surface_and_its_coordinates(
@@ -75,7 +66,7 @@ def test_rays_see_the_first_surface_and_its_coordinates(
         -((p[:, None] - BALLS[:, :3]) * d[:, None]).sum(-1) < 0.35 * BALLS[:, 3]
     )
     met = t.isfinite() & ~rim.any(-1)  # along an outline, one sample decides
-    T = projector_pose().expand(len(o), 4, 4)
+    T = inverse(torch.from_numpy(look_at(PROJECTOR_CENTRE.tolist())).float()).expand(len(o), 4, 4)
     seen = renderer(strategy).render(o.float(), d.float(), T, samples, jitter)
     nearest = Balls().sdf((o[:, None] + torch.linspace(2, 4, 400)[:, None] * d[:, None]).reshape(-1, 3).float())
     clear = nearest.reshape(len(o), -1).amin(-1) > 0.03

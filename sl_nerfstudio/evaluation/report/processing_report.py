@@ -39,7 +39,7 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "settings": sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
         "made_at": datetime.now(),
     }
-    return page(_TEMPLATE, {"figure": _figure, "percent": _percent, "first_line": first_line}, values)
+    return page(_TEMPLATE, values, first_line=first_line)
 
 
 def _band(result: ProcessResult) -> str:
@@ -90,11 +90,3 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
 def _pictures(preview: Preview) -> tuple[str, str]:
     image, coords = (("" if p is None else data_uri(p)) for p in (preview.image, preview.coords))
     return image, coords
-
-
-def _figure(value: float | None, decimals: int = 2) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{100 * value:.0f} %"

@@ -80,7 +80,7 @@ def render_report(report: ReportInput) -> str:
         "summary": _summary(report),
         "plotly": compressed_script(),
     }
-    return page(_TEMPLATE, {"number": _number, "percent": _percent, "fixed": _fixed}, values)
+    return page(_TEMPLATE, values)
 
 
 def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictures:
@@ -229,22 +229,3 @@ def _summary(report: ReportInput) -> list[tuple[str, str]]:
          f"{np.min(baseline):.4g} to {np.max(baseline):.4g}"),
         ("Mesh", f"{len(mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
     ]  # fmt: skip
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    """Three significant digits, a dash where there is no value."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if value == 0 or 1e-4 <= abs(value) < 1e5:
-        return f"{value:#.{digits}g}".rstrip(".") if value else "0"
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
-
-
-def _fixed(value: float | None, decimals: int = 2) -> str:
-    """A fixed number of decimals, a dash where there is no value."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
-
-
-def _percent(value: float | None, decimals: int = 1) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{100 * value:.{decimals}f} %"
