@@ -23,7 +23,8 @@ _DEGENERACIES: dict[DegeneracyKind, str] = {
     "other depths in this view",
     "epipole in view": "one device is in the other's view of the object, and depth cannot be measured around that "
     "place; move the projector to the side",
-    "ambiguous": "a second pose explains the coordinates nearly as well; show parts at other depths in this view",
+    "ambiguous": "a second pose explains {:.0%} of the coordinates, and this one {:.0%}; show parts at other depths in "
+    "this view",
     "many outliers": "{:.0%} of the coordinates contradict the rest; check the pattern file and the light",
     "poor fit": "coordinates miss their epipolar curves by {:.2g} px; check the intrinsics of both devices and the "
     "projector's model (OPENCV or DOE)",

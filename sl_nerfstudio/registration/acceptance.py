@@ -3,44 +3,48 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.assembly import Component
 from sl_nerfstudio.registration.edge_weights import is_accepted, is_ambiguous, quality
 from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
 from sl_nerfstudio.registration.pair_match import PairMatch
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.result import (
-    AmbiguousPose,
     Edge,
     Exclusion,
-    InconsistentPair,
     NoCommonSurface,
     PoorPair,
     Registration,
+    SeparateComponent,
     SurfaceDisagrees,
     UncertainRotation,
     Uncertainty,
 )
-from sl_nerfstudio.registration.surface_agreement import agreement_at
-from sl_nerfstudio.registration.view_graph import ViewGraph, connected_components
+from sl_nerfstudio.registration.surface_agreement import Tolerance, agreement_at
+from sl_nerfstudio.registration.view_graph import ViewGraph
 
 
 def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
-    """Poses and baselines of the frames that agree with each other; every other frame with its reason."""
-    n, edges, settings = len(names), graph.edges, graph.settings
-    solution = graph.solve()
-    consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
-    connected = _largest_component(consistent, n)
-    fitness = np.array([_fitness_of(k, solution, connected, graph) for k in range(n)])
+    """Poses and baselines of the largest component; every other frame with its reason."""
+    edges, settings = graph.edges, graph.settings
+    components = graph.assemble()
+    main = components[0] if len(components[0]) > 1 else {}
+    component = _numbers(components, len(names))
+    solution = graph.solve(components[0])
+    connected = component == 0
+    fitness = np.array([_fitness_of(k, solution, connected, graph) for k in range(len(names))])
     registered = connected & (fitness >= settings.acceptance.least_fitness)
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
+    consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
     return Registration(
         names,
         poses,
         baseline,
         registered,
+        component,
         np.where(registered, fitness, np.nan),
         tuple(
             Edge(
@@ -50,20 +54,21 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
             for e, used in zip(edges, solution.consistent, strict=True)
         ),
         tuple(
-            SurfaceDisagrees(names[k], float(fitness[k])) if connected[k] else _exclusion(k, names, graph)
+            SurfaceDisagrees(names[k], float(fitness[k]))
+            if connected[k]
+            else _exclusion(k, names, components, main, graph)
             for k in np.flatnonzero(~registered).tolist()
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
     )  # fmt: skip
 
 
-def _largest_component(edges: Sequence[PairMatch], n: int) -> Bool[ndarray, "n"]:
-    """Frames of the largest group that edges connect; none where nothing is connected."""
-    component = connected_components(edges, n)[0]
-    inside = np.zeros(n, dtype=bool)
-    if len(component) > 1:
-        inside[component] = True
-    return inside
+def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
+    """Number of each frame's component; -1 for single frames."""
+    number = np.full(n, -1, dtype=np.int64)
+    for c, frames in enumerate(c for c in components if len(c) > 1):
+        number[list(frames)] = c
+    return number
 
 
 def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph) -> float:
@@ -77,7 +82,7 @@ def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n
         if j == k or other is None or not graph.see_same_side(S, other):
             continue
         maps = graph.maps[k], graph.maps[j]
-        found = agreement_at(maps, other.inverse() @ S, graph.rng, settings.tolerance, settings)
+        found = agreement_at(maps, other.inverse() @ S, graph.rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
         agreeing += found.agreeing[0]
         judged += found.judged[0]
     return agreeing / judged if judged else 0.0
@@ -102,17 +107,26 @@ def _in_first_camera(
     return poses, baseline
 
 
-def _exclusion(k: int, names: Sequence[str], graph: ViewGraph) -> Exclusion:
+def _exclusion(
+    k: int, names: Sequence[str], components: Sequence[Component], main: Component, graph: ViewGraph
+) -> Exclusion:
     """Why a frame is not in the largest component."""
     settings = graph.settings.edge
     mine = [e for e in graph.matches if k in (e.source, e.target)]
     if not mine:
         return NoCommonSurface(names[k])
     best = max(mine, key=lambda e: quality(e, settings))
-    partner = names[best.other(k)]
-    if is_accepted(best, settings):
-        return InconsistentPair(names[k], partner)
-    return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+    if not is_accepted(best, settings):
+        partner = names[best.other(k)]
+        return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+    component = next(c for c in components if k in c)
+    across = [
+        (e, e.source if e.source in main else e.target)
+        for e in graph.matches
+        if (e.source in main and e.target in component) or (e.target in main and e.source in component)
+    ]
+    partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
+    return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), partner)
 
 
 def _uncertainties(
@@ -122,10 +136,7 @@ def _uncertainties(
     out: list[Uncertainty] = []
     frames: list[int] = np.flatnonzero(registered).tolist()
     for k in frames:
-        mine = [e for e in consistent if k in (e.source, e.target)]
-        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
-        if mine and all(is_ambiguous(e, graph.settings.edge) for e in mine):
-            out.append(AmbiguousPose(names[k]))
-        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
+        sigma_deg = min((e.rotation_sigma_deg for e in consistent if k in (e.source, e.target)), default=0.0)
+        if sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
             out.append(UncertainRotation(names[k], sigma_deg))
     return out

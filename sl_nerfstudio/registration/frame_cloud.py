@@ -87,7 +87,7 @@ def frame_cloud(
         agreeing,
         uv_camera[keep],
         points,
-        sigma_noise=pose.residual_px * found.sigma_depth.numpy(),
+        sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
         sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
     )
 

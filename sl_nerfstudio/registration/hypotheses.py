@@ -1,6 +1,7 @@
 """Several similarities between two frames at once, as arrays."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,11 +17,17 @@ class Hypotheses:
     scale: Float64[ndarray, "k"]
     R: Float64[ndarray, "k 3 3"]
     t: Float64[ndarray, "k 3"]
+    log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
 
     @staticmethod
     def of(S: Similarity) -> "Hypotheses":
         """One similarity alone."""
-        return Hypotheses(np.array([S.scale]), S.R[None], S.t[None])
+        return Hypotheses(np.array([S.scale]), S.R[None], S.t[None], np.log([S.scale]))
+
+    @staticmethod
+    def joined(parts: Sequence["Hypotheses"]) -> "Hypotheses":
+        """Several sets as one."""
+        return Hypotheses(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Hypotheses)))
 
     def __len__(self) -> int:
         """Number of similarities."""
@@ -28,7 +35,7 @@ class Hypotheses:
 
     def __getitem__(self, index: list[int]) -> "Hypotheses":
         """Some of them."""
-        return Hypotheses(self.scale[index], self.R[index], self.t[index])
+        return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
 
     def similarity(self, k: int) -> Similarity:
         """One of them."""

@@ -9,6 +9,15 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.settings import PairSettings
 from sl_nerfstudio.registration.surface_agreement import Agreement
+from sl_nerfstudio.registration.surface_map import SurfaceMap
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A clearly different similarity between the same two frames."""
+
+    S_target_source: Similarity
+    ratio: float  # its score over that of the best one: 1 is as good
 
 
 @dataclass(frozen=True)
@@ -22,8 +31,13 @@ class PairMatch:
     overlap: float  # fraction of all points that lie on the other frame's surface
     fitness: float  # the same among the points that could be judged
     rms: float  # distance of agreeing points from the surface, in radii
-    second_best_ratio: float  # score of the best clearly different similarity over that of this one: 1 is ambiguous
+    rivals: tuple[Rival, ...]  # the best first
     rotation_sigma_deg: float  # standard deviation of the least known rotation: large on surfaces of revolution
+
+    @property
+    def second_best_ratio(self) -> float:
+        """Score of the best rival over that of this similarity: 1 is ambiguous."""
+        return self.rivals[0].ratio if self.rivals else 0.0
 
     def between(self, source: int, target: int) -> Similarity:
         """The similarity from `source` to `target`, whichever way it was found."""
@@ -40,16 +54,21 @@ def match_from(
     S_target_source: Similarity,
     found: Agreement,
     k: int,
-    second_best_ratio: float,
-    target_radius: float,
+    rivals: tuple[Rival, ...],
+    target: SurfaceMap,
     settings: PairSettings,
 ) -> PairMatch:
     """The edge for similarity k of `found`, with the uncertainty that follows from the sums."""
-    D = np.array([target_radius] * 3 + [1] * 4)
-    H = found.H[k] * D[:, None] * D / target_radius**2
-    rms = max(float(np.sqrt(found.squares[k])) / target_radius, settings.least_rms)
+    D = np.array([target.radius] * 3 + [1] * 4)
+    H = found.H[k] * D[:, None] * D / target.radius**2
+    # No pair is assumed to fit better than the surfaces are known: errors of the relative pose bend them.
+    typical = float(np.median(target.sigma[target.valid])) / target.radius
+    rms = max(float(np.sqrt(found.squares[k])), 1.0) * typical
     count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
     information = H * (settings.independent_points / count / rms**2) + settings.least_information * np.eye(7)
+    # Errors of the two relative poses move and bend a surface as a whole: more points do not average them.
+    bending = np.array([settings.shift_sigmas] * 3 + [settings.turn_sigmas] * 4) * rms
+    information = np.linalg.inv(np.linalg.inv(information) + np.diag(bending**2))
     sigma = np.sqrt(1 / np.linalg.eigvalsh(_rotation_information(information))[0])
     return PairMatch(
         *pair,
@@ -58,7 +77,7 @@ def match_from(
         float(found.agreeing[k]),
         float(found.fitness[k]),
         rms,
-        second_best_ratio,
+        rivals,
         float(np.degrees(sigma)),
     )
 

@@ -1,10 +1,10 @@
 """Pose graph optimisation: frames are nodes, similarities between pairs are edges, some of which are wrong.
 
-Wrong edges are kept from doing harm in two ways: the optimisation starts from the spanning tree with which most other
-edges agree, and its Geman-McClure kernel starts wide and narrows (Yang et al., RA-L 2020).
+The start is an assembled component, so most edges agree with it to within their errors. A Geman-McClure kernel that
+starts wide and narrows (Yang et al., RA-L 2020) keeps the others from doing harm.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,38 +12,34 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
+from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots, adjoint, chi_square, exp_at, node_at, residual
 from sl_nerfstudio.registration.pair_match import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PoseGraphSettings
-from sl_nerfstudio.registration.spanning_tree import best_tree
 
 
 @dataclass(frozen=True)
 class PoseGraphSolution:
-    """`S_world_camera` of every frame, None for frames that no edge connects to the root."""
+    """One component of frames in its own world."""
 
-    S_world_camera: Nodes
-    consistent: Bool[ndarray, "edges"]  # edges that agree with the solution
+    S_world_camera: Nodes  # None for frames outside
+    consistent: Bool[ndarray, "edges"]  # edges that agree with the solution; False where an end is outside
 
 
 def optimise_pose_graph(
     edges: Sequence[PairMatch],
     pivots: Pivots,
-    root: int,
-    strength: Float64[ndarray, "edges"],
+    start: Mapping[int, Similarity],
     weight: Float64[ndarray, "edges"],
     settings: PoseGraphSettings = REGISTRATION_DEFAULTS.pose_graph,
 ) -> PoseGraphSolution:
-    """The spanning tree from `root` that most edges agree with, then all edges together, robustly.
-
-    `strength` is what a tree prefers, `weight` that of each edge in the sums. The root's similarity is the identity.
-    """
-    nodes = best_tree(edges, pivots, root, strength, weight, settings)
-    inside = np.array([nodes[e.source] is not None and nodes[e.target] is not None for e in edges], dtype=bool)
+    """All edges inside a component together, robustly, each with its weight. The first frame of `start` stays."""
+    nodes: Nodes = [start.get(k) for k in range(len(pivots))]
+    inside = np.array([e.source in start and e.target in start for e in edges], dtype=bool)
     connected = [e for e, here in zip(edges, inside, strict=True) if here]
-    chi2 = np.full(len(edges), np.inf)  # stays infinite where an end has no pose
+    chi2 = np.full(len(edges), np.inf)
     if connected:
-        nodes = _optimised(connected, nodes, pivots, root, weight[inside], settings)
+        nodes = _optimised(connected, nodes, pivots, next(iter(start)), weight[inside], settings)
         chi2[inside] = chi_square(connected, nodes, pivots)
     return PoseGraphSolution(nodes, chi2 < settings.rejection_factor * settings.kernel_chi2)
 

@@ -33,7 +33,7 @@ def register(
 
     Args:
         clouds: the frames, in the order of capture if `sequence`.
-        sequence: each frame overlaps its neighbours; if not, every pair is tried.
+        sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
         seed: of the choice of points.
         start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
         progress: called with a few words at the beginning of each stage.
@@ -58,6 +58,8 @@ def register(
         graph.try_pairs([(i, j) for i in range(n) for j in range(i + 1, n)], settings.pair.anywhere)
     for _ in range(selection.rounds):
         report("closing loops")
-        graph.bridge_components()
-        graph.try_overlapping(graph.solve().S_world_camera)
+        components = graph.assemble()
+        for component in (c for c in components if len(c) > 1):
+            graph.try_overlapping(graph.solve(component).S_world_camera)
+        graph.bridge(components)
     return accept_frames(tuple(c.name for c in clouds), graph)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 
@@ -34,11 +34,12 @@ class NoCommonSurface:
 
 
 @dataclass(frozen=True)
-class InconsistentPair:
-    """A frame was left out because its best pair does not connect it consistently with the registered frames."""
+class SeparateComponent:
+    """A frame was left out because it, or its component, is not connected to the largest one with certainty."""
 
     frame: str
-    partner: str
+    component: tuple[str, ...]  # all frames of its component
+    partner: str | None  # the frame of the largest component with which it shares most; None: none
 
 
 @dataclass(frozen=True)
@@ -53,26 +54,27 @@ class PoorPair:
     least_fitness: float
 
 
-Exclusion = SurfaceDisagrees | NoCommonSurface | InconsistentPair | PoorPair
+Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair
 """Why a frame was not registered."""
 
 
 @dataclass(frozen=True)
-class AmbiguousPose:
-    """In all consistent pairs of a frame a clearly different similarity fits nearly as well."""
+class UndecidedProjector:
+    """Two poses of a frame's projector explain its coordinates, and the other frames do not tell which is right."""
 
     frame: str
+    angle_deg: float  # between the two poses of the projector
 
 
 @dataclass(frozen=True)
 class UncertainRotation:
-    """No consistent pair of a frame determines its rotation well."""
+    """A frame may slip along the surface that other frames see, as on a vase without texture."""
 
     frame: str
     sigma_deg: float  # of the least known rotation, by the best pair
 
 
-Uncertainty = AmbiguousPose | UncertainRotation
+Uncertainty = UndecidedProjector | UncertainRotation
 """What is uncertain about a registered frame."""
 
 
@@ -84,6 +86,7 @@ class Registration:
     T_world_camera: Float64[ndarray, "n 4 4"]  # NaN where not registered
     baseline: Float64[ndarray, "n"]  # camera to projector; geometric mean 1 over the registered frames; NaN elsewhere
     registered: Bool[ndarray, "n"]
+    component: Int64[ndarray, "n"]  # 0: the largest, which is registered; 1, 2, ...: others; -1: a single frame
     fitness: Float64[ndarray, "n"]  # share of each frame's judged points that agree; NaN where not registered
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered

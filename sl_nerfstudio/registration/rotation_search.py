@@ -28,22 +28,25 @@ def rotations(search: Search) -> Float64[ndarray, "k 3 3"]:
 
 
 def around_guess(target: SurfaceMap, search: Search, guess: Similarity) -> Hypotheses:
-    """A guess, rotated about the object."""
-    turn, pivot = rotations(search), target.object_centre
+    """A guess, rotated about what may be the object."""
+    return Hypotheses.joined([_rotated(rotations(search), view.centre, guess) for view in target.views])
+
+
+def _rotated(turn: Float64[ndarray, "k 3 3"], pivot: Float64[ndarray, "3"], guess: Similarity) -> Hypotheses:
     t = pivot + np.einsum("kij,j->ki", turn, guess.t - pivot)
-    return Hypotheses(np.full(len(turn), guess.scale), turn @ guess.R, t)
+    scale = np.full(len(turn), guess.scale)
+    return Hypotheses(scale, turn @ guess.R, t, np.log(scale))
 
 
 def without_guess(source: SurfaceMap, target: SurfaceMap, search: Search, scales: tuple[float, ...]) -> Hypotheses:
     """Rotations of two cameras that look at the object from the same side.
 
-    `scales` are relative to the one that makes the visible parts equally large.
+    The frames' guesses of where the object is are put onto each other, one after the other. `scales` are relative to
+    the one at which their sizes are equal.
     """
-    turn = rotations(search)
-    size = target.radius / source.radius
-    k, parts = len(turn), [(f * size, target.object_centre - f * size * turn @ source.object_centre) for f in scales]
-    return Hypotheses(
-        np.repeat([scale for scale, _ in parts], k),
-        np.concatenate([turn] * len(parts)),
-        np.concatenate([t for _, t in parts]),
-    )
+    turn, parts = rotations(search), []
+    for a, b in zip(source.views, target.views, strict=True):
+        for scale in (factor * b.size / a.size for factor in scales):
+            size = np.full(len(turn), scale)
+            parts.append(Hypotheses(size, turn, b.centre - scale * turn @ a.centre, np.log(size)))
+    return Hypotheses.joined(parts)

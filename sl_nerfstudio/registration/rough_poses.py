@@ -52,7 +52,7 @@ def with_common_centre(
     is still a good start.
     """
     pairs = zip(S_world_camera, maps, strict=True)
-    centres = [None if S is None else S.points(m.object_centre[None])[0] for S, m in pairs]
+    centres = [None if S is None else S.points(m.views[0].centre[None])[0] for S, m in pairs]
     known = [p for p in centres if p is not None]
     common = np.median(known, axis=0) if known else np.zeros(3)
     return [

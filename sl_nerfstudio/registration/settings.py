@@ -29,8 +29,20 @@ class SurfaceMapSettings:
     """cosine between ray and normal below which a surface is seen too obliquely"""
     largest_sigma_ratio: float = 4.0
     """uncertainty of a point relative to the frame's median, beyond which it is left out"""
+    lattice_error: float = 0.25
+    """error of a point that no averaging removes, map pixels"""
+    orientations: int = 150
+    """directions that normals are sorted into, about 15 degrees apart"""
     centre_depth: float = 0.4
     """radii from the centroid of the visible points to about the centre of the object behind them"""
+    middle: float = 0.15
+    """distance from the image's centre, as a share of its shorter side, within which the object may be expected"""
+    fewest_central: int = 200
+    """map pixels in the middle at least; with fewer, the middle is larger"""
+    near_quantile: float = 0.3
+    """quantile of the depths in the middle at which the object is expected: a table may be behind it"""
+    nearness: float = 0.1
+    """share of that depth by which the object's centre lies behind its surface at most"""
 
 
 @dataclass(frozen=True)
@@ -41,8 +53,13 @@ class AgreementSettings:
     """radii behind a surface: points that are farther back are hidden by it, nearer ones contradict it"""
     least_facing_cosine: float = 0.3
     """cosine between the normals of two places that may be the same"""
-    behind_penalty: float = 0.5
-    """what a point a little behind the surface costs in the score; a point in front of it costs 1"""
+    behind: float = 0.5
+    """what a point a little behind the surface counts as, where a point in front of it counts as 1"""
+    search_penalty: float = 1.0
+    """what a point that contradicts costs in the score while starts are compared; one that agrees earns 1"""
+    penalty: float = 3.0
+    """the same where results are compared: of right pairs hardly any point contradicts, and a plane always agrees with
+    a plane"""
     kernel_cutoff: float = 4.0
     """widths of the robust kernel beyond which a point has no weight"""
 
@@ -71,14 +88,16 @@ class PairSettings:
     """for frames that other pairs have placed"""
     rough: Search = field(default_factory=lambda: Search(30.0, 12.0))
     """for frames with rough camera poses"""
-    start_scales: tuple[float, ...] = (0.87, 1.0, 1.15)
-    """scales to start from, relative to the one that makes the visible parts equally large"""
-    tolerance: float = 0.04
-    """radii within which a point agrees with a surface: errors of the relative pose bend surfaces by about this much"""
+    start_scales: tuple[float, ...] = (0.8, 1.0, 1.25)
+    """scales to start from, relative to the one that makes the expected objects equally large, or equally far"""
+    tolerance_sigmas: float = 4.0
+    """standard deviations of the two surfaces within which a point agrees"""
     search_tolerance: float = 0.15
-    """the same while starts are compared"""
-    coarse_tolerance_factor: float = 2.0
-    """tolerance times this while the results of the first refinement are compared"""
+    """radii within which a point agrees while starts are compared"""
+    coarse_tolerance: float = 0.06
+    """the same while the results of the first refinement are compared"""
+    likeness_points: int = 80
+    """points of each frame by which pairs are chosen"""
     search_points: int = 200
     """points of each frame by which starts are compared"""
     coarse_points: int = 400
@@ -90,23 +109,35 @@ class PairSettings:
     fine_starts: int = 4
     """best distinct results that are refined further"""
     coarse_widths: tuple[float, ...] = (0.3, 0.3, 0.25, 0.25, 0.2, 0.2, 0.15, 0.15, 0.12, 0.1, 0.08, 0.08)
-    """kernel width of each step of the first refinement, radii"""
-    fine_widths: tuple[float, ...] = (0.08, 0.06, 0.05, 0.04, 0.03, 0.03, 0.03, 0.03)
-    """kernel width of each step of the last refinement, radii"""
+    """kernel width of each step of the first refinement, radii; never below `kernel_sigmas`"""
+    fine_widths: tuple[float, ...] = (0.08, 0.06, 0.04, 0.03, 0.02, 0.015, 0.01, 0.0, 0.0, 0.0)
+    """kernel width of each step of the last refinement, radii; never below `kernel_sigmas`"""
+    kernel_sigmas: float = 3.0
+    """least width of the kernel, in standard deviations of the two surfaces"""
+    likely: float = 0.7
+    """share of the largest overlap that a result must have to say how closely surfaces agree"""
+    common_rms: float = 2.5
+    """width at which results are compared, in root mean square distances of the closest one"""
+    least_width: float = 0.3
+    """least such width, in standard deviations of the surfaces"""
+    common_steps: int = 4
+    """steps of refinement with a kernel of that width"""
     damping: float = 1e-4
     """damping of a step, as a share of the trace of the normal equations"""
     largest_step: float = 0.5
     """size of a step, radii"""
-    scale_sigma: float = 0.2
-    """prior of the logarithm of the scale: how far the sizes of the visible parts may differ"""
+    scale_sigma: float = 0.25
+    """prior of the logarithm of the scale, about that of the start"""
     largest_log_scale: float = 0.6
-    """bound of the logarithm of the scale"""
+    """bound of the logarithm of the scale, about that of the start"""
     independent_points: float = 40.0
     """points of a pair that count as independent: errors of a surface are shared by neighbouring points"""
     least_information: float = 1e-3
     """information on each unknown that is assumed at least, in inverse squares of radians and radii"""
-    least_rms: float = 0.015
-    """radii: no pair is assumed to fit better, because errors of the relative pose bend the surfaces"""
+    shift_sigmas: float = 1.5
+    """error of a pair's translation that all points share, in standard deviations of the surfaces"""
+    turn_sigmas: float = 0.4
+    """the same of its rotation and its scale, as lengths at one radius"""
     same_rotation_deg: float = 6.0
     """rotation between two results, in degrees, below which they are one"""
     same_shift: float = 0.12
@@ -137,22 +168,12 @@ class EdgeSettings:
 
 @dataclass(frozen=True)
 class PoseGraphSettings:
-    """Cycle consistency, spanning tree and robust optimisation of the graph of frames."""
+    """Robust optimisation of the graph of frames."""
 
-    cycle_rotation_deg: float = 6.0
-    """rotation, in degrees, by which three pairs may fail to close a cycle"""
-    cycle_shift: float = 0.15
-    """shift, in radii, by which three pairs may fail to close a cycle"""
-    cycle_log_scale: float = 0.15
-    """logarithm of the scale by which three pairs may fail to close a cycle"""
-    cycle_weight: float = 5.0
-    """what a closed cycle adds to the strength of an edge in a spanning tree; a perfect pair adds 1"""
-    trees: int = 20
-    """spanning trees of which the best starts the optimisation: one tree may hold a wrong pair"""
     kernel_chi2: float = 40.0
     """chi square (7 degrees of freedom) at which an edge counts a quarter: errors of edges are not quite normal"""
     first_kernel_factor: float = 30.0
-    """kernel_chi2 times this to begin with: the drift of a tree must be within it, wrong pairs should be beyond"""
+    """kernel_chi2 times this to begin with: the drift of a component must be within it, wrong pairs beyond"""
     kernel_shrinkage: float = 1.7
     """factor by which the squared kernel width falls in an iteration"""
     rejection_factor: float = 4.0
@@ -163,6 +184,32 @@ class PoseGraphSettings:
     """step, in radian and radii, below which the optimisation has converged"""
     largest_log_scale_step: float = 0.5
     """logarithm of the scale that one step may change"""
+
+
+@dataclass(frozen=True)
+class AssemblySettings:
+    """Which components of frames are joined."""
+
+    tolerance_sigmas: float = 6.0
+    """standard deviations of two surfaces within which points agree: components have small errors of their own"""
+    least_agreeing: float = 0.15
+    """points that must agree across two components, in frames: 1 is all points of one frame"""
+    misfit_factor: float = 2.5
+    """share of the points that may contradict, of those that can be judged, relative to good pairs of the scan"""
+    least_misfit: float = 0.015
+    """share that may contradict in good pairs: points at edges do in every pair"""
+    largest_sigma_deg: float = 3.0
+    """standard deviation of the least known rotation, in degrees, of a pair that joins two components on its own"""
+    largest_rival: float = 0.85
+    """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
+    most_compared: int = 8
+    """clearly different similarities that are compared at most"""
+    same_rotation_deg: float = 8.0
+    """rotation between two similarities, in degrees, below which they are one"""
+    same_shift: float = 0.2
+    """shift between two similarities, in radii, below which they are one"""
+    most_pairs: int = 12
+    """pairs of frames across two components that are compared at most"""
 
 
 @dataclass(frozen=True)
@@ -181,8 +228,12 @@ class PairSelectionSettings:
     """pairs of each frame that are tried for closing cycles"""
     rounds: int = 2
     """rounds of closing cycles"""
-    bridges: int = 4
-    """frames of the largest group with which each frame outside is paired"""
+    bridges: int = 8
+    """pairs of frames across two components that are registered in order to join them"""
+    most_compared: int = 40
+    """pairs across two components of which those that look most alike are chosen"""
+    bridges_nearby: int = 3
+    """how many of these are those taken one soon after the other"""
 
 
 @dataclass(frozen=True)
@@ -225,6 +276,8 @@ class RegistrationSettings:
     """which pairs are registered"""
     edge: EdgeSettings = field(default_factory=EdgeSettings)
     """which pairs are accepted"""
+    assembly: AssemblySettings = field(default_factory=AssemblySettings)
+    """which components of frames are joined"""
     pose_graph: PoseGraphSettings = field(default_factory=PoseGraphSettings)
     """all accepted pairs together"""
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)

@@ -32,11 +32,20 @@ class Side:
     map: SurfaceMap
     points: Float64[ndarray, "n 3"]
     normals: Float64[ndarray, "n 3"]
+    sigma: Float64[ndarray, "n"]  # along the normals
 
     @staticmethod
     def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
         """With about `count` points spread evenly over the image."""
         return Side(surface, *surface.sample(count, rng))
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """A distance between two surfaces: the larger of a length and a multiple of their standard deviation."""
+
+    radii: float  # of the target's points
+    sigmas: float
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class Agreement:
     agreeing: Float64[ndarray, "k"]  # fraction of the points that lie on the other surface
     in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
     behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
-    squares: Float64[ndarray, "k"]  # mean squared distance of those that agree
+    squares: Float64[ndarray, "k"]  # mean squared distance of those that agree, in units of its variance
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
@@ -60,33 +69,33 @@ class Agreement:
         """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
         return self.agreeing + self.in_front + self.behind
 
-    def score(self, behind_penalty: float) -> Float64[ndarray, "k"]:
-        """Points that agree less those that contradict the similarity."""
-        return self.agreeing - self.in_front - behind_penalty * self.behind
+    def score(self, penalty: float, behind: float) -> Float64[ndarray, "k"]:
+        """Points that agree less `penalty` times those that contradict, of which points behind count as `behind`."""
+        return self.agreeing - penalty * (self.in_front + behind * self.behind)
 
 
 def agreement(
     source: Side,
     target: Side,
     hypotheses: Hypotheses,
-    tolerance: float,
-    width: float,
+    tolerance: Tolerance,
+    width: Tolerance,
     settings: AgreementSettings = REGISTRATION_DEFAULTS.pair.agreement,
 ) -> Agreement:
     """Both ways, for k similarities `p_target = scale R p_source + t`.
 
-    `tolerance` is the distance within which points agree, `width` that of the robust kernel, both in radii of the
-    target's points.
+    `tolerance` is the distance within which points agree, `width` that of the robust kernel.
     """
     k, radius = len(hypotheses), target.map.radius
     H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 4))
-    tolerances = np.array([tolerance, width, settings.hidden_depth]) * radius
+    tolerances = np.array([tolerance.radii * radius, width.radii * radius, settings.hidden_depth * radius,
+                           tolerance.sigmas, width.sigmas])  # fmt: skip
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
         _sums(
-            len(scale), mover.points, mover.normals, scale, R, t, bool(reverse),
-            m.point, m.normal, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
+            len(scale), mover.points, mover.normals, mover.sigma, scale, R, t, bool(reverse),
+            m.point, m.normal, m.sigma, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
             settings.least_facing_cosine, settings.kernel_cutoff, H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
@@ -98,7 +107,7 @@ def agreement_at(
     maps: tuple[SurfaceMap, SurfaceMap],
     S_target_source: Similarity,
     rng: np.random.Generator,
-    tolerance: float,
+    tolerance: Tolerance,
     settings: PairSettings,
 ) -> Agreement:
     """How two frames agree under one similarity."""
@@ -108,12 +117,12 @@ def agreement_at(
 
 @compiled_range
 def _sums(
-    first, last, points, normals, scale, R, t, reverse, map_point, map_normal, valid, code, camera, c, tolerances,
-    least_facing, cutoff, H, g, counts
+    first, last, points, normals, sigma, scale, R, t, reverse, map_point, map_normal, map_sigma, valid, code, camera, c,
+    tolerances, least_facing, cutoff, H, g, counts
 ):  # fmt: skip
     """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
     h, w = valid.shape
-    tau, width, hidden = tolerances[0], tolerances[1], tolerances[2]
+    hidden = tolerances[2]
     for k in range(first, last):
         s = scale[k]
         J = np.zeros(7)
@@ -147,10 +156,14 @@ def _sums(
             r = na * (X - map_point[i, j, 0]) + nb * (Y - map_point[i, j, 1]) + nc * (Z - map_point[i, j, 2])
             if reverse:
                 r *= s
+                spread = np.hypot(sigma[n], s * map_sigma[i, j])
+            else:
+                spread = np.hypot(s * sigma[n], map_sigma[i, j])
+            tau, width = max(tolerances[0], tolerances[3] * spread), max(tolerances[1], tolerances[4] * spread)
             facing = na * A + nb * B + nc * C
             if abs(r) < tau and facing > least_facing:
                 counts[k, 0] += 1
-                counts[k, 3] += r * r
+                counts[k, 3] += (r / spread) ** 2
             elif r > tau:
                 counts[k, 1] += 1
             elif r > -hidden:

@@ -16,16 +16,26 @@ from sl_nerfstudio.relative_pose.ray_pairs import directions
 
 
 @dataclass(frozen=True)
+class View:
+    """A guess of which part of a frame other frames see too, as a start of registration."""
+
+    centre: Float64[ndarray, "3"]  # about the centre of the object, which lies behind what is seen of it
+    size: float  # a length that is about the same in frames that see the same object from about as far
+
+
+@dataclass(frozen=True)
 class SurfaceMap:
     """Points and normals of a frame on a regular lattice of camera pixels; lengths in units of its baseline."""
 
     camera: Device  # of the map: the frame's camera, scaled
     point: Float64[ndarray, "h w 3"]  # camera axes
     normal: Float64[ndarray, "h w 3"]  # towards the camera
+    sigma: Float64[ndarray, "h w"]  # one standard deviation of the surface along its normal
     valid: Bool[ndarray, "h w"]
+    weight: Float64[ndarray, "m"]  # of each valid place when places are drawn: large where few look its way
     centroid: Float64[ndarray, "3"]
-    object_centre: Float64[ndarray, "3"]  # about the centre of the object, which lies behind what is seen of it
     radius: float  # RMS distance of the points from the centroid
+    views: tuple[View, ...]  # what may be the object that this and other frames see
 
     @property
     def parameters(self) -> Float64[ndarray, "8"]:
@@ -37,12 +47,18 @@ class SurfaceMap:
         """Model of the map's camera, for compiled loops."""
         return MODELS[self.camera.model].code
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
-        """Points and normals of about `count` places spread evenly over the image."""
+    def sample(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"], Float64[ndarray, "n"]]:
+        """Points, normals and sigma of `count` places spread over the image and over the surface's orientations.
+
+        A table says little about where a frame is, however much of the image it fills: orientations that are rare count
+        more (normal-space sampling, Rusinkiewicz and Levoy, 3DIM 2001).
+        """
         index = np.flatnonzero(self.valid)
-        step = max(1.0, len(index) / count)
-        chosen = index[np.floor(np.arange(0, len(index) - 1e-9, step) + rng.uniform(0, 0.999)).astype(int) % len(index)]
-        return self.point.reshape(-1, 3)[chosen], self.normal.reshape(-1, 3)[chosen]
+        place = (np.arange(count) + rng.uniform(0, 1)) / count
+        chosen = index[np.searchsorted(np.cumsum(self.weight), place * self.weight.sum()).clip(0, len(index) - 1)]
+        return self.point.reshape(-1, 3)[chosen], self.normal.reshape(-1, 3)[chosen], self.sigma.reshape(-1)[chosen]
 
 
 def build_surface_map(
@@ -59,8 +75,10 @@ def build_surface_map(
     index = np.minimum(row, camera.h - 1) * camera.w + np.minimum(column, camera.w - 1)
     size = camera.w * camera.h
     weight = np.bincount(index, minlength=size)
+    shape = (camera.h, camera.w)
     mean = np.bincount(index, -1 / cloud.points[keep, 2], size) / np.maximum(weight, 1)
-    inverse_depth = np.where(weight > 0, mean, np.nan).reshape(camera.h, camera.w)
+    inverse_depth = np.where(weight > 0, mean, np.nan).reshape(shape)
+    sigma_ray = (np.bincount(index, cloud.sigma[keep], size) / np.maximum(weight, 1)).reshape(shape)
     fitted = np.full((camera.h, camera.w, 3), np.nan)
     _fit_inverse_depth(
         camera.h,
@@ -78,18 +96,64 @@ def build_surface_map(
     cosine = -(normal * ray).sum(-1) / np.linalg.norm(ray, axis=-1)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > settings.least_cosine)
-    points = point[valid] if valid.any() else cloud.points
-    centroid = points.mean(0)
-    radius = float(np.sqrt(((points - centroid) ** 2).sum(-1).mean()))
+    depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
+    sigma = np.hypot(sigma_ray * np.abs(np.nan_to_num(cosine)), settings.lattice_error * depth / camera.fl_x)
+    points, place = (point[valid], uv.reshape(*shape, 2)[valid]) if valid.any() else (cloud.points, None)
+    centroid, radius = _centre_and_radius(points)
     return SurfaceMap(
         camera,
         np.ascontiguousarray(np.nan_to_num(point)),
         np.ascontiguousarray(np.nan_to_num(normal)),
+        np.ascontiguousarray(sigma),
         valid,
+        _orientation_weights(normal[valid], settings.orientations),
         centroid,
-        centroid * (1 + settings.centre_depth * radius / np.linalg.norm(centroid)),
         radius,
+        _views(points, place, camera, settings),
     )
+
+
+def _orientation_weights(normal: Float64[ndarray, "m 3"], count: int) -> Float64[ndarray, "m"]:
+    """One over the square root of how many normals have about the same direction."""
+    if not len(normal):
+        return np.zeros(0)
+    k = np.arange(count) + 0.5
+    height, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k  # a lattice of directions (Vogel's spiral)
+    flat = np.sqrt(1 - height**2)
+    nearest = (normal @ np.stack([flat * np.cos(turn), flat * np.sin(turn), height])).argmax(1)
+    return 1 / np.sqrt(np.bincount(nearest, minlength=count)[nearest])
+
+
+def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "3"], float]:
+    centroid = points.mean(0)
+    return centroid, float(np.sqrt(((points - centroid) ** 2).sum(-1).mean()))
+
+
+def _views(
+    points: Float64[ndarray, "n 3"],
+    uv: Float64[ndarray, "n 2"] | None,
+    camera: Device,
+    settings: SurfaceMapSettings,
+) -> tuple[View, ...]:
+    """Everything that the frame sees; and what lies in the middle of its image, at what depth that is.
+
+    With nothing but the object in view, its visible parts are about equally large in all frames. A wall that only some
+    frames see changes size and centre of everything; cameras that look at the object have it in the middle all the
+    same, and are about equally far from it.
+    """
+    centroid, radius = _centre_and_radius(points)
+    behind = settings.centre_depth * radius
+    views = [View(centroid * (1 + behind / np.linalg.norm(centroid)), radius)]
+    if uv is None:
+        return tuple(views)
+    off = np.abs(uv - (camera.cx, camera.cy)).max(-1) / min(camera.w, camera.h)
+    central = np.sort(off)[min(len(off), settings.fewest_central) - 1]
+    middle = points[off <= max(central, settings.middle)]
+    depth = np.linalg.norm(middle, axis=1)
+    place = np.median(middle / depth[:, None], axis=0)
+    near = float(np.quantile(depth, settings.near_quantile))
+    views.append(View(place / np.linalg.norm(place) * (near + min(behind, settings.nearness * near)), near))
+    return tuple(views)
 
 
 def _normals(

@@ -1,19 +1,20 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.registration.cycle_consistency import cycle_consistency
+from sl_nerfstudio.registration.assembly import Assembly, Component
 from sl_nerfstudio.registration.edge_weights import edge_weights, is_accepted, quality
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
 from sl_nerfstudio.registration.pair_match import PairMatch
-from sl_nerfstudio.registration.pair_registration import register_pair
+from sl_nerfstudio.registration.pair_registration import register_pair, search_score
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings, Search
-from sl_nerfstudio.registration.surface_agreement import agreement_at
+from sl_nerfstudio.registration.surface_agreement import Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 Pair = tuple[int, int]
@@ -30,6 +31,7 @@ class ViewGraph:
         self.settings = settings
         self._start = start  # S_world_camera of frames where it is known roughly
         self._pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
+        self._sides = [Side.sampled(m, settings.pair.coarse_points, rng) for m in maps]
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
 
@@ -57,24 +59,21 @@ class ViewGraph:
             if guess is not None:
                 self._register(pair, self.settings.pair.nearby, guess)
 
-    def bridge_components(self) -> None:
-        """Where frames form several components, search between them everywhere: one may be upside down."""
-        main, *others = connected_components(self.edges, len(self.maps))
+    def bridge(self, components: Sequence[Component]) -> None:
+        """Search between components everywhere: one may be upside down."""
         pairs: set[Pair] = set()
-        for k in (k for component in others for k in component):
-            nearest = sorted(main, key=lambda m: abs(m - k))[: self.settings.selection.bridges]
-            pairs |= {(min(k, m), max(k, m)) for m in nearest}
+        for first, second in combinations(components, 2):
+            pairs |= set(self._bridges(first, second))
         self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
 
-    def solve(self) -> PoseGraphSolution:
-        """Poses of the largest component of frames."""
-        edges, settings = self.edges, self.settings
-        root = connected_components(edges, len(self.maps))[0][0]
-        weight = edge_weights(edges, settings.edge)
-        # A spanning tree should prefer pairs that close cycles, then surfaces that agree and are not ambiguous.
-        cycles = cycle_consistency(edges, self._pivots, weight, settings.pose_graph)
-        strength = settings.pose_graph.cycle_weight * cycles + np.array([quality(e, settings.edge) for e in edges])
-        return optimise_pose_graph(edges, self._pivots, root, strength, weight, settings.pose_graph)
+    def assemble(self) -> list[Component]:
+        """Components of frames whose connection is certain, the largest first."""
+        return Assembly(self._sides, self._pivots, self.edges, self.settings).grow()
+
+    def solve(self, component: Component) -> PoseGraphSolution:
+        """A component with all edges inside it optimised together."""
+        weight = edge_weights(self.edges, self.settings.edge)
+        return optimise_pose_graph(self.edges, self._pivots, component, weight, self.settings.pose_graph)
 
     def see_same_side(self, a: Similarity, b: Similarity) -> bool:
         """Whether the lines of sight of two cameras differ little enough to see a common surface."""
@@ -88,17 +87,31 @@ class ViewGraph:
         if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
             self._tried[pair] = match
 
+    def _bridges(self, first: Component, second: Component) -> list[Pair]:
+        """Pairs across two components: those taken one soon after the other, and those that look most alike."""
+        selection = self.settings.selection
+        pairs = [(min(i, j), max(i, j)) for i in first for j in second]
+        nearby = sorted(pairs, key=lambda p: p[1] - p[0])[: selection.bridges_nearby]
+        others = [p for p in pairs if p not in nearby]
+        some = [others[k] for k in self.rng.permutation(len(others))[: selection.most_compared]]
+        alike = sorted(some, key=lambda p: -self._likeness(p))
+        return nearby + alike[: selection.bridges - len(nearby)]
+
+    def _likeness(self, pair: Pair) -> float:
+        maps = self.maps[pair[0]], self.maps[pair[1]]
+        return search_score(maps, self.settings.pair.anywhere, self.rng, self.settings.pair)
+
     def _overlapping(self, S_world_camera: Nodes) -> list[Pair]:
         """For every frame the pairs with the largest expected overlap, without those that are edges already."""
         selection, n = self.settings.selection, len(S_world_camera)
+        tolerance = Tolerance(selection.overlap_tolerance, self.settings.pair.tolerance_sigmas)
         shares = np.zeros((n, n))
-        for i in range(n):
-            for j in range(i + 1, n):
-                a, b = S_world_camera[i], S_world_camera[j]
-                if a is not None and b is not None and self.see_same_side(a, b):
-                    maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
-                    found = agreement_at(maps, S, self.rng, selection.overlap_tolerance, self.settings.pair)
-                    shares[i, j] = shares[j, i] = found.agreeing[0]
+        for i, j in combinations(range(n), 2):
+            a, b = S_world_camera[i], S_world_camera[j]
+            if a is not None and b is not None and self.see_same_side(a, b):
+                maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
+                found = agreement_at(maps, S, self.rng, tolerance, self.settings.pair)
+                shares[i, j] = shares[j, i] = found.agreeing[0]
         pairs: set[Pair] = set()
         for i in range(n):
             for j in np.argsort(-shares[i], kind="stable")[: selection.partners].tolist():
@@ -109,16 +122,6 @@ class ViewGraph:
     def _is_edge(self, pair: Pair) -> bool:
         match = self._tried.get(pair)
         return match is not None and is_accepted(match, self.settings.edge)
-
-
-def connected_components(edges: Iterable[PairMatch], n: int) -> list[list[int]]:
-    """Connected frames, the largest component first."""
-    label = list(range(n))
-    for e in edges:
-        a, b = label[e.source], label[e.target]
-        label = [a if x == b else x for x in label]
-    components = [[k for k in range(n) if label[k] == x] for x in dict.fromkeys(label)]
-    return sorted(components, key=len, reverse=True)
 
 
 def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:

@@ -37,7 +37,7 @@ class Degeneracy:
     - pure rotation, planar: relief that is left, in projector pixels
     - small parallax: median angle between the rays, in degrees
     - epipole in view: none
-    - ambiguous: noise of the second best solution over that of the best
+    - ambiguous: shares of the correspondences that the second best solution and the best one explain
     - many outliers: share of the correspondences that disagree
     - poor fit: noise of the residuals, in projector pixels
     - uncertain: standard deviations of the rotation and of the baseline's direction, in degrees
@@ -52,7 +52,7 @@ def find_degeneracies(
     rays: RayPairs,
     inlier: Bool[ndarray, "n"],
     sigma_deg: tuple[float, float],
-    second_best: EpipolarFit | None,
+    explained: tuple[float, float] | None,
     blocks_of_pattern: int,
     limits: DegeneracyLimits = RELATIVE_POSE_DEFAULTS.degeneracy,
 ) -> tuple[Degeneracy, ...]:
@@ -63,7 +63,7 @@ def find_degeneracies(
         rays: the frame's correspondences.
         inlier: those that agree with the pose.
         sigma_deg: standard deviations of rotation and of the baseline's direction.
-        second_best: the best clearly different solution, if there is one.
+        explained: what the second best solution and this one explain, where another explains nearly as much.
         blocks_of_pattern: number of squares of the whole pattern.
         limits: when a frame counts as degenerate.
     """
@@ -74,7 +74,6 @@ def find_degeneracies(
     plane, rotation = plane_relief(good, limits), rotation_relief(good, limits)
     parallax_deg = float(np.degrees(np.median(ray_angles(found, good))))
     outliers = 1 - float(inlier.mean())
-    ratio = np.inf if second_best is None else second_best.noise_px / noise
     too_uncertain = (
         sigma_deg[0] > limits.largest_sigma_rotation_deg or sigma_deg[1] > limits.largest_sigma_direction_deg
     )
@@ -86,7 +85,7 @@ def find_degeneracies(
         (rotation >= least_relief and parallax_deg < limits.least_parallax_deg, "small parallax", (parallax_deg,)),
         (rotation >= least_relief and plane < least_relief, "planar", (plane,)),
         (epipole_in_view(found, good, limits.epipole_sectors), "epipole in view", ()),
-        (ratio < limits.least_second_best_ratio, "ambiguous", (ratio,)),
+        (explained is not None, "ambiguous", explained or ()),
         (outliers > limits.largest_outlier_share, "many outliers", (outliers,)),
         (noise > limits.largest_noise_px, "poor fit", (noise,)),
         (too_uncertain, "uncertain", sigma_deg),

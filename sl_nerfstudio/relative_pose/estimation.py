@@ -3,17 +3,20 @@
 Five degrees of freedom; the length of the baseline cannot be seen in one frame and is set to one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
+from sl_nerfstudio.relative_pose.candidates import Candidate, ranked, relative_pose_candidates
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, find_degeneracies
 from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, distinct, fit_epipolar
-from sl_nerfstudio.relative_pose.five_point import five_point_candidates, in_front
+from sl_nerfstudio.relative_pose.five_point import in_front
 from sl_nerfstudio.relative_pose.pattern_blocks import block_count
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.sampson import sampson
@@ -31,14 +34,17 @@ class RelativePose:
     `covariance` is that of (w, b): a rotation of the projector about its own centre, in camera axes and radian
     (`R <- exp(w) R`), and a rotation of the baseline (`t <- exp(B b) t`, B = `sampson.direction_basis(t)`).
     It allows for errors that neighbouring pixels share, within squares of 1/25 of the pattern; errors of the whole
-    frame (intrinsics) are not included.
+    frame (intrinsics) are not included, nor is it part of it that an alternative may be the true pose.
     """
 
     T_camera_projector: Float64[ndarray, "4 4"]
     covariance: Float64[ndarray, "5 5"]
     inliers: Bool[ndarray, "n"]  # of the correspondences given: epipolar error within four sigma, in front of both
     residual_px: float  # robust standard deviation of the epipolar error, projector pixels
+    noise_px: Float64[ndarray, "n"]  # the same around each correspondence; NaN where it has no ray
+    explained: float  # share of the correspondences, each by how well it fits at a width common to all solutions
     degeneracies: tuple[Degeneracy, ...]
+    alternatives: tuple["RelativePose", ...] = ()  # poses that explain nearly as much, the best first
 
     @property
     def sigma_rotation_deg(self) -> float:
@@ -73,37 +79,83 @@ def estimate_relative_pose(
             "    remedy: more light, less exposure by other sources, the object larger in the image"
         )
     some = rays.chosen(subsample(np.arange(len(rays)), settings.most, rng))
-    candidates = five_point_candidates(some, rng, settings)
+    candidates = relative_pose_candidates(some, rng, settings)
     if not candidates:
         raise _no_pose("no relative pose puts most points in front of both devices")
-    found = fit_epipolar(candidates[0].fit.R, candidates[0].fit.t, some, settings.fit)
-    others = (c.fit for c in candidates[1:])
-    second_best = next((o for o in others if distinct((o.R, o.t), (found.R, found.t), settings.second_best)), None)
-    good = _inliers(found, rays, settings.inlier_sigmas)
-    if found.noise_px > settings.largest_noise_share * projector.w or good.mean() < settings.least_inlier_share:
+    rivals = [c for c in candidates if c.rivals_best][: settings.candidates.most]
+    solutions = _distinct_solutions([fit_epipolar(c.fit.R, c.fit.t, some, settings.fit) for c in rivals], settings)
+    solutions = ranked(solutions, some, settings)
+    frame = _Frame(len(uv_camera), usable, rays, some, block_count(projector, settings.blocks), settings)
+    second_best = solutions[1].explained if len(solutions) > 1 else None
+    alternatives = tuple(_relative_pose(c, None, (), frame) for c in solutions[1:])
+    found = _relative_pose(solutions[0], second_best, alternatives, frame)
+    good = float(found.inliers[usable].mean())
+    if found.residual_px > settings.largest_noise_share * projector.w or good < settings.least_inlier_share:
         raise _no_pose(
-            f"the best relative pose fits {good.mean():.0%} of the decoded pixels to within {found.noise_px:.2g} px"
+            f"the best relative pose fits {good:.0%} of the decoded pixels to within {found.residual_px:.2g} px"
         )
-    cov = covariance(found, some, settings.fit)
+    return found
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What all solutions of a frame have in common."""
+
+    correspondences: int  # that were given
+    usable: Int64[ndarray, "m"]  # those that have rays
+    rays: RayPairs
+    some: RayPairs  # to which solutions were fitted
+    blocks: int  # squares of the whole pattern
+    settings: RelativePoseSettings
+
+
+def _distinct_solutions(fits: Sequence[EpipolarFit], settings: RelativePoseSettings) -> list[EpipolarFit]:
+    """Without those that are close to an earlier one: unfinished refinements may have the same end."""
+    kept: list[EpipolarFit] = []
+    for fit in fits:
+        if all(distinct((fit.R, fit.t), (other.R, other.t), settings.solutions) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _relative_pose(
+    solution: Candidate, second_best: float | None, alternatives: tuple[RelativePose, ...], frame: _Frame
+) -> RelativePose:
+    """A solution with its covariance, inliers and degeneracies."""
+    found, settings = solution.fit, frame.settings
+    cov = covariance(found, frame.some, settings.fit)
     degeneracies = find_degeneracies(
         found,
-        some,
+        frame.some,
         np.abs(found.residual) < settings.inlier_sigmas * found.noise_px,
         (_angle_sigma_deg(cov[:3, :3]), _angle_sigma_deg(cov[3:, 3:])),
-        second_best,
-        block_count(projector, settings.blocks),
+        None if second_best is None else (second_best, solution.explained),
+        frame.blocks,
         settings.degeneracy,
     )
-    inliers = np.zeros(len(uv_camera), dtype=bool)
-    inliers[usable] = good
+    residual = sampson(found.R, found.t, frame.rays)
+    noise = _noise_around(residual, frame.rays, found.noise_px, settings)
+    good = (np.abs(residual) < settings.inlier_sigmas * noise) & in_front(found.R, found.t, frame.rays)
+    inliers, noise_px = np.zeros(frame.correspondences, dtype=bool), np.full(frame.correspondences, np.nan)
+    inliers[frame.usable], noise_px[frame.usable] = good, noise
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found.R, found.t
-    return RelativePose(T, cov, inliers, found.noise_px, degeneracies)
+    return RelativePose(T, cov, inliers, found.noise_px, noise_px, solution.explained, degeneracies, alternatives)
 
 
-def _inliers(found: EpipolarFit, rays: RayPairs, sigmas: float) -> Bool[ndarray, "n"]:
-    close = np.abs(sampson(found.R, found.t, rays)) < sigmas * found.noise_px
-    return close & in_front(found.R, found.t, rays)
+def _noise_around(
+    residual: Float64[ndarray, "n"], rays: RayPairs, noise_px: float, settings: RelativePoseSettings
+) -> Float64[ndarray, "n"]:
+    """Robust standard deviation of the residuals in the square of the pattern that each lies in.
+
+    A sharp table and a blurred object have different noise; that of the one must not throw out the other.
+    """
+    _, group, count = np.unique(rays.block, return_inverse=True, return_counts=True)
+    order = np.lexsort((np.abs(residual), group))
+    middle = np.cumsum(count) - count + count // 2
+    noise = MAD_TO_SIGMA * np.abs(residual)[order][middle]
+    noise = noise.clip(noise_px, settings.largest_local_noise * noise_px)
+    return np.where(count < settings.fewest_in_block, noise_px, noise)[group]
 
 
 def _angle_sigma_deg(covariance_rad: Float64[ndarray, "k k"]) -> float:

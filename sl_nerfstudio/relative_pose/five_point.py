@@ -1,59 +1,37 @@
 """First solutions for the pose of a projector relative to its camera, by five-point samples.
 
-Random samples are solved (Nister, PAMI 2004, as in OpenCV), scored, and the best solutions refined. Samples and scores
-use rays, so every projector model is treated alike: what OpenCV takes for image points are rays divided by their last
-component.
+Random samples are solved (Nister, PAMI 2004, as in OpenCV) and scored. Samples and scores use rays, so every projector
+model is treated alike: what OpenCV takes for image points are rays divided by their last component.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, distinct, fit_epipolar
+from sl_nerfstudio.relative_pose.epipolar_fit import distinct
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings, Separation
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A solution that differs from the others."""
-
-    fit: EpipolarFit
-    in_front: float  # share of the well-fitting rays that meet in front of both devices
-
-
-def five_point_candidates(
+def five_point_starts(
     rays: RayPairs, rng: np.random.Generator, settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS
-) -> list[Candidate]:
-    """Distinct local optima with most rays meeting in front of both devices, the best first; may be empty."""
+) -> list[tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]]:
+    """Poses (R, t), projector to camera, |t| = 1, of the best samples, without those close to a better one."""
     s = settings.five_point
     usable = (rays.d_camera[:, 2] < -s.least_cosine) & (rays.d_projector[:, 2] < -s.least_cosine)
     candidates = np.flatnonzero(usable)
     if len(candidates) < 5:
         return []
     scoring_rays = rays.chosen(subsample(candidates, s.scoring_rays, rng))
-    polishing_rays = rays.chosen(subsample(np.arange(len(rays)), s.polishing_rays, rng))
     samples = [rays.chosen(rng.choice(candidates, 5, replace=False)) for _ in range(s.samples)]
     matrices = [(E, sample) for sample in samples for E in essential_matrices(sample)]
     if not matrices:
         return []
     scores = _scores(np.stack([E for E, _ in matrices]), scoring_rays, s.outlier_px)
-    starts = _distinct_starts([matrices[k] for k in np.argsort(scores)], s.polished, s.start_separation)
-    polishing = replace(settings.fit, iterations=s.polishing_iterations)
-    found: list[Candidate] = []
-    for R, t in starts:
-        fit = fit_epipolar(R, t, polishing_rays, polishing)
-        fitting = np.abs(fit.residual) <= s.inlier_sigmas * fit.noise_px
-        front = float(in_front(fit.R, fit.t, polishing_rays)[fitting].mean())
-        if front < s.least_in_front:  # the same essential matrix with the surface behind the devices
-            continue
-        if all(distinct((fit.R, fit.t), (other.fit.R, other.fit.t), s.solution_separation) for other in found):
-            found.append(Candidate(fit, front))
-    return sorted(found, key=lambda c: c.fit.noise_px)
+    return _distinct_starts([matrices[k] for k in np.argsort(scores)], s.starts, s.separation)
 
 
 def in_front(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs) -> Bool[ndarray, "n"]:

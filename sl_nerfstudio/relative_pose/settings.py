@@ -21,24 +21,52 @@ class FivePointSettings:
     """samples of five correspondences; with a third of them wrong, no sample is good with probability 1e-6"""
     scoring_rays: int = 300
     """correspondences on which the solutions of all samples are scored"""
-    polishing_rays: int = 800
-    """correspondences with which the best solutions are refined before they are compared"""
-    polished: int = 6
-    """number of best solutions that are refined"""
-    polishing_iterations: int = 12
-    """iterations of that refinement"""
     outlier_px: float = 4.0
     """residual, in projector pixels, beyond which a correspondence counts as wrong in the score"""
     least_cosine: float = 1e-3
     """cosine between ray and optical axis below which a ray cannot be written as an image point"""
+    starts: int = 8
+    """number of solutions that are kept"""
+    separation: Separation = field(default_factory=lambda: Separation(0.05, 0.1))
+    """by how much they differ from each other"""
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """The plane that holds most correspondences, and its two reconstructions."""
+
+    fewest: int = 20
+    """correspondences with which a plane is looked for"""
+    outlier_px: float = 4.0
+    """distance from the plane's image, in projector pixels, within which a correspondence lies in the plane"""
+    least_cosine: float = 1e-3
+    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
+    least_translation: float = 1e-6
+    """translation, in distances of the plane, below which two devices differ by a rotation alone"""
+
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """Refinement and ranking of the first solutions."""
+
+    polishing_rays: int = 800
+    """correspondences with which solutions are refined before they are compared"""
+    polishing_iterations: int = 12
+    """iterations of that refinement"""
+    ranking_rays: int = 4000
+    """correspondences by which the refined solutions are compared"""
     inlier_sigmas: float = 3.0
     """standard deviations of the noise within which a correspondence votes on which side the surface lies"""
     least_in_front: float = 0.5
     """share of these that must lie in front of both devices"""
-    start_separation: Separation = field(default_factory=lambda: Separation(0.05, 0.1))
-    """by how much the solutions that are refined differ from each other"""
-    solution_separation: Separation = field(default_factory=lambda: Separation(0.02, 0.05))
+    separation: Separation = field(default_factory=lambda: Separation(0.02, 0.05))
     """by how much the refined solutions differ from each other"""
+    rival_share: float = 0.03
+    """share of the correspondences that a solution may explain less than the best one and still be a rival"""
+    rival_errors: float = 3.0
+    """standard errors of the difference within which a solution is a rival"""
+    most: int = 3
+    """solutions of a frame, the best one included, at most"""
 
 
 @dataclass(frozen=True)
@@ -87,8 +115,6 @@ class DegeneracyLimits:
     """share of the correspondences that may disagree with the pose"""
     largest_noise_px: float = 2.0
     """noise of the residuals, in projector pixels"""
-    least_second_best_ratio: float = 1.3
-    """noise of the second best solution relative to the best; below it the frame is ambiguous"""
     largest_sigma_rotation_deg: float = 0.5
     """standard deviation of the rotation, in degrees"""
     largest_sigma_direction_deg: float = 1.5
@@ -117,12 +143,20 @@ class RelativePoseSettings:
     """share of the correspondences that must agree with the pose"""
     largest_noise_share: float = 0.02
     """noise beyond which nothing fits, as a share of the pattern's width"""
-    second_best: Separation = field(default_factory=lambda: Separation(0.0354, 0.1))
-    """by how much the second best solution differs from the best: by more than an unfinished refinement does"""
+    fewest_in_block: int = 20
+    """correspondences in a square of the pattern from which its own noise is measured"""
+    largest_local_noise: float = 3.0
+    """noise in a square of the pattern at most, relative to that of the whole frame"""
+    solutions: Separation = field(default_factory=lambda: Separation(0.0354, 0.1))
+    """by how much two solutions of a frame differ: by more than unfinished refinements do"""
     blocks: PatternBlocks = field(default_factory=PatternBlocks)
     """squares of the pattern"""
     five_point: FivePointSettings = field(default_factory=FivePointSettings)
-    """the first solutions"""
+    """first solutions from random samples"""
+    plane: PlaneSettings = field(default_factory=PlaneSettings)
+    """first solutions from the dominant plane"""
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    """their refinement and ranking"""
     fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
     """the fit of the best one"""
     degeneracy: DegeneracyLimits = field(default_factory=DegeneracyLimits)

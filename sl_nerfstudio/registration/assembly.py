@@ -1,0 +1,175 @@
+"""Frames are put together into components, the most certain pairs first.
+
+Two components are joined where one similarity between them is clearly better supported than any other: by all pairs of
+frames across the two at once, however few of them were registered. A pair that fits by accident thus joins nothing on
+its own once components have grown, and a weak cut between two blocks is judged as a whole. Components whose connection
+stays undecided remain apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.edge_weights import edge_weights, quality
+from sl_nerfstudio.registration.graph_residuals import Pivots, node_at
+from sl_nerfstudio.registration.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
+from sl_nerfstudio.registration.settings import RegistrationSettings
+from sl_nerfstudio.registration.surface_agreement import Side, Tolerance, agreement
+
+Component = dict[int, Similarity]  # S_component_camera of each frame
+Link = tuple[Similarity, float]  # a similarity between two components that a pair says, and its quality
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How well two components agree under one similarity: sums over pairs of frames across them."""
+
+    S_first_second: Similarity
+    votes: float  # of registered pairs: their quality, where it is their best result, or a share of it
+    links: int  # registered pairs of which it is the best result
+    agreeing: float  # points, in frames: 1 is all points of one frame
+    contradicting: float
+
+    @property
+    def fitness(self) -> float:
+        """Of the points that could be judged, the share that agrees."""
+        return self.agreeing / max(self.agreeing + self.contradicting, 1e-9)
+
+
+class Assembly:
+    """Components of frames, grown along registered pairs."""
+
+    def __init__(
+        self, sides: Sequence[Side], pivots: Pivots, edges: Sequence[PairMatch], settings: RegistrationSettings
+    ) -> None:
+        self._sides = sides
+        self._pivots = pivots
+        self._settings = settings
+        self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
+        self._weight = edge_weights(self._edges, settings.edge)
+        self._rejected: set[tuple[frozenset[int], frozenset[int]]] = set()
+        usual = float(np.quantile([e.fitness for e in edges], settings.edge.good_quantile)) if edges else 1.0
+        s = settings.assembly
+        self._least_fitness = 1 - s.misfit_factor * max(s.least_misfit, 1 - usual)
+        self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
+
+    def grow(self) -> list[Component]:
+        """Join components until no connection is decided; the largest first."""
+        while self._join_next():
+            pass
+        return sorted(self.components, key=lambda c: (-len(c), min(c)))
+
+    def _join_next(self) -> bool:
+        for edge in self._edges:
+            first, second = self._component_of(edge.target), self._component_of(edge.source)
+            if first is second or (key := (frozenset(first), frozenset(second))) in self._rejected:
+                continue
+            joint = self.decide(first, second)
+            if joint is None:
+                self._rejected |= {key, key[::-1]}
+                continue
+            self.components = [c for c in self.components if c is not first and c is not second]
+            self.components.append(self._joined(first, second, joint.S_first_second))
+            return True
+        return False
+
+    def _component_of(self, frame: int) -> Component:
+        return next(c for c in self.components if frame in c)
+
+    def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
+        """Both in the world of the first, with all pairs inside optimised together."""
+        both = {**first, **{k: S @ S_second for k, S_second in second.items()}}
+        nodes = optimise_pose_graph(self._edges, self._pivots, both, self._weight, self._settings.pose_graph)
+        return {k: node_at(nodes.S_world_camera, k) for k in both}
+
+    def decide(self, first: Component, second: Component) -> Joint | None:
+        """The similarity between two components; None where it is not certain."""
+        s = self._settings.assembly
+        found = sorted(self._joints(first, second), key=lambda j: -j.votes)
+        if not found:
+            return None
+        best = found[0]
+        if best.agreeing < s.least_agreeing or best.fitness < self._least_fitness:
+            return None
+        if len(found) > 1 and found[1].votes > s.largest_rival * best.votes:
+            return None
+        if best.links < 2 and not self._certain_alone(first, second):
+            return None
+        return best
+
+    def _joints(self, first: Component, second: Component) -> list[Joint]:
+        """The clearly different similarities between two components that pairs across say, with their votes."""
+        links = [self._links(e, first, second) for e in self._crossing(first, second)]
+        distinct: list[Similarity] = []
+        for S, _ in sorted((one for link in links for one in link), key=lambda one: -one[1]):
+            if all(self._differ(S, other, second) for other in distinct):
+                distinct.append(S)
+        return [self._judge(first, second, S, links) for S in distinct[: self._settings.assembly.most_compared]]
+
+    def _crossing(self, first: Component, second: Component) -> list[PairMatch]:
+        return [
+            e
+            for e in self._edges
+            if (e.source in first and e.target in second) or (e.source in second and e.target in first)
+        ]
+
+    def _links(self, e: PairMatch, first: Component, second: Component) -> list[Link]:
+        """What a pair across says: its best similarity and its rivals, each with its quality."""
+        forward = e.source in second
+        target, source = (e.target, e.source) if forward else (e.source, e.target)
+        best = e.overlap * e.fitness**2
+        results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
+        return [(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q) for S, q in results]
+
+    def _judge(self, first: Component, second: Component, S: Similarity, links: Sequence[Sequence[Link]]) -> Joint:
+        """Votes of the pairs across, and the points of all frames across that see the same side."""
+        s, a = self._settings.assembly, self._settings.pair.agreement
+        votes, same = 0.0, 0
+        for link in links:
+            near = [(number, q) for number, (T, q) in enumerate(link) if not self._differ(S, T, second)]
+            votes += max((q for _, q in near), default=0.0)
+            same += any(number == 0 for number, _ in near)
+        tolerance = Tolerance(0.0, s.tolerance_sigmas)
+        agreeing = contradicting = 0.0
+        for i, j in self._facing(first, second, S):
+            S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])
+            sums = agreement(self._sides[j], self._sides[i], S_i_j, tolerance, tolerance, a)
+            agreeing += float(sums.agreeing[0])
+            contradicting += float(sums.in_front[0] + a.behind * sums.behind[0])
+        return Joint(S, votes, same, agreeing, contradicting)
+
+    def _certain_alone(self, first: Component, second: Component) -> bool:
+        """Whether one of the pairs across determines the similarity by itself."""
+        s = self._settings.assembly
+        return any(
+            e.rotation_sigma_deg < s.largest_sigma_deg
+            and e.second_best_ratio < s.largest_rival
+            and e.fitness > self._least_fitness
+            for e in self._crossing(first, second)
+        )
+
+    def _facing(self, first: Component, second: Component, S: Similarity) -> list[tuple[int, int]]:
+        """The pairs across whose cameras look most nearly the same way."""
+        s = self._settings.assembly
+        pairs = [(i, j) for i in first for j in second]
+        cosine = np.array([first[i].R[:, 2] @ S.R @ second[j].R[:, 2] for i, j in pairs])
+        near = np.argsort(-cosine, kind="stable")[: s.most_pairs]
+        least = np.cos(np.radians(self._settings.selection.largest_view_angle_deg))
+        return [pairs[k] for k in near if cosine[k] > least]
+
+    def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
+        """Whether two similarities put the frames of `second` at clearly different places."""
+        s = self._settings.assembly
+        if np.degrees(Rotation.from_matrix(a.R @ b.R.T).magnitude()) > s.same_rotation_deg:
+            return True
+        shifts = []
+        for k, S in second.items():
+            surface = self._sides[k].map
+            p, radius = S.points(surface.centroid[None]), a.scale * S.scale * surface.radius
+            shifts.append(float(np.linalg.norm(a.points(p) - b.points(p))) / radius)
+        return min(shifts) > s.same_shift
