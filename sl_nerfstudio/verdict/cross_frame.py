@@ -6,13 +6,8 @@ been seen instead. One behind it may be hidden and is not judged; if it is a con
 where the other frame's points then lie in front.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
-import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
@@ -23,41 +18,9 @@ from sl_nerfstudio.geometry.devices import project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.threads import one_torch_thread
+from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, LookUps, summarise
 from sl_nerfstudio.verdict.decoding_noise import frame_noise
 from sl_nerfstudio.verdict.settings import CrossFrameSettings
-
-
-@dataclass(frozen=True)
-class PairAgreement:
-    """Two frames that saw some of the same surface."""
-
-    frames: tuple[int, int]
-    judged: int  # points of one that the other can judge, both ways
-    share: float  # of these, how many agree
-    px_p95: float  # 95 % of the residuals are smaller, pattern pixels
-
-
-@dataclass(frozen=True)
-class FrameCrossAgreement:
-    """One frame against all others; NaN where nothing could be judged."""
-
-    points: int  # that were triangulated and looked up
-    seen: float  # share of these that at least one other frame can judge
-    share: float  # of its judged points, those that agree: the median over its pairs
-    px_median: float  # pattern pixels, the median over its pairs
-    px_p95: float  # the same of the 95 % quantiles
-
-
-@dataclass(frozen=True)
-class CrossFrameAgreement:
-    """All frames against each other, in the order of the frames."""
-
-    noise_px: float  # of one look-up: the median over the frames
-    share: float  # of all judged points, those that agree; NaN where nothing could be judged
-    px_median: float
-    px_p95: float
-    frames: tuple[FrameCrossAgreement, ...]
-    pairs: tuple[PairAgreement, ...]
 
 
 @one_torch_thread()
@@ -82,10 +45,20 @@ def cross_frame_agreement(
     usual = float(noise.nanmedian())
     noise = noise.nan_to_num(usual).clamp_max(s.largest_noise_ratio * usual)
     size = linear.residuals.cross.norm(dim=-1)
-    expected = _expected_sigma(linear, anchors, rows, sigma, noise, s.footprint * _footprint(rig, anchors, maps))
-    agrees = size < s.sigmas * expected
-    judged = linear.residuals.cross_valid & (agrees | _in_front(rig, anchors, rows, maps))
-    return _summary(rig.frames, anchors, rows.frame, rows.anchor, judged.numpy(), agrees.numpy(), size.numpy(), usual, s)
+    by_noise = _variance_by_noise(linear, anchors, rows, noise**2 + (s.footprint * _footprint(rig, anchors, maps)) ** 2)
+    by_poses = _variance_by_poses(linear, anchors, rows, sigma)
+    normalised = size / (by_noise + by_poses).sqrt()
+    judged = linear.residuals.cross_valid & ((normalised < s.sigmas) | _in_front(rig, anchors, rows, maps))
+    looked_up = LookUps(
+        frames=rig.frames,
+        source=anchors.frame.numpy(),
+        anchor=rows.anchor[judged].numpy(),
+        viewer=rows.frame[judged].numpy(),
+        px=size[judged].numpy(),
+        normalised=normalised[judged].numpy(),
+        by_poses=(by_poses / (by_noise + by_poses))[judged].numpy(),
+    )
+    return summarise(looked_up, usual, s)
 
 
 def _footprint(rig: Rig, anchors: Anchors, maps: CoordinateMaps) -> Float[Tensor, "frames"]:
@@ -96,27 +69,32 @@ def _footprint(rig: Rig, anchors: Anchors, maps: CoordinateMaps) -> Float[Tensor
     return torch.stack([x.median() if len(x) else torch.zeros((), dtype=size.dtype) for x in found])
 
 
-def _expected_sigma(
-    linear: Linearisation,
-    anchors: Anchors,
-    rows: Observations,
-    sigma: Float[Tensor, "frames 12"],
-    noise: Float[Tensor, "frames"],
-    floor: Float[Tensor, "frames"],
+def _variance_by_noise(
+    linear: Linearisation, anchors: Anchors, rows: Observations, variance: Float[Tensor, "frames"]
 ) -> Float[Tensor, "rows"]:
-    """1 sigma of each cross residual (root of the sum over both coordinates, for the poses' part), pattern pixels."""
-    variance = noise**2 + floor**2
-    # What an error of the anchor's own coordinate, or of its projector, does to its depth, and that to the residual.
+    """Variance of a coordinate of each cross residual from the `variance` of look-ups in both frames, px^2.
+
+    An error of the anchor's own coordinate changes its depth, and that the residual.
+    """
+    own2, cross2 = (linear.own_depth**2).sum(-1).clamp_min(1e-300), (linear.cross_depth**2).sum(-1)
+    source = anchors.frame[rows.anchor]
+    return variance[rows.frame] + variance[source] * cross2 / own2[rows.anchor]
+
+
+def _variance_by_poses(
+    linear: Linearisation, anchors: Anchors, rows: Observations, sigma: Float[Tensor, "frames 12"]
+) -> Float[Tensor, "rows"]:
+    """Variance of each cross residual, both coordinates together, from the stated sigma of the poses, px^2."""
+    variance = sigma.reshape(len(sigma), 2, 6).transpose(0, 1).flatten() ** 2  # delta of all frames, rho of all frames
     length2 = (linear.own_depth**2).sum(-1).clamp_min(1e-300)
-    gain2 = (linear.cross_depth**2).sum(-1) / length2[rows.anchor]
-    own = (linear.own_depth[:, :, None] * linear.own).sum(1) / length2[:, None]
-    flat = sigma.reshape(len(sigma), 2, 6).transpose(0, 1).flatten() ** 2
-    through_depth = (own**2 * flat[linear.own_columns]).sum(-1)[rows.anchor] * (linear.cross_depth**2).sum(-1)
-    direct = (linear.cross**2 * flat[linear.cross_columns][:, None, :]).sum((1, 2))
-    return (variance[rows.frame] + variance[anchors.frame[rows.anchor]] * gain2 + direct + through_depth).sqrt()
+    depth = (linear.own_depth[:, :, None] * linear.own).sum(1) / length2[:, None]  # by the projector's pose
+    through_depth = (depth**2 * variance[linear.own_columns]).sum(-1)[rows.anchor] * (linear.cross_depth**2).sum(-1)
+    return (linear.cross**2 * variance[linear.cross_columns][:, None, :]).sum((1, 2)) + through_depth
 
 
-def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Tensor:
+def _in_front(
+    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps
+) -> Bool[Tensor, "rows"]:
     """Whether a point is nearer to the other camera than what that camera saw in its place."""
     j, a = rows.frame, rows.anchor
     p_world = transform(rig.T_world_camera[anchors.frame[a]], (anchors.depth[:, None] * anchors.d_camera)[a])
@@ -127,64 +105,3 @@ def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMa
     d_projector = rotate(T, unproject(rig.projector, maps.look_up(j, uv).uv_projector))
     depth, beyond = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
     return (beyond > 0) & (p_j.norm(dim=-1) < depth)  # False where the rays do not meet
-
-
-def _summary(
-    frames: int,
-    anchors: Anchors,
-    viewer: Tensor,
-    anchor: Tensor,
-    judged: ndarray,
-    agrees: ndarray,
-    size: ndarray,
-    noise: float,
-    settings: CrossFrameSettings,
-) -> CrossFrameAgreement:
-    """Figures of the pairs, the frames and all together."""
-    source = anchors.frame.numpy()
-    first, second = np.sort(np.stack([source[anchor.numpy()], viewer.numpy()]), 0)
-    pair = np.where(judged, first * frames + second, -1)
-    order = np.argsort(pair, kind="stable")
-    bounds = np.flatnonzero(np.diff(pair[order], prepend=-2, append=-2))
-    pairs = []
-    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
-        mine = order[low:high]
-        if judged[mine[0]] and len(mine) >= settings.fewest_judged:
-            p95 = float(np.quantile(size[mine], 0.95))
-            pairs.append((mine, PairAgreement(tuple(divmod(int(pair[mine[0]]), frames)), len(mine), float(agrees[mine].mean()), p95)))  # fmt: skip
-    seen = np.zeros(len(source), bool)
-    seen[anchor.numpy()[judged]] = True
-    rows = [
-        _frame(k, seen[source == k], [(p, float(np.median(size[mine]))) for mine, p in pairs if k in p.frames])
-        for k in range(frames)
-    ]
-    everything = size[judged]
-    return CrossFrameAgreement(
-        noise_px=noise,
-        share=float(agrees[judged].mean()) if len(everything) else float("nan"),
-        px_median=_quantile(everything, 0.5),
-        px_p95=_quantile(everything, 0.95),
-        frames=tuple(rows),
-        pairs=tuple(p for _, p in pairs),
-    )
-
-
-def _frame(k: int, seen: ndarray, pairs: Sequence[tuple[PairAgreement, float]]) -> FrameCrossAgreement:
-    weight = np.array([p.judged for p, _ in pairs], np.float64)
-    share, median, p95 = (
-        _weighted_median(np.array(values), weight)
-        for values in ([p.share for p, _ in pairs], [m for _, m in pairs], [p.px_p95 for p, _ in pairs])
-    )
-    return FrameCrossAgreement(len(seen), float(seen.mean()) if len(seen) else 0.0, share, median, p95)
-
-
-def _weighted_median(values: Float[ndarray, "n"], weight: Float[ndarray, "n"]) -> float:
-    if not len(values):
-        return float("nan")
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(total, total[-1] / 2)]])
-
-
-def _quantile(values: Float[ndarray, "n"], q: float) -> float:
-    return float(np.quantile(values, q)) if len(values) else float("nan")

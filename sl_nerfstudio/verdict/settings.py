@@ -1,6 +1,6 @@
-"""Limits of the verdict: multiples of the measured noise, shares of pixels and of frames. No lengths, no pattern pixels."""
+"""Limits of the verdict: multiples of the measured noise, shares of pixels and of frames; no lengths, no pattern pixels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -23,5 +23,40 @@ class CrossFrameSettings:
     projector makes it."""
     fewest_judged: int = 30
     """Judged points below which a pair of frames shares too little to say anything."""
-    least_pair_share: float = 0.85
-    """Share of a pair's judged points that must agree for the two frames to confirm each other."""
+    least_tail: float = 0.5
+    """Smallest 95 % residual of a pair that counts, in units of the noise: below, look-ups decide, not poses."""
+    largest_tail: float = 2.0
+    """Largest 95 % residual, in units of the expected sigma, that a scan's better pairs may have: two-dimensional normal
+    errors have 2.4, and the expected sigma is generous."""
+    rough_factor: float = 1.6
+    """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
+    of a pose is common to all points of a pair, so right pairs differ by chance."""
+    reference_quantile: float = 0.25
+    """Quantile of the pairs' 95 % residuals with which each pair is compared: a quarter of the pairs must be right."""
+    contradicting_excess: float = 2.5
+    """95 % residual of a pair relative to that quantile, beyond which the two frames contradict each other."""
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """What makes a scan good, acceptable or poor. A single frame beyond a limit keeps it from being good."""
+
+    most_frames: float = 0.25
+    """Share of the frames that may be left out, undecided, unconfirmed or weakly decoded before the scan is poor."""
+    least_decoded: float = 0.5
+    """Share of the visible pattern that must be decoded in every frame."""
+    least_own_share: float = 0.7
+    """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector."""
+    largest_sigma_deg: float = 3.0
+    """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong: the scan is poor."""
+    least_seen: float = 0.15
+    """Share of a frame's points that other frames must be able to judge: registration demands the same overlap."""
+    good_share: float = 0.95
+    """Share of the judged points that must agree for a scan to be good, in every frame and over all."""
+    least_share: float = 0.85
+    """The same for an acceptable scan."""
+    good_excess: float = 2.0
+    """95 % residual of a frame relative to the better pairs of the scan, up to which a scan is good; frames beyond
+    `cross.contradicting_excess` make it poor."""
+    cross: CrossFrameSettings = field(default_factory=CrossFrameSettings)
+    """When frames agree with each other."""
