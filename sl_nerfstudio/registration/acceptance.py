@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -32,7 +32,8 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
     n, edges, settings = len(names), graph.edges, graph.settings
     solution = graph.solve()
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
-    connected = _largest_component(consistent, n)
+    component = _components(consistent, n)
+    connected = component == 0
     fitness = np.array([_fitness_of(k, solution, connected, graph) for k in range(n)])
     registered = connected & (fitness >= settings.acceptance.least_fitness)
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
@@ -41,6 +42,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
         poses,
         baseline,
         registered,
+        component,
         np.where(registered, fitness, np.nan),
         tuple(
             Edge(
@@ -57,13 +59,13 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
     )  # fmt: skip
 
 
-def _largest_component(edges: Sequence[PairMatch], n: int) -> Bool[ndarray, "n"]:
-    """Frames of the largest group that edges connect; none where nothing is connected."""
-    component = connected_components(edges, n)[0]
-    inside = np.zeros(n, dtype=bool)
-    if len(component) > 1:
-        inside[component] = True
-    return inside
+def _components(edges: Sequence[PairMatch], n: int) -> Int64[ndarray, "n"]:
+    """The group of each frame that edges connect, 0 the largest; -1 for single frames."""
+    out = np.full(n, -1, dtype=np.int64)
+    for number, group in enumerate(connected_components(edges, n)):
+        if len(group) > 1:
+            out[group] = number
+    return out
 
 
 def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph) -> float:

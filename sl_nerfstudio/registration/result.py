@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 
@@ -84,6 +84,7 @@ class Registration:
     T_world_camera: Float64[ndarray, "n 4 4"]  # NaN where not registered
     baseline: Float64[ndarray, "n"]  # camera to projector; geometric mean 1 over the registered frames; NaN elsewhere
     registered: Bool[ndarray, "n"]
+    component: Int64[ndarray, "n"]  # group that consistent pairs connect: 0 the largest, 1, 2, .. others, -1 none
     fitness: Float64[ndarray, "n"]  # share of each frame's judged points that agree; NaN where not registered
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered

@@ -68,9 +68,7 @@ def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> 
         share=_mean(found.normalised < settings.sigmas),
         px_median=_quantile(found.px, 0.5),
         px_p95=_quantile(found.px, 0.95),
-        frames=tuple(
-            _frame(seen[found.source == k], [p for p in pairs if k in p.frames]) for k in range(found.frames)
-        ),
+        frames=tuple(_frame(seen[found.source == k], [p for p in pairs if k in p.frames]) for k in range(found.frames)),
         pairs=tuple(pairs),
     )
 

@@ -2,8 +2,8 @@
 
 A point is triangulated in one frame and projected into another camera; the coordinate decoded *there* is compared with
 where that frame's projector has the point. A point in front of what the other camera saw contradicts it: it would have
-been seen instead. One behind it may be hidden and is not judged; if it is a contradiction, it shows the other way round,
-where the other frame's points then lie in front.
+been seen instead. One behind it may be hidden and is not judged; if it is a contradiction, that shows the other way
+round, where the other frame's points then lie in front.
 """
 
 import torch
@@ -92,9 +92,7 @@ def _variance_by_poses(
     return (linear.cross**2 * variance[linear.cross_columns][:, None, :]).sum((1, 2)) + through_depth
 
 
-def _in_front(
-    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps
-) -> Bool[Tensor, "rows"]:
+def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:
     """Whether a point is nearer to the other camera than what that camera saw in its place."""
     j, a = rows.frame, rows.anchor
     p_world = transform(rig.T_world_camera[anchors.frame[a]], (anchors.depth[:, None] * anchors.d_camera)[a])

@@ -1,4 +1,4 @@
-"""Limits of the verdict: multiples of the measured noise, shares of pixels and of frames; no lengths, no pattern pixels."""
+"""Limits of the verdict: multiples of the measured noise, shares of pixels and of frames; no lengths."""
 
 from dataclasses import dataclass, field
 
@@ -26,8 +26,8 @@ class CrossFrameSettings:
     least_tail: float = 0.5
     """Smallest 95 % residual of a pair that counts, in units of the noise: below, look-ups decide, not poses."""
     largest_tail: float = 2.0
-    """Largest 95 % residual, in units of the expected sigma, that a scan's better pairs may have: two-dimensional normal
-    errors have 2.4, and the expected sigma is generous."""
+    """Largest 95 % residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
+    dimensions have 2.4, and the expected sigma is generous."""
     rough_factor: float = 1.6
     """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
     of a pose is common to all points of a pair, so right pairs differ by chance."""
@@ -48,7 +48,8 @@ class VerdictSettings:
     least_own_share: float = 0.7
     """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector."""
     largest_sigma_deg: float = 3.0
-    """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong: the scan is poor."""
+    """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong and the scan is
+    poor."""
     least_seen: float = 0.15
     """Share of a frame's points that other frames must be able to judge: registration demands the same overlap."""
     good_share: float = 0.95
