@@ -137,10 +137,17 @@ def _contradicting_groups(
         )
         return
     for group in groups[1:]:
+        between = [p.px_p95 for p in cross.pairs if len(set(p.frames) & set(group)) == 1]
+        if not between:
+            yield Reason(
+                "poor",
+                f"{listed([names[k] for k in group])}: no surface in common with the other frames, so nothing confirms "
+                "how the two parts lie to each other",
+            )
+            continue
         if len(group) == 1:
             yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross))
             continue
-        between = [p.px_p95 for p in cross.pairs if len(set(p.frames) & set(group)) == 1]
         yield Reason(
             "poor",
             f"{listed([names[k] for k in group])}: agree with each other and contradict the other frames: 95 % of the "

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement, FramePixels
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.comparisons import compare_frames
 from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
