@@ -22,8 +22,8 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     """List every fault of a scan folder at once: file, frame, field, likely cause, what to do.
 
     Reads transforms.json and decodes every file; training makes the same check before it starts. Without faults it
-    prints a short summary and a verdict on the starting poses, with what is doubtful, and exits with status 0; otherwise
-    it prints all faults and exits with status 1.
+    prints a short summary, a verdict on the starting poses and what is doubtful, and exits with status 0; otherwise it
+    prints all faults and exits with status 1.
 
     Args:
         folder: The scan folder, which holds transforms.json.
@@ -52,7 +52,7 @@ def agreement(result: "FolderCheck", cross: "CrossFrameAgreement") -> str:
     verdict = judge_scan(ScanFacts(frames, cross=cross))
     seen = [frame.seen for frame in cross.frames]
     lines = [
-        f"  coverage            {100 * min(seen):.0f} to {100 * max(seen):.0f} % of a frame's points are seen by others",
+        f"  coverage            {100 * min(seen):.0f} to {100 * max(seen):.0f} % of a frame's points seen by others",
         f"  frames agree        to {cross.px_median:.2g} px (median), {cross.px_p95:.2g} px (95 %); "
         f"noise {cross.noise_px:.2g} px",
         f"  verdict             {verdict.band}",

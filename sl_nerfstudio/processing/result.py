@@ -29,7 +29,7 @@ class FrameRecord:
     cross_share: float | None = None  # of these, those that agree: the median over the frames it is compared with
     cross_px_median: float | None = None  # their residual, pattern pixels, the same median
     cross_px_p95: float | None = None  # 95 % of the residuals are smaller
-    cross_excess: float | None = None  # 95 % residual in units of what is expected, relative to the scan's better pairs
+    cross_excess: float | None = None  # residual in units of what is expected, relative to the scan's better pairs
     baseline: float | None = None  # camera to projector, in the scan's unit
     degeneracies: tuple[str, ...] = ()
 

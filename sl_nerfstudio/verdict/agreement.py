@@ -31,7 +31,7 @@ class PairAgreement:
     share: float  # of these, how many agree
     px_median: float  # residual, pattern pixels
     px_p95: float
-    excess: float  # 95 % residual in units of what is expected, relative to the scan's better pairs
+    excess: float  # residual in units of what is expected, relative to the scan's better pairs
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ def _pairs(found: LookUps, settings: CrossFrameSettings) -> list[PairAgreement]:
     order = np.argsort(pair, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []
     groups = [mine for mine in groups if len(mine) >= settings.fewest_judged]
-    tails = [_tail(found, mine, settings) for mine in groups]
-    allowed = settings.largest_tail * _quantile(np.array([t.stated for t in tails]), 0.5)
-    reference = min(_quantile(np.array([t.noises for t in tails]), settings.reference_quantile), allowed)
+    residuals = [_residual(found, mine, settings) for mine in groups]
+    allowed = settings.largest_typical * _quantile(np.array([t.stated for t in residuals]), 0.5)
+    reference = min(_quantile(np.array([t.noises for t in residuals]), settings.reference_quantile), allowed)
     return [
         PairAgreement(
             frames=(int(first[mine[0]]), int(second[mine[0]])),
@@ -91,23 +91,23 @@ def _pairs(found: LookUps, settings: CrossFrameSettings) -> list[PairAgreement]:
             px_p95=_quantile(found.px[mine], 0.95),
             excess=t.noises / (reference * t.chance),
         )
-        for mine, t in zip(groups, tails, strict=True)
+        for mine, t in zip(groups, residuals, strict=True)
     ]
 
 
 @dataclass(frozen=True)
-class _PairTail:
-    """The 95 % residual of a pair."""
+class _PairResidual:
+    """The residual of a pair at the typical quantile."""
 
     noises: float  # in units of the noise, but not below what look-ups decide
     stated: float  # expected sigma, with the stated uncertainty of the poses, in the same units
     chance: float  # factor by which right pairs may differ: an error of a pose is common to all points of a pair
 
 
-def _tail(found: LookUps, mine: Int[ndarray, "m"], settings: CrossFrameSettings) -> _PairTail:
+def _residual(found: LookUps, mine: Int[ndarray, "m"], settings: CrossFrameSettings) -> _PairResidual:
     by_noise = np.sqrt(1 - found.by_poses[mine])  # share of the expected sigma
-    return _PairTail(
-        max(_quantile(found.normalised[mine] / by_noise, 0.95), settings.least_tail),
+    return _PairResidual(
+        max(_quantile(found.normalised[mine] / by_noise, settings.typical_quantile), settings.least_typical),
         float(np.median(1 / by_noise)),
         1 + (settings.rough_factor - 1) * _mean(found.by_poses[mine]),
     )

@@ -110,7 +110,7 @@ def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement, settings: Ve
     for k, (name, frame) in enumerate(zip(names, cross.frames, strict=True)):
         band = frame_band(frame, settings)
         if band != "good" and k not in named:
-            yield Reason(band, _frame_sentence(name, frame, cross))
+            yield Reason(band, _frame_sentence(name, frame, cross, band))
     if cross.share < settings.good_share:
         yield Reason(
             "poor" if cross.share < settings.least_share else "acceptable",
@@ -146,7 +146,7 @@ def _contradicting_groups(
             )
             continue
         if len(group) == 1:
-            yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross))
+            yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross, "poor"))
             continue
         yield Reason(
             "poor",
@@ -156,11 +156,12 @@ def _contradicting_groups(
         )
 
 
-def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgreement) -> str:
+def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgreement, band: Band) -> str:
     usual = _median([f.px_p95 for f in cross.frames if math.isfinite(f.px_p95)])
     return (
-        f"{name}: contradicts the frames that saw the same surface: {frame.share:.0%} of its points agree, 95 % lie "
-        f"within {frame.px_p95:.2g} px (usual in this scan: {usual:.2g} px)"
+        f"{name}: {'contradicts' if band == 'poor' else 'agrees less well with'} the frames that saw the same surface: "
+        f"{frame.excess:.2g} times the usual residual, {frame.share:.0%} of its points within the noise, 95 % within "
+        f"{frame.px_p95:.2g} px (usual in this scan: {usual:.2g} px)"
     )
 
 

@@ -23,18 +23,21 @@ class CrossFrameSettings:
     projector makes it."""
     fewest_judged: int = 30
     """Judged points below which a pair of frames shares too little to say anything."""
-    least_tail: float = 0.5
-    """Smallest 95 % residual of a pair that counts, in units of the noise: below, look-ups decide, not poses."""
-    largest_tail: float = 2.0
-    """Largest 95 % residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
-    dimensions have 2.4, and the expected sigma is generous."""
+    typical_quantile: float = 0.8
+    """Quantile of a pair's residuals by which it is compared with other pairs: wrong decodings do not reach it, and a
+    plane on which two frames agree by chance rarely holds so much of them."""
+    least_typical: float = 0.35
+    """Smallest such residual that counts, in units of the noise: below, look-ups decide, not poses."""
+    largest_typical: float = 1.5
+    """Largest such residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
+    dimensions have 1.8, and the expected sigma is generous."""
     rough_factor: float = 1.6
     """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
     of a pose is common to all points of a pair, so right pairs differ by chance."""
     reference_quantile: float = 0.25
-    """Quantile of the pairs' 95 % residuals with which each pair is compared: a quarter of the pairs must be right."""
+    """Quantile of those residuals over all pairs with which each pair is compared: a quarter of the pairs must be right."""
     contradicting_excess: float = 2.5
-    """95 % residual of a pair relative to that quantile, beyond which the two frames contradict each other."""
+    """Residual of a pair relative to that reference, beyond which the two frames contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,9 @@ class VerdictSettings:
     """Share of the frames that may be left out, undecided, unconfirmed or weakly decoded before the scan is poor."""
     least_decoded: float = 0.5
     """Share of the visible pattern that must be decoded in every frame."""
-    least_own_share: float = 0.7
-    """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector."""
+    least_own_share: float = 0.5
+    """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
+    pose could explain the majority."""
     largest_sigma_deg: float = 3.0
     """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong and the scan is
     poor."""
@@ -57,7 +61,7 @@ class VerdictSettings:
     least_share: float = 0.85
     """The same for an acceptable scan."""
     good_excess: float = 2.0
-    """95 % residual of a frame relative to the better pairs of the scan, up to which a scan is good; frames beyond
+    """Residual of a frame relative to the better pairs of the scan, up to which a scan is good; frames beyond
     `cross.contradicting_excess` make it poor."""
     cross: CrossFrameSettings = field(default_factory=CrossFrameSettings)
     """When frames agree with each other."""
