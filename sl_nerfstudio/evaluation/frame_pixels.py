@@ -35,6 +35,7 @@ class FramePixels:
     hit: Bool[ndarray, "n"]  # the camera ray hits the mesh
     lit: Bool[ndarray, "n"]  # ... at a point that the projector lights, inside the pattern
     decoded: Bool[ndarray, "n"]
+    coords: Float[ndarray, "n 2"]  # as decoded, pattern pixels
     offset: Float[ndarray, "n 2"]  # predicted minus decoded coordinates, pattern pixels
     epipolar: Float[ndarray, "n"]  # signed distance from the epipolar curve, pattern pixels
     captured: Float[ndarray, "n"]  # locally normalised captured pattern
@@ -95,6 +96,7 @@ def frame_pixels(
         hit=hits.hit,
         lit=reached,
         decoded=np.isfinite(coords[row, column]).all(1),
+        coords=decoded_uv.numpy(),
         offset=predicted - decoded_uv.numpy(),
         epipolar=epipolar,
         captured=captured[row, column].astype(np.float64),

@@ -26,7 +26,7 @@ class CrossFrameSettings:
     typical_quantile: float = 0.8
     """Quantile of a pair's residuals by which it is compared with other pairs: wrong decodings do not reach it, and a
     plane on which two frames agree by chance rarely holds so much of them."""
-    least_typical: float = 0.35
+    least_typical: float = 0.5
     """Smallest such residual that counts, in units of the noise: below, look-ups decide, not poses."""
     largest_typical: float = 1.5
     """Largest such residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
@@ -35,7 +35,7 @@ class CrossFrameSettings:
     """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
     of a pose is common to all points of a pair, so right pairs differ by chance."""
     reference_quantile: float = 0.25
-    """Quantile of those residuals over all pairs with which each pair is compared: a quarter of the pairs must be right."""
+    """Quantile of those residuals over all pairs with which each is compared: a quarter of the pairs must be right."""
     contradicting_excess: float = 2.5
     """Residual of a pair relative to that reference, beyond which the two frames contradict each other."""
 
