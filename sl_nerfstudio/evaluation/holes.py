@@ -43,7 +43,7 @@ def find_holes(pixels: FramePixels, mesh_size: float) -> Holes:
     return Holes(float(missing.sum() / count), _largest_area(missing, count) / count)
 
 
-def _as_image(pixels: FramePixels, values: ndarray, nothing: float) -> ndarray:
+def _as_image(pixels: FramePixels, values: ndarray, nothing: float | bool) -> ndarray:
     """Values on the grid of evaluated pixels."""
     row, column = pixels.row // pixels.stride, pixels.column // pixels.stride
     image = np.full((row.max() + 1, column.max() + 1, *values.shape[1:]), nothing, values.dtype)
