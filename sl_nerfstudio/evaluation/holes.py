@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from numpy import ndarray
 from scipy.ndimage import binary_opening, label
 
@@ -59,9 +59,9 @@ def _wrong_patches(pixels: FramePixels, missing: Bool[ndarray, "h w"], count: in
     for axis in (0, 1):
         jump = np.linalg.norm(np.diff(coords, axis=axis), axis=-1) > limit
         inside &= ~np.insert(jump, jump.shape[axis], False, axis) & ~np.insert(jump, 0, False, axis)
-    patch, patches = label(inside)  # type: ignore[misc]
-    size = np.bincount(patch.ravel(), minlength=patches + 1)
-    lost = np.bincount(patch[missing], minlength=patches + 1)
+    patch = _numbered(inside)
+    size = np.bincount(patch.ravel())
+    lost = np.bincount(patch[missing], minlength=len(size))
     wrong = (2 * lost > size) & (size < _LARGE_PATCH * count)
     wrong[0] = True  # at the jumps themselves
     return wrong[patch]
@@ -71,5 +71,12 @@ def _largest_area(missing: Bool[ndarray, "h w"], count: int) -> int:
     """Pixels of the largest connected area that is wide enough; `count` pixels were decoded."""
     width = 1 + 2 * max(1, round(_LEAST_WIDTH * np.sqrt(count) / 2))
     wide = binary_opening(missing, np.ones((width, width), bool))
-    areas = np.bincount(label(wide)[0].ravel())[1:]  # type: ignore[index]
+    areas = np.bincount(_numbered(wide).ravel())[1:]
     return int(areas.max()) if len(areas) else 0
+
+
+def _numbered(flags: Bool[ndarray, "h w"]) -> Int[ndarray, "h w"]:
+    """The number of the connected area of each pixel, from 1; 0 elsewhere."""
+    out = np.zeros(flags.shape, dtype=np.int32)
+    label(flags, output=out)
+    return out

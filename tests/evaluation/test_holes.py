@@ -71,7 +71,7 @@ def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Path) -> No
     """Its points lie in the air before the surface, on their epipolar curves, but it has a jump all around it."""
     pixels, size = pixels_of(fine_scan, MADE.truth())
     row, column = int(np.median(pixels.row)), int(np.median(pixels.column))
-    patch = (np.abs(pixels.row - row) < 4) & (np.abs(pixels.column - column) < 4)
+    patch = (np.abs(pixels.row - row) < 3) & (np.abs(pixels.column - column) < 3)
     wrong = replace(
         pixels,
         coords=np.where(patch[:, None], pixels.coords + 15.0, pixels.coords),

@@ -21,7 +21,8 @@ GOOD = {"decode_rate": 0.93, "mask_share": 0.4, "epipolar_px": 0.31, "relative_s
 def _result(frames, **changes):
     edges = (EdgeRecord(("a<b", "c"), 0.5, 0.9, True, False), EdgeRecord(("c", "d"), 0.2, 0.5, False, True))
     values = {"config": CONFIG, "decoder": "network", "units": "mm", "scale_source": "baseline of frame 0",
-              "frames": frames, "edges": edges, "remarks": (), "recapture": (), "joint_px": (1.5, 0.4), "cross_px": (0.2, 0.8),
+              "frames": frames, "edges": edges, "remarks": (), "recapture": (), "joint_px": (1.5, 0.4),
+              "cross_px": (0.2, 0.8),
               "verdict": Verdict("good", ()), "versions": {"torch": "2"}, **changes}  # fmt: skip
     return ProcessResult(**values)
 

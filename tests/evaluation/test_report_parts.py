@@ -78,7 +78,8 @@ def test_brightness_is_matched_in_least_squares() -> None:
     flags = np.ones(n, dtype=bool)
     pixels = FramePixels(
         row=np.arange(n), column=np.arange(n), stride=1, hit=flags, lit=np.arange(n) < 40, decoded=flags,
-        coords=np.zeros((n, 2)), offset=np.zeros((n, 2)), epipolar=np.zeros(n), captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0),
+        coords=np.zeros((n, 2)), offset=np.zeros((n, 2)), epipolar=np.zeros(n),
+        captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0),
         rendered=rendered, depth_per_px=np.ones(n), ray_angle_deg=np.ones(n), behind=np.zeros(n),
         noise_px=0.1, footprint_px=1.0,
     )  # fmt: skip
