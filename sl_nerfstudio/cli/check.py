@@ -10,6 +10,7 @@ from sl_nerfstudio.cli.run import run
 
 if TYPE_CHECKING:
     from sl_nerfstudio.scan.check.folder import FolderCheck
+    from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 
 
 def main() -> None:
@@ -20,8 +21,9 @@ def main() -> None:
 def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]) -> None:
     """List every fault of a scan folder at once: file, frame, field, likely cause, what to do.
 
-    Reads transforms.json and decodes every file; training makes the same check before it starts. Prints a short
-    summary and exits with status 0 if the scan is good, prints all faults and exits with status 1 otherwise.
+    Reads transforms.json and decodes every file; training makes the same check before it starts. Without faults it
+    prints a short summary, a verdict on the starting poses and what is doubtful, and exits with status 0; otherwise it
+    prints all faults and exits with status 1.
 
     Args:
         folder: The scan folder, which holds transforms.json.
@@ -32,7 +34,31 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
-    sys.stdout.write(summary(result))
+    from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
+
+    scan = result.scan
+    cross = None
+    if scan is not None:
+        cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
+    sys.stdout.write(summary(result) + ("" if cross is None else agreement(result, cross)))
+
+
+def agreement(result: "FolderCheck", cross: "CrossFrameAgreement") -> str:
+    """What the coordinates of the frames say about each other under the starting poses, and the verdict."""
+    from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
+    from sl_nerfstudio.verdict.judge import judge_scan
+
+    frames = tuple(FrameFacts(content.name, decoded_share=content.decoded) for content in result.contents)
+    verdict = judge_scan(ScanFacts(frames, cross=cross))
+    seen = [frame.seen for frame in cross.frames]
+    lines = [
+        f"  coverage            {100 * min(seen):.0f} to {100 * max(seen):.0f} % of a frame's points seen by others",
+        f"  frames agree        to {cross.px_median:.2g} px (median), {cross.px_p95:.2g} px (95 %); "
+        f"noise {cross.noise_px:.2g} px",
+        f"  verdict             {verdict.band}",
+        *(f"  warning             {reason}" for reason in verdict.reasons),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def summary(result: "FolderCheck") -> str:

@@ -12,6 +12,7 @@ from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
     from sl_nerfstudio.evaluation.evaluate import Evaluation
+    from sl_nerfstudio.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ def evaluate_scan(config: EvalConfig) -> None:
     _check(config)
     from sl_nerfstudio.evaluation.evaluate import evaluate
     from sl_nerfstudio.evaluation.inputs import read_inputs
+    from sl_nerfstudio.evaluation.judgement import judge
+    from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
     from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
     from sl_nerfstudio.scan.atomic import write_atomic
@@ -52,18 +55,21 @@ def evaluate_scan(config: EvalConfig) -> None:
     thumbnails = ResidualThumbnails()
     evaluation = evaluate(
         inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
-        config.samples, config.seed, on_frame=thumbnails if config.report else None,
+        config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
     )  # fmt: skip
+    judgement = judge(evaluation, intrinsics_hint(inputs.training, inputs.scan))
     results: dict[Path, str] = {}
     if config.json:
-        results[config.json] = json.dumps(to_json(evaluation), indent=2, allow_nan=False) + "\n"
+        results[config.json] = json.dumps(to_json(evaluation, judgement.verdict), indent=2, allow_nan=False) + "\n"
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
-        results[config.report] = render_report(ReportInput(evaluation, inputs, thumbnails.frames, config.mesh.name))
+        results[config.report] = render_report(
+            ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name)
+        )
     for path, text in results.items():
         write_atomic(path, text.encode())
-    print_summary(evaluation, list(results))
+    print_summary(evaluation, judgement.verdict, list(results))
 
 
 def _check(config: EvalConfig) -> None:
@@ -86,7 +92,7 @@ def _check(config: EvalConfig) -> None:
         )
 
 
-def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
+def print_summary(evaluation: "Evaluation", verdict: "Verdict", written: list[Path]) -> None:
     """Print the main figures as tables."""
     from rich.console import Console
     from rich.table import Table
@@ -117,15 +123,27 @@ def print_summary(evaluation: "Evaluation", written: list[Path]) -> None:
         console.print(table)
     agreement = evaluation.agreement
     table = Table(title="Agreement with the captures", title_justify="left")
-    for column in ("coordinates px (median)", "epipolar px (median)", "pattern cosine", "covered"):
+    for column in (
+        "coordinates px (median)",
+        "95 %",
+        "epipolar px (median)",
+        "pattern cosine",
+        "covered",
+        "worst hole",
+    ):
         table.add_column(column, justify="right")
     table.add_row(
         f"{agreement.coordinate_px_median:.3f}",
+        f"{agreement.coordinate_px_p95:.3f}",
         f"{agreement.epipolar_px_median:.3f}",
         f"{agreement.pattern_cosine:.4f}",
         f"{agreement.hit_share:.1%}",
+        f"{max(frame.largest_hole for frame in agreement.frames):.1%}",
     )
     console.print(table)
+    console.print(f"verdict: {verdict.band}", highlight=False)
+    for reason in verdict.reasons:
+        console.print(f"  {reason}", highlight=False, soft_wrap=True, markup=False)
     for path in written:
         console.print(f"written: {path}", highlight=False, soft_wrap=True)
 

@@ -40,8 +40,10 @@ def closing_words(result: "ProcessResult") -> str:
 
     output = result.config.output
     lost = [f"  left out: {f.name}: {first_line(f.reason)}\n" for f in result.frames if not f.in_scan]
+    reasons = "".join(f"  {reason}\n" for reason in result.verdict.reasons)
     scale = f"lengths in {result.units} ({result.scale_source})" if result.scale_source else "no length is known"
     return (
+        f"verdict: {result.verdict.band}\n{reasons}"
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
         f"report: {output / 'processing.html'}\n"
         f"decoded frames are kept in {result.config.work_folder} for the next run; remove this folder once you "

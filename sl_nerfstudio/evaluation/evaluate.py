@@ -13,9 +13,9 @@ from sl_nerfstudio.evaluation.capture_agreement import (
     AgreementAccumulator,
     CaptureAgreement,
     FrameAgreement,
-    FramePixels,
     compare_captures,
 )
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
@@ -24,7 +24,9 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan import Frame, Scan
+from sl_nerfstudio.scan import Frame, PoseSigma, Scan
+from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
+from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
 
 ALIGNMENTS = ("rigid", "similarity", "none")
 
@@ -40,6 +42,7 @@ class Evaluation:
     pose_errors: PoseErrors | None  # of the poses that were evaluated
     initial_pose_errors: PoseErrors | None  # of the scan's own poses, if others were evaluated
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
+    cross: CrossFrameAgreement | None = None  # of the frames with each other, under the evaluated poses
 
     @property
     def truth_units(self) -> str:
@@ -62,8 +65,9 @@ def evaluate(
     samples: int = 100_000,
     seed: int = 0,
     on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None = None,
+    sigma: Sequence[PoseSigma | None] = (),
 ) -> Evaluation:
-    """Evaluate `mesh` with `poses` on `scan`.
+    """Evaluate `mesh` with `poses` on `scan`; `sigma` is the stated uncertainty of the poses, if they are rough.
 
     `on_frame` is called with each frame and its pixels in turn (to make pictures). Raises UserError if the mesh cannot
     be a surface of this scan.
@@ -85,6 +89,7 @@ def evaluate(
         pose_errors=compare_poses(poses, true_poses) if true_poses else None,
         initial_pose_errors=compare_poses(initial, true_poses) if true_poses and moved else None,
         starting_poses=not moved,
+        cross=compare_scan_frames(scan, poses, sigma or [None] * len(scan.frames)),
     )
 
 

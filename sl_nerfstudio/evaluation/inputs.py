@@ -42,6 +42,14 @@ class EvaluationInputs:
     pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # one per frame, or empty
     training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
 
+    @property
+    def stated_sigma(self) -> list[PoseSigma | None]:
+        """Stated uncertainty of the evaluated poses, where those are the scan's rough starting poses; else none.
+
+        Refined poses count as exact, so that their errors show.
+        """
+        return [None if self.poses_path is not None else frame.pose_sigma for frame in self.scan.frames]
+
 
 def read_inputs(
     mesh: Path, data: Path, poses: Path | None, reference: Path | None, samples: int, seed: int

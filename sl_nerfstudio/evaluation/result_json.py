@@ -7,16 +7,23 @@ from typing import Any
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
+from sl_nerfstudio.verdict.verdict import Verdict
 
 
-def to_json(evaluation: Evaluation) -> dict[str, Any]:
+def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
     """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
-    the captures, is always there.
+    the captures, is always there, and so are `verdict` and `reasons`. `cross_frame` is the agreement of the frames with
+    each other.
     """
-    out: dict[str, Any] = {"format": 1, "units": evaluation.units}
+    out: dict[str, Any] = {
+        "format": 1,
+        "verdict": verdict.band,
+        "reasons": list(verdict.reasons),
+        "units": evaluation.units,
+    }
     if evaluation.reference is not None or evaluation.pose_errors is not None:
         out["truth_units"] = evaluation.truth_units
     if evaluation.reference is not None:
@@ -28,6 +35,8 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
     if evaluation.initial_pose_errors is not None:
         out["initial"] = _poses(evaluation.initial_pose_errors)
     out["fit"] = asdict(evaluation.agreement)
+    if evaluation.cross is not None:
+        out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
     return _finite(out)
 
 

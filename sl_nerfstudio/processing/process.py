@@ -16,7 +16,7 @@ from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.refined_focal import refine_focal
 from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.processing.summary import summarise
+from sl_nerfstudio.processing.summary import compare_registered, summarise
 from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
@@ -50,7 +50,8 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     _require_registered(config, inputs, results, registration, make_report)
 
     poses = find_scan_poses(clouds, registration, inputs.known, given)
-    result = summarise(config, job.decoder.name, results, registration, poses)
+    cross = compare_registered(clouds, registration, poses.adjusted)
+    result = summarise(config, job.decoder.name, results, registration, poses, cross)
     if result.joint_px is not None:
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(config.output, job, results, poses, result, make_report)

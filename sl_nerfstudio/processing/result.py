@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.verdict.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,18 @@ class FrameRecord:
     decode_rate: float | None = None
     mask_share: float | None = None
     epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
-    sigma_rotation_deg: float | None = None
-    sigma_direction_deg: float | None = None
+    own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's projector
+    relative_sigma_rotation_deg: float | None = None  # of the projector against the camera, from this frame alone
+    relative_sigma_direction_deg: float | None = None
+    component: int = -1  # group of frames that registration connects: 0 the largest, which is in the scan; -1: none
+    undecided: bool = False  # registration could not decide its pose
+    sigma_rotation_deg: float | None = None  # of the camera in the scan, 1 sigma per axis
     fitness: float | None = None  # share of the points seen by other frames, too, that agree with them
+    seen_share: float | None = None  # of its points, those that other frames can judge by their coordinates
+    cross_share: float | None = None  # of these, those that agree: the median over the frames it is compared with
+    cross_px_median: float | None = None  # their residual, pattern pixels, the same median
+    cross_px_p95: float | None = None  # 95 % of the residuals are smaller
+    cross_excess: float | None = None  # residual in units of what is expected, relative to the scan's better pairs
     baseline: float | None = None  # camera to projector, in the scan's unit
     degeneracies: tuple[str, ...] = ()
 
@@ -48,6 +58,8 @@ class ProcessResult:
     remarks: tuple[str, ...]
     recapture: tuple[str, ...]  # what to capture again or in addition, and why
     joint_px: tuple[float, float] | None  # cross-frame residual before and after the joint adjustment
+    cross_px: tuple[float, float] | None  # the same over all points that two frames saw: median, 95 %
+    verdict: Verdict
     versions: dict[str, str]
 
     @property
@@ -58,6 +70,8 @@ class ProcessResult:
     def document(self) -> dict[str, Any]:
         """As JSON."""
         return {
+            "verdict": self.verdict.band,
+            "reasons": list(self.verdict.reasons),
             "decoder": self.decoder,
             "units": self.units,
             "scale": self.scale_source or None,
@@ -69,5 +83,6 @@ class ProcessResult:
             "remarks": list(self.remarks),
             "recapture": list(self.recapture),
             "joint_adjustment_px": self.joint_px,
+            "cross_frame_px": self.cross_px,
             "versions": self.versions,
         }

@@ -2,12 +2,13 @@
 
 import importlib.metadata
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sl_nerfstudio import __version__
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
@@ -15,7 +16,12 @@ from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
-from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.result import Registration, UncertainRotation
+from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
+from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
+from sl_nerfstudio.verdict.judge import judge_scan
+from sl_nerfstudio.verdict.scan_agreement import compare_frames
 
 _ALONE = "too few other frames could be used"
 
@@ -46,12 +52,14 @@ def summarise(
     results: Sequence[FrameStageResult],
     registration: Registration | None,
     poses: ScanPoses | None,
+    cross: CrossFrameAgreement | None = None,
 ) -> ProcessResult:
-    """The result of a run; without `poses` no frame is in a scan."""
-    frames = tuple(_record(result, registration, poses) for result in results)
+    """The result of a run; without `poses` no frame is in a scan. `cross` is of the registered frames."""
+    frames = _with_cross([_record(result, registration, poses) for result in results], cross)
     edges = () if registration is None else registration.edges
     records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
     adjusted = None if poses is None else poses.adjusted
+    wrong = _contradiction(results, adjusted)
     return ProcessResult(
         config=config,
         decoder=decoder,
@@ -59,23 +67,69 @@ def summarise(
         scale_source=poses.scale.source if poses is not None and poses.scale.known else "",
         frames=frames,
         edges=records,
-        remarks=_remarks(results, registration, adjusted),
+        remarks=(*([wrong] if wrong else []), *_uncertain(registration)),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
+        cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
+        verdict=judge_scan(
+            ScanFacts(
+                tuple(map(_facts, frames)), tuple(PairFacts(e.frames, e.used) for e in records), cross, bool(wrong)
+            )
+        ),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 
 
-def _remarks(
-    results: Sequence[FrameStageResult], registration: Registration | None, adjusted: AdjustedFrames | None
-) -> tuple[str, ...]:
-    """What remains uncertain."""
-    remarks = () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
+def compare_registered(
+    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames
+) -> CrossFrameAgreement:
+    """Coordinates of all registered frames against each other; the poses count as exact, so that errors show."""
+    index = np.flatnonzero(registration.registered)
+    chosen = [clouds[k] for k in index]
+    poses = DevicePoses(adjusted.poses.T_world_camera[index], adjusted.poses.T_world_projector[index])
+    return compare_frames(
+        [c.camera for c in chosen], clouds[0].projector, poses, [c.coords for c in chosen], [None] * len(chosen)
+    )
+
+
+def _with_cross(frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None) -> tuple[FrameRecord, ...]:
+    """The records with what the other frames say about each."""
+    found = iter(() if cross is None else cross.frames)
+    return tuple(_agreeing(f, next(found)) if f.in_scan and cross is not None else f for f in frames)
+
+
+def _agreeing(frame: FrameRecord, found: FrameCrossAgreement) -> FrameRecord:
+    figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
+               "cross_excess": found.excess}  # fmt: skip
+    known = {key: value for key, value in figures.items() if np.isfinite(value)}
+    return replace(frame, seen_share=found.seen, **known)
+
+
+def _facts(frame: FrameRecord) -> FrameFacts:
+    """What the verdict judges of a frame."""
+    return FrameFacts(
+        frame.name,
+        frame.in_scan,
+        frame.component if frame.component >= 0 else None,
+        frame.undecided,
+        frame.sigma_rotation_deg,
+        frame.decode_rate,
+        frame.own_share,
+        bool(frame.degeneracies),
+    )
+
+
+def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:
+    """Which intrinsics the captures contradict; "" if none."""
     clouds = clouds_of(results)
     if adjusted is None or not clouds:
-        return remarks
-    wrong = contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
-    return (wrong, *remarks) if wrong else remarks
+        return ""
+    return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+
+
+def _uncertain(registration: Registration | None) -> tuple[str, ...]:
+    """What registration could not decide."""
+    return () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:
@@ -92,23 +146,35 @@ def _record(result: FrameStageResult, registration: Registration | None, poses: 
         return FrameRecord(result.name, False, result.stage, result.reason, rate, share)
     if failure is None and poses is None:
         failure = Failure("registering", _ALONE)
-    baseline = fitness = None
-    if failure is None and poses is not None and registration is not None:
-        k = registration.names.index(result.name)
-        baseline = float(poses.adjusted.poses.baseline[k])
-        fitness = float(np.nan_to_num(registration.fitness[k]))
-    pose = cloud.pose
-    return FrameRecord(
+    record = FrameRecord(
         name=result.name,
         in_scan=failure is None,
         stage="" if failure is None else failure.stage,
         reason="" if failure is None else failure.reason,
         decode_rate=rate,
         mask_share=share,
-        epipolar_px=float(pose.residual_px),
-        sigma_rotation_deg=pose.sigma_rotation_deg,
-        sigma_direction_deg=pose.sigma_direction_deg,
-        fitness=fitness,
-        baseline=baseline,
-        degeneracies=tuple(map(degeneracy_sentence, pose.degeneracies)),
+        epipolar_px=float(cloud.pose.residual_px),
+        own_share=float(cloud.pose.inliers.mean()),
+        relative_sigma_rotation_deg=cloud.pose.sigma_rotation_deg,
+        relative_sigma_direction_deg=cloud.pose.sigma_direction_deg,
+        degeneracies=tuple(map(degeneracy_sentence, cloud.pose.degeneracies)),
+    )
+    return record if registration is None else _registered(record, registration, poses)
+
+
+def _registered(record: FrameRecord, registration: Registration, poses: ScanPoses | None) -> FrameRecord:
+    """The record with what registration and the joint adjustment found."""
+    k = registration.names.index(record.name)
+    record = replace(record, component=int(registration.component[k]))
+    if not record.in_scan or poses is None:
+        return record
+    doubts = [u for u in registration.uncertainties if u.frame == record.name]
+    stated = poses.adjusted.sigma[k]
+    sigmas = [u.sigma_deg for u in doubts if isinstance(u, UncertainRotation)]
+    return replace(
+        record,
+        undecided=bool(doubts),
+        sigma_rotation_deg=max([*sigmas, *([] if stated is None else [stated.camera_rotation_deg])], default=None),
+        fitness=float(np.nan_to_num(registration.fitness[k])),
+        baseline=float(poses.adjusted.poses.baseline[k]),
     )

@@ -127,3 +127,11 @@ def test_a_fault_in_words() -> None:
     assert str(error).splitlines()[0] == "2 faults in scan"
     assert isinstance(error, UserError)
     assert str(ScanError([fault])).splitlines()[0] == "1 fault in the scan"
+
+
+def test_the_verdict_on_the_starting_poses(good: Path, tmp_path: Path) -> None:
+    """A frame that is turned about the object is no fault of the folder, but the coordinates contradict it."""
+    lines = command(str(good)).stdout.splitlines()
+    assert [line[:22].strip() for line in lines[7:10]] == ["coverage", "frames agree", "verdict"]
+    assert lines[7].endswith("% of a frame's points seen by others")
+    assert "px (median)" in lines[8] and "noise" in lines[8]

@@ -125,7 +125,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
 def test_without_truth_the_fit_is_there_and_nothing_else(scan: Path, untrue: Path, tmp_path: Path) -> None:
     run("--mesh", mesh_of(scan), "--data", untrue, "--json", tmp_path / "out.json")
     content = json.loads((tmp_path / "out.json").read_text())
-    assert set(content) == {"format", "units", "fit"}
+    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "cross_frame"}
     assert content["fit"]["coordinate_px_median"] < 1e-2
 
 

@@ -3,8 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, frame_pixels, look_up
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement
 from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.frame_pixels import frame_pixels, look_up
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device

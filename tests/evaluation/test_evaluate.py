@@ -8,6 +8,7 @@ import pytest
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import Evaluation, evaluate
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.judgement import judge
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.result_json import to_json
 from sl_nerfstudio.geometry.device_poses import DevicePoses
@@ -58,8 +59,12 @@ def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_
     assert result.pose_errors is None
 
 
+def as_json(evaluation: Evaluation) -> dict:
+    return to_json(evaluation, judge(evaluation).verdict)
+
+
 def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
-    content = to_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan()))
+    content = as_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan()))
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["units"] == content["truth_units"] == "mm"
     for name in ("rigid", "similarity", "none"):
@@ -72,6 +77,9 @@ def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
     for device in ("camera", "projector"):
         assert set(content[device]) >= {"translation_rmse", "rotation_rmse_deg"}
     assert set(content["fit"]) >= {"coordinate_px_median", "epipolar_px_median", "pattern_cosine", "frames"}
+    assert content["verdict"] in ("good", "acceptable", "poor") and isinstance(content["reasons"], list)
+    assert set(content["fit"]["frames"][0]) >= {"coordinate_px_p95", "covered_share", "agreeing_share", "largest_hole"}
+    assert len(content["cross_frame"]["frames"]) == 3
 
 
 def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path) -> None:
@@ -82,7 +90,7 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path)
     poses = scan.poses.mapped(S)
     noisy = Mesh(vertices + np.random.default_rng(0).normal(0, 0.5, vertices.shape), made.truth().faces)
     reference = mesh_reference(made.truth(), scan, made.true_poses(), SAMPLES)
-    content = to_json(evaluate(noisy.mapped(S), scan, poses, reference, made.true_poses(), samples=SAMPLES))
+    content = as_json(evaluate(noisy.mapped(S), scan, poses, reference, made.true_poses(), samples=SAMPLES))
     assert (content["units"], content["truth_units"]) == ("arbitrary", "units of the truth")
     assert 0.1 < content["similarity"]["accuracy"]["rmse"] < 1.0
     assert content["camera"]["translation_rmse"] < 1e-6
@@ -90,13 +98,13 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path)
 
 def test_without_truth_only_the_fit_is_there(clean_scan: Path) -> None:
     scan = read_scan(clean_scan)
-    content = to_json(evaluate(FacetedScan().truth(), scan, scan.poses))
-    assert set(content) == {"format", "units", "fit"}
+    content = as_json(evaluate(FacetedScan().truth(), scan, scan.poses))
+    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "cross_frame"}
     assert content["fit"]["coordinate_px_median"] < 1e-3
 
 
 def test_figures_repeat_with_the_seed(clean_scan: Path) -> None:
-    first, second = (to_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan())) for _ in range(2))
+    first, second = (as_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan())) for _ in range(2))
     assert first == second
 
 
@@ -116,7 +124,7 @@ def test_figures_do_not_depend_on_the_unit(tmp_path: Path) -> None:
     in_m = FacetedScan(wrong_poses_deg=1.0, units="m", scale=0.04)
     swollen = Mesh(in_mm.mesh.vertices * 1.02, in_mm.mesh.faces)
     mm, m = (
-        to_json(evaluated(made.write(tmp_path / made.units), FacetedScan(scale=made.scale, mesh=swollen).truth(), made))
+        as_json(evaluated(made.write(tmp_path / made.units), FacetedScan(scale=made.scale, mesh=swollen).truth(), made))
         for made in (in_mm, in_m)
     )
     assert m["rigid"]["accuracy"]["rmse"] * 1000 == pytest.approx(mm["rigid"]["accuracy"]["rmse"], rel=1e-4)

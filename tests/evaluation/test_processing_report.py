@@ -10,17 +10,20 @@ from sl_nerfstudio.evaluation.report.processing_report import render_processing_
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.preview import Preview, make_preview
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
+from sl_nerfstudio.verdict.verdict import Verdict
 
 CONFIG = ProcessConfig(Path("captures & more"), Path("pattern.json"), Path("intrinsics.json"), Path("scan"))
-GOOD = {"decode_rate": 0.93, "mask_share": 0.4, "epipolar_px": 0.31, "sigma_rotation_deg": 0.12,
-        "sigma_direction_deg": 0.25, "fitness": 0.9, "baseline": 84.5}  # fmt: skip
+GOOD = {"decode_rate": 0.93, "mask_share": 0.4, "epipolar_px": 0.31, "relative_sigma_rotation_deg": 0.12,
+        "relative_sigma_direction_deg": 0.25, "sigma_rotation_deg": 0.04, "cross_share": 0.97, "cross_px_p95": 0.83,
+        "cross_px_median": 0.21, "component": 0, "fitness": 0.9, "baseline": 84.5}  # fmt: skip
 
 
 def _result(frames, **changes):
     edges = (EdgeRecord(("a<b", "c"), 0.5, 0.9, True, False), EdgeRecord(("c", "d"), 0.2, 0.5, False, True))
     values = {"config": CONFIG, "decoder": "network", "units": "mm", "scale_source": "baseline of frame 0",
               "frames": frames, "edges": edges, "remarks": (), "recapture": (), "joint_px": (1.5, 0.4),
-              "versions": {"torch": "2"}, **changes}  # fmt: skip
+              "cross_px": (0.2, 0.8),
+              "verdict": Verdict("good", ()), "versions": {"torch": "2"}, **changes}  # fmt: skip
     return ProcessResult(**values)
 
 
@@ -42,28 +45,23 @@ def test_everything_is_shown_and_escaped():
     assert not re.search(r"(src|href)=\"?https?:", page) and "<script" not in page
 
 
-@pytest.mark.parametrize(
-    ("lost", "changes", "band"),
-    [
-        (0, {}, "Good"),
-        (1, {}, "Acceptable"),
-        (4, {}, "Poor"),
-        (0, {"remarks": ("the scene is symmetric",)}, "Acceptable"),
-    ],
-)
-def test_verdict(lost, changes, band):
-    frames = tuple(
-        FrameRecord(str(k), k >= lost, "" if k >= lost else "registering", "" if k >= lost else "alone", **GOOD)
-        for k in range(8)
-    )
-    page = render_processing_report(_result(frames, edges=(), **changes), [Preview(None, None)] * 8)
-    assert f"<strong>{band}</strong>" in page
+@pytest.mark.parametrize("band", ["good", "acceptable", "poor"])
+def test_the_verdict_and_its_reasons_come_first(band):
+    reasons = () if band == "good" else ("c: contradicts <the others>", "d: undecided")
+    frames = tuple(FrameRecord(name, True, "", "", **GOOD, undecided=name == "d") for name in "cd")
+    page = render_processing_report(_result(frames, verdict=Verdict(band, reasons)), [Preview(None, None)] * 2)
+    assert f'<div class="verdict {band}"><strong>{band.capitalize()}</strong>' in page
+    assert ("<li>c: contradicts &lt;the others&gt;</li><li>d: undecided</li>" in page) == (band != "good")
+    assert page.index("<strong>") < page.index("What to capture again")
+    assert "<td>undecided</td>" in page and "0.83 px" in page and "97 %" in page
+    assert "half lie within 0.20 px and 95 % within 0.80 px" in page
 
 
 def test_a_report_without_any_good_frame_can_be_made():
     frames = (FrameRecord("a", False, "reading", "x"), FrameRecord("b", False, "decoding", "y"))
     page = render_processing_report(
-        _result(frames, edges=(), joint_px=None, scale_source="", units="arbitrary"), [Preview(None, None)] * 2
+        _result(frames, edges=(), joint_px=None, cross_px=None, scale_source="", units="arbitrary"),
+        [Preview(None, None)] * 2,
     )
     assert "0 of 2 frames are in the scan: no scan could be written" in page
 

@@ -10,8 +10,10 @@ import pytest
 from sl_nerfstudio.evaluation.evaluate import evaluate
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import EvaluationInputs
+from sl_nerfstudio.evaluation.judgement import judge
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.report.charts import nice_limit
+from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, OrthographicView, camera_views, pixel_map, render
 from sl_nerfstudio.evaluation.report.plot3d import decimated
 from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
@@ -90,7 +92,16 @@ def full_report(clean_scan: Path) -> str:
     path = Path("refined/transforms.json")
     inputs = EvaluationInputs(made.truth(), scan, moved, true, reference, path, [sigma, None, sigma], TRAINING)
     made_at = datetime(2026, 1, 2, 3, 4)
-    return render_report(ReportInput(evaluation, inputs, thumbnails.frames, "<mesh & co>.ply", made_at))
+    return render_report(
+        ReportInput(
+            evaluation,
+            judge(evaluation, intrinsics_hint(inputs.training, scan)),
+            inputs,
+            thumbnails.frames,
+            "<mesh & co>.ply",
+            made_at,
+        )
+    )
 
 
 def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) -> None:
@@ -140,7 +151,11 @@ def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -
     thumbnails = ResidualThumbnails()
     evaluation = evaluate(made.truth(), scan, poses, on_frame=thumbnails)
     inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
-    page = render_report(ReportInput(evaluation, inputs, thumbnails.frames, "mesh.ply"))
+    page = render_report(
+        ReportInput(
+            evaluation, judge(evaluation, intrinsics_hint(inputs.training, scan)), inputs, thumbnails.frames, "mesh.ply"
+        )
+    )
     text = " ".join(" ".join(Page(page).text).split())
     assert "No truth or reference is known for this scan" in text
     assert "The scan's own poses were evaluated" in text
@@ -157,7 +172,11 @@ def test_report_with_reference_points_shows_signed_offsets(clean_scan: Path) -> 
         made.truth(), scan, poses, PointReference(points, "some points"), samples=5000, on_frame=thumbnails
     )
     inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
-    page = render_report(ReportInput(evaluation, inputs, thumbnails.frames, "mesh.ply"))
+    page = render_report(
+        ReportInput(
+            evaluation, judge(evaluation, intrinsics_hint(inputs.training, scan)), inputs, thumbnails.frames, "mesh.ply"
+        )
+    )
     text = " ".join(" ".join(Page(page).text).split())
     assert "Distance from reference" in text and "some points" in text
 

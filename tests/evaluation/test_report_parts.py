@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement, FramePixels
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.comparisons import compare_frames
 from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
@@ -24,7 +25,7 @@ from sl_nerfstudio.scan import read_scan
 
 from .faceted_scan import FacetedScan
 
-FRAME = FrameAgreement("f", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
+FRAME = FrameAgreement("f", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)
 
 
 def picture(address: str) -> np.ndarray:
@@ -77,8 +78,10 @@ def test_brightness_is_matched_in_least_squares() -> None:
     flags = np.ones(n, dtype=bool)
     pixels = FramePixels(
         row=np.arange(n), column=np.arange(n), stride=1, hit=flags, lit=np.arange(n) < 40, decoded=flags,
-        offset=np.zeros((n, 2)), epipolar=np.zeros(n), captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0),
-        rendered=rendered, depth_per_px=np.ones(n), ray_angle_deg=np.ones(n),
+        coords=np.zeros((n, 2)), offset=np.zeros((n, 2)), epipolar=np.zeros(n),
+        captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0),
+        rendered=rendered, depth_per_px=np.ones(n), ray_angle_deg=np.ones(n), behind=np.zeros(n),
+        noise_px=0.1, footprint_px=1.0,
     )  # fmt: skip
     assert brightness_ratio(pixels) == pytest.approx(1.7)  # unlit pixels do not count
     assert brightness_ratio(replace(pixels, lit=~flags)) == 1.0

@@ -9,10 +9,10 @@ import pytest
 from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.processing.summary import left_out, summarise
+from sl_nerfstudio.processing.summary import compare_registered, left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import NoCommonSurface
+from sl_nerfstudio.registration.result import AmbiguousPose, NoCommonSurface, UncertainRotation
 from tests.processing.ramp_scan import NAMES
 
 
@@ -53,12 +53,50 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
         assert frame.epipolar_px == stage.cloud.pose.residual_px < 0.01
         figures = vars(frame)
         assert figures["fitness"] > 0.9
-        assert figures["sigma_rotation_deg"] < 0.01 and figures["sigma_direction_deg"] < 0.01
+        assert figures["relative_sigma_rotation_deg"] < 0.01 and figures["relative_sigma_direction_deg"] < 0.01
+        assert 0 < figures["sigma_rotation_deg"] < 0.1 and frame.component == 0 and not frame.undecided
+        assert figures["own_share"] > 0.95
     assert result.joint_px is not None
     before, after = result.joint_px
     assert after < before < 0.2
     assert {edge.frames for edge in result.edges} >= set(pairwise(NAMES))
     assert set(result.versions) == {"sl_nerfstudio", "numpy", "torch"}
+
+
+def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results, registration, poses):
+    cross = compare_registered(clouds_of(results), registration, poses.adjusted)
+    result = summarise(config, "ramps", results, registration, poses, cross)
+    assert (
+        result.verdict.band == "good" and result.document()["verdict"] == "good" and result.document()["reasons"] == []
+    )
+    for frame, found in zip(result.frames, cross.frames, strict=True):
+        assert (frame.seen_share, frame.cross_share, frame.cross_px_p95) == (found.seen, found.share, found.px_p95)
+        assert found.share > 0.95
+    assert result.cross_px == (cross.px_median, cross.px_p95)
+
+
+def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(config, results, registration, poses):
+    doubts = (UncertainRotation(NAMES[1], 7.5), AmbiguousPose(NAMES[2]))
+    result = summarise(config, "ramps", results, replace(registration, uncertainties=doubts), poses)
+    assert result.verdict.band == "poor"
+    assert result.verdict.reasons[0].startswith(f"{NAMES[1]}: rotation known only to 7.5 degrees")
+    assert result.frames[1].sigma_rotation_deg == 7.5
+    assert [frame.undecided for frame in result.frames] == [False, True, True, False]
+    assert result.document()["frames"][1]["undecided"] is True
+    one = summarise(config, "ramps", results, replace(registration, uncertainties=doubts[1:]), poses)
+    assert one.verdict.band == "acceptable" and NAMES[2] in one.verdict.reasons[0]
+
+
+def test_frames_of_another_component_say_so(config, results, registration, poses):
+    apart = replace(
+        registration,
+        registered=np.array([True, True, True, False]),
+        component=np.array([0, 0, 0, 1]),
+        exclusions=(NoCommonSurface(NAMES[3]),),
+    )
+    result = summarise(config, "ramps", results, apart, poses)
+    assert [frame.component for frame in result.frames] == [0, 0, 0, 1]
+    assert result.verdict.band == "acceptable" and f"{NAMES[3]}: stands alone" in result.verdict.reasons[0]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FramePixels, frame_pixels
+from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels, frame_pixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.pictures import (
     NO_SURFACE,

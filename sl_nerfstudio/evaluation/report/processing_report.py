@@ -14,7 +14,6 @@ from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.result import FrameRecord, ProcessResult
 
 _TEMPLATE = "processing.html.j2"
-_MANY_WEAK = 0.25  # of the frames
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
     values = {
         "result": result,
         "rows": rows,
-        "band": _band(result),
+        "verdict": result.verdict,
         "sentence": _sentence(result),
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
@@ -40,17 +39,6 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "made_at": datetime.now(),
     }
     return page(_TEMPLATE, values, first_line=first_line)
-
-
-def _band(result: ProcessResult) -> str:
-    """good, acceptable or poor."""
-    lost = len(result.frames) - result.registered
-    weak = sum(bool(f.degeneracies) for f in result.frames if f.in_scan)
-    if result.registered < 2 or lost > len(result.frames) / 4:
-        return "poor"
-    if lost or weak > _MANY_WEAK * result.registered or result.remarks:
-        return "acceptable"
-    return "good"
 
 
 def _sentence(result: ProcessResult) -> str:
@@ -78,10 +66,12 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
         ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
          [charts.Bars("epipolar", values("epipolar_px"))]),
         ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
-         [charts.Bars("rotation", values("sigma_rotation_deg")),
-          charts.Bars("baseline's direction", values("sigma_direction_deg"))]),
+         [charts.Bars("rotation", values("relative_sigma_rotation_deg")),
+          charts.Bars("baseline's direction", values("relative_sigma_direction_deg"))]),
         ("Agreement with overlapping frames", "% of the points",
-         [charts.Bars("agreement", values("fitness", 100.0))]),
+         [charts.Bars("surfaces", values("fitness", 100.0)), charts.Bars("coordinates", values("cross_share", 100.0))]),
+        ("Coordinates of this frame against those of the others", "pattern px",
+         [charts.Bars("95 % below", values("cross_px_p95")), charts.Bars("median", values("cross_px_median"))]),
     ]  # fmt: skip
     known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]
     return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]

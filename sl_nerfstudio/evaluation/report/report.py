@@ -12,16 +12,15 @@ from numpy import ndarray
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import EvaluationInputs
+from sl_nerfstudio.evaluation.judgement import Judgement
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
-from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
 from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, camera_views, data_uri, render
 from sl_nerfstudio.evaluation.report.plot3d import compressed_script, mesh_figure
 from sl_nerfstudio.evaluation.report.thumbnails import COORDINATE, EPIPOLAR, PATTERN, FrameThumbnails
-from sl_nerfstudio.evaluation.verdict import judge
 from sl_nerfstudio.scan import PoseSigma
 
 _TEMPLATE = "report.html.j2"
@@ -32,6 +31,7 @@ class ReportInput:
     """What the report is made from."""
 
     evaluation: Evaluation
+    judgement: Judgement
     inputs: EvaluationInputs
     thumbnails: list[FrameThumbnails]
     mesh_name: str
@@ -66,7 +66,8 @@ def render_report(report: ReportInput) -> str:
         "agreement": evaluation.agreement,
         "units": evaluation.units,
         "truth_units": evaluation.truth_units,
-        "verdict": judge(evaluation, intrinsics_hint(report.inputs.training, report.inputs.scan)),
+        "judgement": report.judgement,
+        "verdict": report.judgement.verdict,
         "surface": _surface_pictures(report, surface),
         "comparisons": comparisons,
         "coordinate_scale": COORDINATE,

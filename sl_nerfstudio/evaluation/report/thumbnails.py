@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement, FramePixels
+from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, data_uri, pixel_map, residual_colours, shrink
 from sl_nerfstudio.scan import Frame
 

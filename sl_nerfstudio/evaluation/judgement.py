@@ -1,15 +1,18 @@
-"""Good, acceptable or poor: how the figures of a scan are judged, and what to do next."""
+"""How the figures of an evaluation are judged, what that makes of the verdict, and what to do next."""
 
 import math
 from dataclasses import dataclass
 from typing import Literal
 
+from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.verdict.judge import cross_reasons
+from sl_nerfstudio.verdict.settings import VerdictSettings
+from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, worst
 
-Band = Literal["good", "acceptable", "poor", "unknown"]
 ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
-_ORDER: dict[str, int] = {"good": 0, "unknown": 0, "acceptable": 1, "poor": 2}
+_ORDER: dict[str, int] = {"good": 0, "unknown": 1, "acceptable": 1, "poor": 2}
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,7 @@ class JudgedFigure:
     name: str
     value: float
     text: str  # the value with its unit
-    band: Band
+    band: Band | Literal["unknown"]  # unknown: the figure does not exist
     good: str  # the limit of "good", in words
     acceptable: str
     meaning: str
@@ -27,10 +30,10 @@ class JudgedFigure:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The worst judgement, and all judged figures."""
+class Judgement:
+    """The verdict, which is the worst judgement, and all judged figures."""
 
-    band: Band
+    verdict: Verdict
     sentence: str
     figures: tuple[JudgedFigure, ...]
     hints: tuple[str, ...] = ()  # explanations that come before the advice of the figures
@@ -42,8 +45,11 @@ class Verdict:
         return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad)]
 
 
-def judge(evaluation: Evaluation, intrinsics: str = "") -> Verdict:
-    """Judge an evaluation by fixed bands; `intrinsics` is what the training found wrong with them ("": nothing)."""
+def judge(evaluation: Evaluation, intrinsics: str = "") -> Judgement:
+    """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
+
+    The agreement of the frames with each other is judged as sl-process and sl-check judge it.
+    """
     fit = evaluation.agreement
     figures = [
         _judged(
@@ -69,13 +75,20 @@ def judge(evaluation: Evaluation, intrinsics: str = "") -> Verdict:
             "export with --keep-unobserved to see whether too much of the surface was removed; otherwise add frames "
             "that see the missing parts",
         ),
-        _worst_frame(evaluation),
+        *(judge_worst(figure, evaluation) for figure in WORST_FRAME),
         _geometry(evaluation),
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
-    band: Band = max((c.band for c in figures), key=lambda b: _ORDER[b])
-    return Verdict(band, _sentence(band, evaluation), tuple(figures), _hints(evaluation, band, intrinsics))
+    reasons = [Reason(f.band, f"{f.name}: {f.text} (good: {f.good})") for f in figures if f.band != "unknown"]
+    reasons += [Reason("acceptable", f"{f.name}: cannot be judged") for f in figures if f.band == "unknown"]
+    names = [frame.name for frame in evaluation.agreement.frames]
+    if evaluation.cross is not None:
+        reasons += cross_reasons(names, evaluation.cross, VerdictSettings())
+    verdict = worst(reasons)
+    return Judgement(
+        verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics)
+    )
 
 
 def _judged(
@@ -83,7 +96,7 @@ def _judged(
 ) -> JudgedFigure:
     """Judge `value`; whether larger is better follows from the order of the limits."""
     sign = 1 if good < acceptable else -1
-    band: Band = "poor"
+    band: Band | Literal["unknown"] = "poor"
     if not math.isfinite(value):
         band = "unknown"
     elif sign * value <= sign * good:
@@ -111,16 +124,68 @@ def _accuracy(evaluation: Evaluation) -> JudgedFigure:
     )  # fmt: skip
 
 
-def _worst_frame(evaluation: Evaluation) -> JudgedFigure:
-    known = [
-        (f.coordinate_px_median, f.name) for f in evaluation.agreement.frames if math.isfinite(f.coordinate_px_median)
-    ]
-    worst, name = max(known, default=(math.nan, ""))
-    ratio = worst / evaluation.agreement.coordinate_px_median if known else math.nan
+@dataclass(frozen=True)
+class WorstFrameFigure:
+    """A figure that is judged in the frame where it is worst."""
+
+    name: str
+    key: str  # of FrameAgreement
+    relative: bool  # judged as a multiple of the median frame's value
+    good: float
+    acceptable: float
+    meaning: str
+    advice: str
+
+
+WORST_FRAME = (
+    WorstFrameFigure(
+        "Worst frame", "coordinate_px_median", True, 2.0, 4.0,
+        "Median coordinate residual of the worst frame, relative to the median frame: no frame should contradict the "
+        "others.",
+        "if its pose or decoding is wrong, leave the frame out and train again",
+    ),
+    WorstFrameFigure(
+        "Worst frame, 95 %", "coordinate_px_p95", True, 3.0, 6.0,
+        "95 % of the coordinate residuals of a frame are smaller: its worst value, relative to the median frame.",
+        "part of the frame contradicts the surface: look at its residual map",
+    ),
+    WorstFrameFigure(
+        "Agreement in the worst frame", "agreeing_share", False, 85.0, 65.0,
+        "Share of a frame's decoded pixels whose predicted coordinate lies within 4 sigma of the measured noise of the "
+        "decoded one, but not less than a camera pixel.",
+        "the surface does not match this frame: train longer, or check its pose",
+    ),
+    WorstFrameFigure(
+        "Coverage of the worst frame", "covered_share", False, 90.0, 75.0,
+        "Share of a frame's decoded pixels at which the mesh has a surface.",
+        "export with --keep-unobserved to see what was removed; otherwise look for holes in the view of this frame",
+    ),
+    WorstFrameFigure(
+        "Largest hole", "largest_hole", False, 0.5, 2.0,
+        "Largest connected area of decoded pixels whose rays meet no surface near the measured point, in percent of "
+        "the frame's decoded pixels; gaps along the rim do not count.",
+        "the surface is missing where it was measured: train longer, or export with a finer resolution",
+    ),
+)  # fmt: skip
+
+
+def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation) -> JudgedFigure:
+    """Judge the frame in which a figure is worst, by name."""
+    sign = 1 if figure.good < figure.acceptable else -1
+    frames = [f for f in evaluation.agreement.frames if math.isfinite(getattr(f, figure.key))]
+    worst_frame: FrameAgreement | None = max(frames, key=lambda f: sign * getattr(f, figure.key), default=None)
+    if worst_frame is None:
+        value, name = math.nan, ""
+    else:
+        value, name = getattr(worst_frame, figure.key), worst_frame.name
+    if figure.relative:
+        usual = sorted(getattr(f, figure.key) for f in frames)[len(frames) // 2] if frames else math.nan
+        value, form, limit = value / usual if usual > 0 else math.nan, "{:.1f} times the median", "{} times"
+    else:
+        value, form, limit = 100 * value, "{:.1f} %", "{} %"
     return _judged(
-        "Worst frame", ratio, f"{{:.1f}} times the median ({name})", 2.0, 4.0, "≤ {} times",
-        "Coordinate residual of the worst frame, relative to the whole scan: no frame should contradict the others.",
-        f"look at {name or 'it'} below; if its pose or decoding is wrong, leave the frame out and train again",
+        figure.name, value, f"{form} ({name})", figure.good, figure.acceptable, f"{'≤' if sign > 0 else '≥'} {limit}",
+        figure.meaning, f"look at {name or 'it'} below: {figure.advice}",
     )  # fmt: skip
 
 
@@ -158,6 +223,5 @@ def _sentence(band: Band, evaluation: Evaluation) -> str:
         "good": "The surface matches the captures, and nothing is conspicuous",
         "acceptable": "The scan is usable; some figures are weaker than they could be",
         "poor": "At least one figure shows that something is wrong",
-        "unknown": "There is too little data for a judgement",
     }[band]
     return f"{start} ({evidence})."

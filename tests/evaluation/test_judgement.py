@@ -1,19 +1,21 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
-from sl_nerfstudio.evaluation.verdict import judge
+from sl_nerfstudio.evaluation.judgement import judge
+from tests.verdict.cases import ring
 
-FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0)
+FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)
 AGREEMENT = CaptureAgreement(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))
 GOOD = Evaluation("mm", AGREEMENT, None, {}, None, None, starting_poses=True)
 
 
 def test_good_agreement_is_good_and_needs_nothing() -> None:
     verdict = judge(GOOD)
-    assert verdict.band == "good"
+    assert verdict.verdict.band == "good" and verdict.verdict.reasons == ()
     assert {figure.band for figure in verdict.figures} == {"good"}
     assert verdict.next_steps == []
     assert "no truth is known" in verdict.sentence  # and does not pretend to know more
@@ -27,6 +29,20 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
 
+def _with(**changes) -> dict:
+    """Five good frames and one that is not."""
+    return {"frames": (*[FRAME] * 5, replace(FRAME, name="frame_00007", **changes))}
+
+
+def test_frames_that_contradict_each_other_are_named_as_in_a_processing_report() -> None:
+    excess = np.ones((3, 3))
+    excess[2, :] = excess[:, 2] = 9.0
+    frames = tuple(replace(FRAME, name=name) for name in "abc")
+    verdict = judge(replace(GOOD, agreement=replace(AGREEMENT, frames=frames), cross=ring(excess))).verdict
+    assert verdict.band == "poor"
+    assert verdict.reasons[0].startswith("c: contradicts the frames that saw the same surface")
+
+
 @pytest.mark.parametrize(
     ("change", "check", "band"),
     [
@@ -38,7 +54,12 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
         ({"pattern_cosine": 0.3}, "Pattern agreement", "poor"),
         ({"hit_share": 0.5}, "Coverage", "poor"),
         ({"ray_angle_deg": 2.0}, "Ray angle", "poor"),
-        ({"frames": (FRAME, replace(FRAME, name="frame_00007", coordinate_px_median=3.5))}, "Worst frame", "poor"),
+        (_with(coordinate_px_median=3.5), "Worst frame", "poor"),
+        (_with(coordinate_px_p95=4.0), "Worst frame, 95 %", "acceptable"),
+        (_with(agreeing_share=0.5), "Agreement in the worst frame", "poor"),
+        (_with(covered_share=0.8), "Coverage of the worst frame", "acceptable"),
+        (_with(largest_hole=0.01), "Largest hole", "acceptable"),
+        (_with(largest_hole=0.05), "Largest hole", "poor"),
     ],
 )
 def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, band: str) -> None:
@@ -48,10 +69,12 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
     if band == "unknown":
         assert judged[check].text == "none"
     else:
-        assert verdict.band == band
+        assert verdict.verdict.band == band
+        assert verdict.verdict.reasons[0].startswith(f"{check}: ")
         assert verdict.next_steps[0].startswith("These figures are for the scan's starting poses")
         assert verdict.next_steps[1].startswith(check)
-    if check == "Worst frame":
+    if "frames" in change:
+        assert "frame_00007" in verdict.verdict.reasons[0]
         assert "frame_00007" in judged[check].text and "frame_00007" in judged[check].advice
 
 

@@ -1,0 +1,100 @@
+"""What facts lead to which verdict, in which words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
+from sl_nerfstudio.verdict.judge import judge_scan
+from sl_nerfstudio.verdict.verdict import Reason, listed, worst
+from tests.verdict.cases import ring
+
+N = 12
+NAMES = [f"f{k:02d}" for k in range(N)]
+GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decoded_share=0.9, own_share=0.95) for name in NAMES)
+CHAIN = tuple(PairFacts((NAMES[k], NAMES[(k + gap) % N]), True) for gap in (1, 2) for k in range(N))
+
+
+def scan(changes=None, **others):
+    """A good scan in which some frames are other than good."""
+    frames = tuple(replace(f, **(changes or {}).get(k, {})) for k, f in enumerate(GOOD))
+    inside = sum(f.in_scan for f in frames)
+    return ScanFacts(frames, **{"pairs": CHAIN, "cross": ring(np.ones((inside, inside))), **others})
+
+
+def test_a_scan_without_any_doubt_is_good():
+    verdict = judge_scan(scan())
+    assert verdict.band == "good" and verdict.reasons == ()
+    assert judge_scan(ScanFacts(GOOD)).band == "good"  # what is not known is not judged
+
+
+@pytest.mark.parametrize(
+    ("change", "one", "words"),
+    [
+        ({"undecided": True}, "acceptable", "f03: the pose is undecided; another one fits nearly as well"),
+        ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
+        ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
+        ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
+        ({"own_share": 0.1}, "acceptable", "f03: only 10% of the decoded pixels agree with the pose of the projector"),
+        ({"in_scan": False, "component": None}, "acceptable", "1 of 12 frames were left out: f03"),
+        (
+            {"in_scan": False, "component": 1},
+            "acceptable",
+            "f03: stands alone; the connection to the other frames is not",
+        ),
+    ],
+)
+def test_one_frame_is_enough_and_many_make_it_poor(change, one, words):
+    verdict = judge_scan(scan({3: change}))
+    assert verdict.band == one
+    assert any(words in reason for reason in verdict.reasons)
+    assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
+
+
+def test_a_group_of_its_own_is_named():
+    verdict = judge_scan(scan({k: {"in_scan": False, "component": 1} for k in (2, 3, 4)}))
+    assert verdict.band == "acceptable"
+    assert verdict.reasons[0].startswith("f02, f03, f04: form a group of their own; the connection to the other frames")
+
+
+def test_pairs_that_contradict_others_and_pairs_on_which_everything_hangs():
+    rejected = tuple(replace(p, used=False) if "f05" in p.frames else p for p in CHAIN)
+    verdict = judge_scan(scan(pairs=rejected))
+    assert "f05: most pairs with other frames contradict the pose found" in verdict.reasons
+    line = [(k, k + 1) for k in range(N - 1)] + [(k, k + 2) for k in range(N - 2) if k not in (4, 5)]
+    verdict = judge_scan(scan(pairs=tuple(PairFacts((NAMES[a], NAMES[b]), True) for a, b in line)))
+    assert verdict.band == "acceptable"
+    assert any("only the pair f05 and f06 connects" in r and "no other pair confirms it" in r for r in verdict.reasons)
+
+
+def test_frames_that_agree_less_well_and_parts_that_share_nothing():
+    cross = ring(np.ones((N, N)))
+    frames = tuple(replace(f, excess=2.2 if k == 4 else 1.0) for k, f in enumerate(cross.frames))
+    verdict = judge_scan(scan(cross=replace(cross, frames=frames)))
+    assert verdict.band == "acceptable"
+    assert verdict.reasons[0].startswith("f04: agrees less well with the frames that saw the same surface: 2.2 times")
+    parts = np.where(np.arange(N)[:, None] // 6 == np.arange(N)[None] // 6, 1.0, np.nan)
+    verdict = judge_scan(scan(cross=ring(parts)))
+    assert verdict.band == "poor" and "no surface in common with the other frames" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("share", "band"), [(0.96, "good"), (0.9, "acceptable"), (0.5, "poor")])
+def test_points_that_do_not_agree_count_even_if_they_are_spread_over_all_frames(share, band):
+    verdict = judge_scan(scan(cross=replace(ring(np.ones((N, N))), share=share)))
+    assert verdict.band == band
+    assert band == "good" or f"of all points that two frames saw, {share:.0%} agree" in verdict.reasons[0]
+
+
+def test_too_few_frames_wrong_intrinsics_and_weak_poses():
+    lost = {k: {"in_scan": False} for k in range(1, N)}
+    assert judge_scan(scan(lost)).reasons == ("only 1 of 12 frames could be used",)
+    assert judge_scan(scan(wrong_intrinsics=True)).band == "acceptable"
+    assert judge_scan(scan({0: {"degenerate": True}})).band == "good"  # the other frames determine it
+    assert judge_scan(scan({k: {"degenerate": True} for k in range(5)})).band == "acceptable"
+
+
+def test_the_worst_reason_comes_first():
+    verdict = worst([Reason("good", "a"), Reason("acceptable", "b"), Reason("poor", "c"), Reason("acceptable", "d")])
+    assert (verdict.band, verdict.reasons) == ("poor", ("c", "b", "d"))
+    assert listed(list("abcdefgh")) == "a, b, c, d, e, f and 2 more"

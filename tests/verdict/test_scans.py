@@ -1,0 +1,103 @@
+"""Verdicts on scans from sl-synth: right ones are good, whatever their unit; every planted fault is named."""
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import PoseSigma, read_scan
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.synthesise import synthesise
+from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
+from sl_nerfstudio.verdict.judge import judge_scan
+from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
+from tests.verdict.cases import turned
+
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """Right poses, noisy coordinates: 0.3 px, 15 % missing, 2 % wrong."""
+    root = tmp_path_factory.mktemp("verdict") / "scan"
+    exact = {"pose_error": (0.0, 0.0), "autocalibration_error": (0.0, 0.0, 0.0)}
+    synthesise(SynthConfig(scene="frog", frames=FRAMES, resolution=160, **exact), root)
+    return read_scan(root)
+
+
+def verdict_on(scan, poses, sigma=None):
+    cross = compare_scan_frames(scan, poses, [sigma] * FRAMES)
+    return judge_scan(ScanFacts(tuple(FrameFacts(f.name) for f in scan.frames), cross=cross))
+
+
+def named(scan, reason):
+    return [f.name for f in scan.frames if f.name in reason.split(":")[0]]
+
+
+def test_a_right_scan_is_good_in_every_unit_and_place(scan):
+    found = compare_scan_frames(scan, scan.poses, [None] * FRAMES)
+    assert verdict_on(scan, scan.poses).band == "good" and verdict_on(scan, scan.poses).reasons == ()
+    assert 0.03 < found.noise_px < 0.3  # look-ups average 0.3 px over a window
+    assert found.share > 0.98 and min(f.seen for f in found.frames) > 0.8
+    S = Similarity(1e-3, np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([3.0, -2.0, 7.0]))
+    metres = compare_scan_frames(scan, scan.poses.mapped(S), [None] * FRAMES)
+    assert metres.noise_px == pytest.approx(found.noise_px, rel=1e-3)
+    assert metres.px_p95 == pytest.approx(found.px_p95, rel=1e-3)
+    assert [p.frames for p in metres.pairs] == [p.frames for p in found.pairs]
+
+
+@pytest.mark.parametrize("degrees", [5.0, 60.0, 170.0])
+def test_one_wrong_frame_makes_the_scan_poor_and_is_named(scan, degrees):
+    verdict = verdict_on(scan, turned(scan.poses, [5], degrees))
+    assert verdict.band == "poor"
+    assert named(scan, verdict.reasons[0]) == ["frame_00005"]
+    assert "contradicts the frames that saw the same surface" in verdict.reasons[0]
+    assert all(named(scan, reason) in ([], ["frame_00005"]) for reason in verdict.reasons)
+
+
+def test_two_halves_are_told_apart(scan):
+    half = list(range(FRAMES // 2, FRAMES))
+    verdict = verdict_on(scan, turned(scan.poses, half, 10.0))
+    assert verdict.band == "poor"
+    assert "agree with each other and contradict the other frames" in verdict.reasons[0]
+    assert "frame_00008, frame_00009" in verdict.reasons[0] and "and 2 more" in verdict.reasons[0]
+
+
+def test_frames_that_are_all_wrong_are_not_taken_for_noise(scan):
+    poses = scan.poses
+    for k in range(FRAMES):
+        poses = turned(poses, [k], 20.0 + 17.0 * k)
+    verdict = verdict_on(scan, poses)
+    assert verdict.band == "poor" and "the frames contradict each other" in verdict.reasons[0]
+
+
+def test_stated_uncertainty_explains_what_it_covers_and_no_more(scan):
+    """Right poses stay good with any stated uncertainty; a frame far beyond it is still named."""
+    sigma = PoseSigma(0.5, 0.3, 0.5, 0.1)
+    assert verdict_on(scan, scan.poses, sigma).band == "good"
+    verdict = verdict_on(scan, turned(scan.poses, [5], 60.0), sigma)
+    assert verdict.band == "poor" and named(scan, verdict.reasons[0]) == ["frame_00005"]
+    slightly = turned(scan.poses, [5], 2.0)
+    exact, rough = (
+        compare_scan_frames(scan, slightly, [s] * FRAMES).frames[5] for s in (None, PoseSigma(3.0, 2.0, 1.0, 0.2))
+    )
+    assert rough.excess < exact.excess and rough.share >= exact.share
+
+
+def test_noise_does_not_grow_with_wrong_poses(scan):
+    """Projectors half a degree off have large epipolar residuals, but no more noise."""
+    poses = scan.poses
+    right = compare_scan_frames(scan, poses, [None] * FRAMES).noise_px
+    projector = poses.T_world_projector.copy()
+    turn = turned(poses, list(range(FRAMES)), 0.5)
+    projector[:, :3, :3] = turn.T_world_projector[:, :3, :3]
+    wrong = compare_scan_frames(scan, type(poses)(poses.T_world_camera, projector), [None] * FRAMES).noise_px
+    assert wrong < 3 * right
+
+
+def test_a_frame_that_nobody_else_saw_is_unconfirmed(scan):
+    poses = turned(scan.poses, [5], 0.0)
+    for T in (poses.T_world_camera, poses.T_world_projector):
+        T[5, :3, 3] += 1e4
+    verdict = verdict_on(scan, poses)
+    assert verdict.band != "good"
+    assert any("frame_00005: no other frame shows enough of the same surface" in reason for reason in verdict.reasons)
