@@ -1,6 +1,6 @@
 """Share of object pixels kept and of surroundings left in, on noisy coordinates of objects on tables and before walls.
 
-    python -m benchmarks.separation [--objects frog medal ...] [--backgrounds none table walls plate] [--zoom 1.0 0.6]
+    python -m benchmarks.separation [--objects frog medal ...] [--backgrounds none table walls ...] [--zoom 1.0 0.6]
 
 Coordinates are cast on the mesh (24 frames of 300 x 300) and disturbed: 0.3 px noise, 15 % of cells missing, 2 % wrong; those that
 contradict the epipolar geometry by more than 1.5 px are dropped, as sl-process does. Poses are wrong by 0.05 degrees and
@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from numpy import ndarray
 
 from benchmarks.machine import write_rows
-from benchmarks.separation.objects import BACKGROUNDS, OBJECTS, in_the_room, surroundings, together
+from benchmarks.separation.objects import BACKGROUNDS, OBJECTS, in_the_room, surroundings
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.object_separation.frame_points import DecodedFrame
@@ -30,6 +30,7 @@ from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords
 from sl_nerfstudio.synthesis.paths import look_at, make_paths
 from sl_nerfstudio.synthesis.ray_casting import RayCaster
 from sl_nerfstudio.synthesis.render import visible_points
+from sl_nerfstudio.synthesis.scenes.surroundings import above_the_table
 from sl_nerfstudio.synthesis.setup import make_cells
 
 FRAMES, RESOLUTION = 24, 300
@@ -59,14 +60,15 @@ class Case:
     is_object: tuple[Bool[ndarray, "h w"], ...]
 
 
-def make_case(name: str, background: str, zoom: float, seed: int = 0) -> Case:
+def make_case(name: str, background: str, zoom: float, seed: int) -> Case:
     """Cast and disturb the coordinates of all frames."""
     rng = np.random.default_rng([seed, 7])
     scene = OBJECTS[name]()
-    whole = together(scene, surroundings(background, scene))
-    caster = RayCaster(whole)
-    poses = make_paths(scene, FRAMES * (3 if background == "walls" else 1), "hand-held", rng)
-    if background == "walls":  # only frames from inside the room
+    if background != "none":
+        scene = above_the_table(scene)
+    caster = RayCaster(scene, surroundings(background, scene, rng))
+    poses = make_paths(scene, FRAMES * (3 if background == "room" else 1), "hand-held", rng)
+    if background == "room":  # only frames from inside the room
         poses = poses[np.flatnonzero(in_the_room(scene, poses.stacked()[:, :3, 3]).reshape(2, -1).all(0))[:FRAMES]]
     layout = GridPattern()
     devices = make_devices(scene, poses, (layout.w, layout.h), DeviceOptions(RESOLUTION))
@@ -83,7 +85,7 @@ def make_case(name: str, background: str, zoom: float, seed: int = 0) -> Case:
         coords[np.abs(_epipolar(camera, T_c, uv, projector, T_p, coords)) > _KEPT_PX] = np.nan
         wrong = _wrong_pose(T_c[:3, 3], scene.centre, rng)
         frames.append(DecodedFrame(camera, projector, wrong @ T_c, wrong @ T_p, coords, mask))
-        objects.append(mask & (found.face < len(scene.faces)).reshape(mask.shape))
+        objects.append(mask & caster.on_object(found.face).reshape(mask.shape))
     return Case(tuple(frames), tuple(objects))
 
 
@@ -107,9 +109,9 @@ def _wrong_pose(position: ndarray, centre: ndarray, rng: np.random.Generator) ->
     return T
 
 
-def measure(name: str, background: str, zoom: float) -> tuple[Row, Case, Separation]:
+def measure(name: str, background: str, zoom: float, seed: int) -> tuple[Row, Case, Separation]:
     """Separate one case and compare."""
-    case = make_case(name, background, zoom)
+    case = make_case(name, background, zoom, seed)
     start = time.monotonic()
     found = separate(case.frames)
     seconds = time.monotonic() - start
@@ -135,6 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
     parser.add_argument("--backgrounds", nargs="+", default=list(BACKGROUNDS), choices=list(BACKGROUNDS))
     parser.add_argument("--zoom", nargs="+", type=float, default=[1.0, 0.6])
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/separation.json"))
     parser.add_argument("--verbose", action="store_true", help="print every plane")
     given = parser.parse_args(arguments)
@@ -142,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in given.objects:
         for background in given.backgrounds:
             for zoom in given.zoom:
-                row, _, found = measure(name, background, zoom)
+                row, _, found = measure(name, background, zoom, given.seed)
                 rows.append(row)
                 print(f"{name:8} {background:6} {zoom:3.1f}  object kept {row.object_kept:7.2%} (worst frame "
                       f"{row.object_kept_worst:7.2%}), of the surroundings ({row.surroundings_share:.0%}) left "
@@ -152,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                         print(f"    {f.verdict:22} share {f.share:.2f} front {f.cameras_in_front:.2f} behind {f.behind:.3f} "
                               f"above {f.above:.3f} continues {f.continues:.2f} area {f.area_ratio:.1f} "
                               f"height {f.height_ratio:.2f} around {f.around:.2f}")  # fmt: skip
-    write_rows(given.output, rows, frames=FRAMES, resolution=RESOLUTION)
+    write_rows(given.output, rows, frames=FRAMES, resolution=RESOLUTION, seed=given.seed)
 
 
 if __name__ == "__main__":

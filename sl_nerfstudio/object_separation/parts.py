@@ -9,12 +9,15 @@ from jaxtyping import Bool, Float, Float64, Int64
 from numpy import ndarray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, cKDTree
 
+from sl_nerfstudio.object_separation.plane import Plane
 from sl_nerfstudio.object_separation.settings import SeparationSettings
 from sl_nerfstudio.object_separation.viewed_region import ViewedRegion
 
 _REACH = 2  # voxels: how far apart connected ones may be
+_TOUCHES = 3.0  # voxels: what comes so near to a plane stands on it
+_WITHIN = 0.5  # share of a part that must lie in the main part's outline in the plane
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,18 @@ class ObjectVoxels:
 
 
 def find_object(
-    frames: Sequence[Float[ndarray, "_n 3"]], region: ViewedRegion, size: float, settings: SeparationSettings
+    frames: Sequence[Float[ndarray, "_n 3"]],
+    planes: Sequence[Plane],
+    region: ViewedRegion,
+    size: float,
+    settings: SeparationSettings,
 ) -> ObjectVoxels:
-    """The part on which most cameras look, and what is close to it; `frames` are points without surroundings."""
+    """The part on which most cameras look, and what belongs to it.
+
+    `frames` are points without surroundings, `planes` those of the surroundings. A part that is not connected to the
+    main one, because what is between them was not decoded, belongs to it if the gap is short and the part floats or is below or
+    above the main one; what stands on a plane beside it does not.
+    """
     voxels = _occupied(frames, size, settings)
     centres = (voxels + 0.5) * size
     if not len(voxels):
@@ -43,7 +55,7 @@ def find_object(
     count, label = _connected(voxels)
     distance = np.linalg.norm(centres - region.focus, axis=1) / region.radius
     main = int(np.argmax(np.bincount(label, 1 / (1 + distance**2) ** 2, count)))
-    kept = _near_main(centres, label, main, settings)
+    kept = _near_main(centres, label, main, _candidates(centres, label, main, planes, size, settings), settings)
     return ObjectVoxels(size, centres[kept[label]])
 
 
@@ -85,18 +97,46 @@ def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]
     return int(count), label.astype(np.int64)
 
 
-def _near_main(
-    centres: Float[ndarray, "v 3"], label: Int64[ndarray, "v"], main: int, settings: SeparationSettings
+def _candidates(
+    centres: Float[ndarray, "v 3"],
+    label: Int64[ndarray, "v"],
+    main: int,
+    planes: Sequence[Plane],
+    size: float,
+    settings: SeparationSettings,
 ) -> Bool[ndarray, "parts"]:
-    """The main part, and parts that a short gap separates from it or from such a part."""
+    """Parts that are large enough, and do not stand on a plane beside the main part."""
+    count = int(label.max()) + 1
+    members = np.bincount(label, minlength=count)
+    fits = members >= settings.least_voxels
+    for plane in planes:
+        touching = np.bincount(label, plane.heights(centres) < _TOUCHES * size, count) > 0
+        flat = (centres - centres[label == main].mean(0)) @ plane.axes().T
+        outline = Delaunay(flat[label == main]) if _has_area(flat[label == main], size) else None
+        within = np.zeros(len(flat)) if outline is None else (outline.find_simplex(flat) >= 0).astype(float)
+        fits &= ~touching | (np.bincount(label, within, count) > _WITHIN * members)
+    return fits
+
+
+def _has_area(flat: Float[ndarray, "v 2"], size: float) -> bool:
+    """Whether places span an area, so that they have an outline."""
+    return len(flat) > 3 and float(np.linalg.svd(flat - flat.mean(0), compute_uv=False)[-1]) > size
+
+
+def _near_main(
+    centres: Float[ndarray, "v 3"],
+    label: Int64[ndarray, "v"],
+    main: int,
+    candidates: Bool[ndarray, "parts"],
+    settings: SeparationSettings,
+) -> Bool[ndarray, "parts"]:
+    """The main part, and candidates that a short gap separates from it or from such a part."""
     body = centres[label == main]
     limit = settings.gap * float(np.linalg.norm(np.percentile(body, 98, axis=0) - np.percentile(body, 2, axis=0)))
-    count = int(label.max()) + 1
-    large = np.bincount(label, minlength=count) >= settings.least_voxels
-    kept = np.zeros(count, dtype=bool)
+    kept = np.zeros(len(candidates), dtype=bool)
     kept[main] = True
     while True:
-        rest = np.flatnonzero(~kept[label] & large[label])
+        rest = np.flatnonzero(~kept[label] & candidates[label])
         if not len(rest):
             return kept
         distance = cKDTree(centres[kept[label]]).query(centres[rest], distance_upper_bound=limit)[0]

@@ -113,10 +113,10 @@ def separate(
     )
     outside = [_surroundings(f, points, pose_noise, region, size, settings) for f in findings if f.is_surroundings]
     rest = [_without(outside, k, p, settings) for k, p in enumerate(points)]
-    voxels = find_object(rest, region, size, settings)
+    voxels = find_object(rest, [s.finding.plane for s in outside], region, size, settings)
     held = sum(int(voxels.contain(p).sum()) for p in rest)
     if held < settings.least_object * sum(map(len, points)):
-        outside, voxels = [], find_object([p.p_world for p in points], region, size, settings)
+        outside, voxels = [], find_object([p.p_world for p in points], [], region, size, settings)
     return Separation(region, findings, tuple(outside), voxels, settings)
 
 
