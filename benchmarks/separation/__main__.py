@@ -2,9 +2,9 @@
 
     python -m benchmarks.separation [--objects frog medal ...] [--backgrounds none table walls ...] [--zoom 1.0 0.6]
 
-Coordinates are cast on the mesh (24 frames of 300 x 300) and disturbed: 0.3 px noise, 15 % of cells missing, 2 % wrong; those that
-contradict the epipolar geometry by more than 1.5 px are dropped, as sl-process does. Poses are wrong by 0.05 degrees and
-0.1 % of the distance. `--zoom` below 1 makes both devices see more of the surroundings.
+Coordinates are cast on the mesh (24 frames of 300 x 300) and disturbed: 0.3 px noise, 15 % of cells missing, 2 % wrong;
+those that contradict the epipolar geometry by more than 1.5 px are dropped, as sl-process does. Poses are wrong by
+0.05 degrees and 0.01 % of the distance. `--zoom` below 1 makes both devices see more of the surroundings.
 """
 
 import argparse
@@ -25,9 +25,9 @@ from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.object_separation.frame_points import DecodedFrame
 from sl_nerfstudio.object_separation.separate import Part, Separation, separate
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.synthesis.devices import DeviceOptions, make_devices, pixels, rays
+from sl_nerfstudio.synthesis.devices import DeviceOptions, make_devices
 from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords
-from sl_nerfstudio.synthesis.paths import look_at, make_paths
+from sl_nerfstudio.synthesis.paths import make_paths
 from sl_nerfstudio.synthesis.ray_casting import RayCaster
 from sl_nerfstudio.synthesis.render import visible_points
 from sl_nerfstudio.synthesis.scenes.surroundings import above_the_table
@@ -72,7 +72,9 @@ def make_case(name: str, background: str, zoom: float, seed: int) -> Case:
         poses = poses[np.flatnonzero(in_the_room(scene, poses.stacked()[:, :3, 3]).reshape(2, -1).all(0))[:FRAMES]]
     layout = GridPattern()
     devices = make_devices(scene, poses, (layout.w, layout.h), DeviceOptions(RESOLUTION))
-    camera, projector = (replace(d, fl_x=zoom * d.fl_x, fl_y=zoom * d.fl_y) for d in (devices.camera, devices.projector))
+    camera, projector = (
+        replace(d, fl_x=zoom * d.fl_x, fl_y=zoom * d.fl_y) for d in (devices.camera, devices.projector)
+    )
     devices = replace(devices, camera=camera, projector=projector)
     cells = make_cells(layout.render(), layout.lattice)
     uv = np.stack(np.meshgrid(np.arange(camera.w), np.arange(camera.h)), -1).reshape(-1, 2) + 0.5
@@ -89,7 +91,7 @@ def make_case(name: str, background: str, zoom: float, seed: int) -> Case:
     return Case(tuple(frames), tuple(objects))
 
 
-def _epipolar(camera, T_c, uv, projector, T_p, coords) -> ndarray:  # noqa: ANN001
+def _epipolar(camera, T_c, uv, projector, T_p, coords) -> ndarray:
     residual = epipolar_residual(
         Intrinsics.of(camera, torch.float64), torch.from_numpy(T_c), torch.from_numpy(uv),
         Intrinsics.of(projector, torch.float64), torch.from_numpy(T_p),
@@ -152,9 +154,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                       f"{row.surroundings_left:7.2%}  {row.seconds:4.1f} s", flush=True)  # fmt: skip
                 if given.verbose:
                     for f in found.findings:
-                        print(f"    {f.verdict:22} share {f.share:.2f} front {f.cameras_in_front:.2f} behind {f.behind:.3f} "
-                              f"above {f.above:.3f} continues {f.continues:.2f} area {f.area_ratio:.1f} "
-                              f"height {f.height_ratio:.2f} around {f.around:.2f}")  # fmt: skip
+                        print(f"    {f.verdict:22} share {f.share:.2f} front {f.cameras_in_front:.2f} "
+                              f"behind {f.behind:.3f} above {f.above:.3f} continues {f.continues:.2f} "
+                              f"area {f.area_ratio:.1f} height {f.height_ratio:.2f} around {f.around:.2f}")  # fmt: skip
     write_rows(given.output, rows, frames=FRAMES, resolution=RESOLUTION, seed=given.seed)
 
 

@@ -1,7 +1,7 @@
 """The planes of the surroundings as each frame sees them, and which of a frame's points are part of them.
 
-The pose of a frame may be wrong by more than its points are noisy. A plane fitted again in each frame, with the common plane as prior,
-takes that error out of the heights above it.
+The pose of a frame may be wrong by more than its points are noisy. A plane fitted again in each frame, with the common
+plane as prior, takes that error out of the heights above it.
 """
 
 from collections.abc import Sequence

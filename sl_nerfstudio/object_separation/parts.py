@@ -45,8 +45,8 @@ def find_object(
     """The part on which most cameras look, and what belongs to it.
 
     `frames` are points without surroundings, `planes` those of the surroundings. A part that is not connected to the
-    main one, because what is between them was not decoded, belongs to it if the gap is short and the part floats or is below or
-    above the main one; what stands on a plane beside it does not.
+    main one, because what is between them was not decoded, belongs to it if the gap is short, and if it floats or is
+    below or above the main one; what stands on a plane beside it does not.
     """
     voxels = _occupied(frames, size, settings)
     centres = (voxels + 0.5) * size

@@ -24,11 +24,16 @@ Verdict = Literal[
 
 _CELLS = 20  # of the grid in the plane, along the radius of the viewed region
 _POINTS_IN_CELL = 3
-_BEYOND_EDGE = (1.04, 1.1, 1.2, 1.35)  # where past the edge to look, as distances from the middle in distances of the edge
+_BEYOND_EDGE = (
+    1.04,
+    1.1,
+    1.2,
+    1.35,
+)  # where past the edge to look, as distances from the middle in distances of the edge
 _AROUND = 0.75  # share of the directions in which a support extends beyond what stands on it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlaneFinding:
     """A plane, facing the cameras, and what is known about it; shares are between 0 and 1."""
 
@@ -128,8 +133,7 @@ def _continues(
         return 0.0
     places = np.concatenate(probes)
     past = sum(
-        _looks_past(plane, places, frame, own, settings).astype(int)
-        for frame, own in zip(frames, points, strict=True)
+        _looks_past(plane, places, frame, own, settings).astype(int) for frame, own in zip(frames, points, strict=True)
     )
     # A rim may stand on the edge, so that only places farther out show that nothing follows.
     most = np.reshape(past, (len(probes), -1)).max(1)
@@ -143,8 +147,7 @@ def _looks_past(
     points: FramePoints,
     settings: SeparationSettings,
 ) -> Bool[ndarray, "m"]:
-    """Places on the plane which a frame sees and lights, away from its borders, and where it saw something behind it
-    or nothing at all."""
+    """Places where a frame looks past the plane: well inside its view, it saw something behind it or nothing at all."""
     uv, inside = _well_inside(frame.camera, frame.T_world_camera, probes, settings.view_margin)
     _, lit = _well_inside(frame.projector, frame.T_world_projector, probes, settings.view_margin)
     looked = inside & lit
@@ -173,13 +176,18 @@ def _well_inside(
 def _what_stands_on_it(
     plane: Plane, on: Float[ndarray, "n 3"], above: Float[ndarray, "m 3"], region: ViewedRegion
 ) -> tuple[float, float, float]:
-    """Bare area and height relative to the area of what rises from a plane, and the share of directions in which the
-    plane extends beyond it."""
+    """How much more than what rises from it a plane is.
+
+    Returns its bare area in areas of what rises, the height of that in roots of its area, and the share of the
+    directions in which the plane extends beyond it.
+    """
     size = region.radius / _CELLS
     axes = plane.axes()
 
     def cells(p: Float[ndarray, "k 3"]) -> Int64[ndarray, "c 2"]:
-        cell, count = np.unique(np.floor((p - region.focus) @ axes.T / size).astype(np.int64), axis=0, return_counts=True)
+        cell, count = np.unique(
+            np.floor((p - region.focus) @ axes.T / size).astype(np.int64), axis=0, return_counts=True
+        )
         return cell[count >= _POINTS_IN_CELL]
 
     standing, bare = cells(above), cells(on)

@@ -71,9 +71,7 @@ def find_planes(
     return found
 
 
-def _largest(
-    pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings
-) -> Plane | None:
+def _largest(pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings) -> Plane | None:
     """The plane that holds the most points, of planes grown from random points; None if there are too few points."""
     if len(pool) < settings.neighbours:
         return None

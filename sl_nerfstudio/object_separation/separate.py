@@ -1,7 +1,7 @@
 """The object of a scan apart from its surroundings.
 
-Planes are found in the points of all frames, and each is judged (`plane_judgement`). What is part of a plane of the surroundings,
-or behind one, is left out; of the rest, the connected part on which the cameras look is the object.
+Planes are found in the points of all frames, and each is judged (`plane_judgement`). What is part of a plane of the
+surroundings, or behind one, is left out; of the rest, the connected part on which the cameras look is the object.
 """
 
 from collections.abc import Sequence
@@ -143,7 +143,9 @@ def _surroundings(
     plane = finding.plane
     own = tuple(plane_in_frame(plane, p, pose_noise, region.radius, settings) for p in points)
     bare = find_bare_places(plane, list(zip(points, own, strict=True)), size, settings)
-    heights = [f.noise * float(np.median(p.sigma_along(plane.normal))) for f, p in zip(own, points, strict=True) if len(p)]
+    heights = [
+        f.noise * float(np.median(p.sigma_along(plane.normal))) for f, p in zip(own, points, strict=True) if len(p)
+    ]
     return Surroundings(finding, bare, own, settings.plane_sigmas * float(np.median(heights)))
 
 

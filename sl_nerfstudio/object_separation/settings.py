@@ -40,7 +40,7 @@ class SeparationSettings:
     directions: int = 36
     """Directions in which the edge of a plane is looked for."""
     view_margin: float = 0.1
-    """Strip along the borders of image and pattern in which an edge is not told from the end of the view, as a share."""
+    """Strip along the borders of image and pattern in which an edge is not told from the end of the view: a share."""
     edge_frames: float = 0.15
     """Share of the frames that must look past the edge of a plane, for the edge to count as seen."""
     continues: float = 0.5

@@ -19,7 +19,7 @@ _EXIF_ORIENTATION = 0x0112
 def read_mask(path: Path, size: tuple[int, int]) -> Bool[ndarray, "h w"]:
     """The pixels to use. `size` is the captures' (w, h).
 
-    If all values but one are zero (0 and 255, 0 and 1), everything that is not zero is used. Otherwise at most 5 % of the
+    With one value beside zero (0 and 255, 0 and 1), everything that is not zero is used. Otherwise at most 5 % of the
     pixels may be between black and white, and they are used from half of full scale on. A palette stands for its
     colours; what is transparent is not used; colours must be greys.
     Raises FileError for any other mask, for one of another size, and for one that is all black.
