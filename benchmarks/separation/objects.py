@@ -1,7 +1,7 @@
 """Objects, and what surrounds them: those of sl-synth, and some that are hard to tell apart; millimetres."""
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -42,7 +42,7 @@ def surroundings(name: str, scene: Scene, rng: np.random.Generator) -> Scene | N
         return make_surroundings(scene, cast(Background, name), rng)
     s, z = scene.size, float(scene.vertices[:, 2].min()) - 1e-4 * scene.size
     if name == "plate":
-        return _joined(name, [trimesh.creation.cylinder(1.4 * s, 8.0, sections=96, transform=_at(0, 0, z - 4.0))])
+        return _joined(name, [trimesh.creation.cylinder(s, 8.0, sections=96, transform=_at(0, 0, z - 4.0))])
     return _joined(name, [
         trimesh.creation.box((14 * s, 14 * s, 10.0), _at(0, 0, z - 5.0)),
         trimesh.creation.box((14 * s, 10.0, 8 * s), _at(0, 1.7 * s, z + 4 * s)),
@@ -60,7 +60,7 @@ def _at(x: float, y: float, z: float) -> Float[ndarray, "4 4"]:
 
 
 def _joined(name: str, parts: list[trimesh.Trimesh]) -> Scene:
-    whole = trimesh.util.concatenate(parts)
+    whole: Any = trimesh.util.concatenate(parts)
     return Scene(name, np.asarray(whole.vertices, np.float64), np.asarray(whole.faces, np.int64))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
@@ -92,7 +92,7 @@ def normals_of(points: FramePoints, neighbours: int) -> Float64[ndarray, "n 3"]:
     """Unit normals towards the camera, from the nearest points of the same frame; NaN with too few points."""
     if len(points) < neighbours:
         return np.full((len(points), 3), np.nan)
-    _, near = cKDTree(points.p_world).query(points.p_world, neighbours)
+    _, near = KDTree(points.p_world).query(points.p_world, neighbours)
     offset = points.p_world[near] - points.p_world[near].mean(1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
     normal = vectors[:, :, 0]
@@ -110,11 +110,11 @@ def cross_frame_noise(frames: Sequence[FramePoints], normals: Sequence[Float[nda
     if len(np.unique(owner)) < 2:
         return 1.0
     sigma = np.concatenate([f.sigma_along(n) for f, n in zip(frames, normals, strict=True)])
-    spacing = np.median(cKDTree(p).query(p, 2)[0][:, 1])
+    spacing = np.median(KDTree(p).query(p, 2)[0][:, 1])
     ratios = []
     for k in range(len(frames)):
         mine, others = np.flatnonzero(owner == k), np.flatnonzero(owner != k)
-        distance, near = cKDTree(p[others]).query(p[mine], distance_upper_bound=4 * spacing)
+        distance, near = KDTree(p[others]).query(p[mine], distance_upper_bound=4 * spacing)
         mine, near = mine[np.isfinite(distance)], others[near[np.isfinite(distance)]]
         same = (normal[mine] * normal[near]).sum(-1) > 0.9
         mine, near = mine[same], near[same]

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from numpy import ndarray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from sl_nerfstudio.object_separation.plane import Plane
 from sl_nerfstudio.object_separation.settings import SeparationSettings
@@ -32,7 +32,7 @@ class ObjectVoxels:
         if not len(self.centres) or not len(p_world):
             return np.zeros(len(p_world), dtype=bool)
         limit = 2.0 * self.size
-        return np.isfinite(cKDTree(self.centres).query(p_world, distance_upper_bound=limit)[0])
+        return np.isfinite(KDTree(self.centres).query(p_world, distance_upper_bound=limit)[0])
 
 
 def find_object(
@@ -139,7 +139,7 @@ def _near_main(
         rest = np.flatnonzero(~kept[label] & candidates[label])
         if not len(rest):
             return kept
-        distance = cKDTree(centres[kept[label]]).query(centres[rest], distance_upper_bound=limit)[0]
+        distance = KDTree(centres[kept[label]]).query(centres[rest], distance_upper_bound=limit)[0]
         near = np.unique(label[rest[np.isfinite(distance)]])
         if not len(near):
             return kept

@@ -73,8 +73,8 @@ class Separation:
         label[points.row, points.column] = self._of_points(index, points)
         gap = frame.seen & (label == Part.NOTHING)
         if len(points) and gap.any():
-            near = distance_transform_edt(label == Part.NOTHING, return_distances=False, return_indices=True)
-            label[gap] = label[tuple(near)][gap]
+            near = np.asarray(distance_transform_edt(label == Part.NOTHING, return_distances=False, return_indices=True))
+            label[gap] = label[near[0][gap], near[1][gap]]
         return label
 
     def keeps(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:

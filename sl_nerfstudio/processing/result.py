@@ -80,7 +80,7 @@ class ProcessResult:
 def with_object_only(result: ProcessResult, found: ObjectOnly) -> ProcessResult:
     """The result with what was left out; frames that show nothing of the object are not in the scan."""
     reason = (
-        "shows nothing of the object\n    cause:  what was decoded in it belongs to its surroundings, by --object-only\n"
+        "shows nothing of the object\n    cause:  all decoded pixels belong to its surroundings, by --object-only\n"
         "    remedy: capture the object in this view, or leave --object-only out"
     )
     empty = set(found.empty_frames())

@@ -36,7 +36,7 @@ def cut_object(mesh: Mesh, scan: Scan, poses: DevicePoses) -> ObjectCut:
     if not len(kept.faces):
         raise UserError(
             "--object-only leaves nothing of the surface\n"
-            "    cause:  the surface is far from the decoded points of the scan: wrong poses, or an unfinished training\n"
+            "    cause:  the surface is far from the scan's decoded points: wrong poses, or an unfinished training\n"
             "    remedy: look at the run in ns-viewer, or leave --object-only out"
         )
     before = float(mesh.face_areas().sum())
