@@ -74,7 +74,8 @@ def describe_plane(f: PlaneFinding) -> str:
     """One line."""
     return (
         f"    {f.verdict:22} share {f.share:.2f} front {f.cameras_in_front:.2f} behind {f.behind:.3f} "
-        f"above {f.above:.3f} continues {f.continues:.2f} area {f.area_ratio:.1f} height {f.height_ratio:.2f} around {f.around:.2f}"
+        f"above {f.above:.3f} continues {f.continues:.2f} area {f.area_ratio:.1f} "
+        f"height {f.height_ratio:.2f} around {f.around:.2f}"
     )
 
 

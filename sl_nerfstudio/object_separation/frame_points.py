@@ -15,6 +15,8 @@ from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.triangulation import triangulate
 
 _LEAST_NOISE_PX = 0.01  # rounding of stored coordinates and poses
+_SAME_PLACE = 3.0  # spacings: how far apart points of two frames on the same surface may be
+_SAME_NORMAL = 0.9  # cosine
 
 
 @dataclass(frozen=True)
@@ -102,23 +104,32 @@ def normals_of(points: FramePoints, neighbours: int) -> Float64[ndarray, "n 3"]:
 def cross_frame_noise(frames: Sequence[FramePoints], normals: Sequence[Float[ndarray, "_n 3"]]) -> float:
     """How much farther points of different frames are from each other than their own noise explains; at least 1.
 
-    Every point is compared with the tangent plane at the nearest point of all other frames. What exceeds the noise of
-    coordinates is error of the poses.
+    Every frame is compared with some others, one by one: each point with the tangent plane at the nearest point there.
+    What exceeds the noise of coordinates is error of the poses.
     """
-    p, normal = np.concatenate([f.p_world for f in frames]), np.concatenate(list(normals))
-    owner = np.repeat(np.arange(len(frames)), [len(f) for f in frames])
-    if len(np.unique(owner)) < 2:
-        return 1.0
-    sigma = np.concatenate([f.sigma_along(n) for f, n in zip(frames, normals, strict=True)])
-    spacing = np.median(KDTree(p).query(p, 2)[0][:, 1])
-    ratios = []
-    for k in range(len(frames)):
-        mine, others = np.flatnonzero(owner == k), np.flatnonzero(owner != k)
-        distance, near = KDTree(p[others]).query(p[mine], distance_upper_bound=4 * spacing)
-        mine, near = mine[np.isfinite(distance)], others[near[np.isfinite(distance)]]
-        same = (normal[mine] * normal[near]).sum(-1) > 0.9
-        mine, near = mine[same], near[same]
-        off = ((p[mine] - p[near]) * normal[near]).sum(-1)
-        ratios.append(np.abs(off) / np.hypot(sigma[mine], sigma[near]))
-    ratio = np.concatenate(ratios)
+    count = len(frames)
+    ratios = [
+        _distances_in_sigmas(frames[k], normals[k], frames[other], normals[other])
+        for k in range(count)
+        for other in sorted({(k + step) % count for step in (1, 2, count // 3, count // 2)} - {k})
+    ]
+    ratio = np.concatenate([np.zeros(0), *ratios])
     return max(1.0, MAD_TO_SIGMA * float(np.median(ratio))) if len(ratio) else 1.0
+
+
+def _distances_in_sigmas(
+    a: FramePoints, normal_a: Float[ndarray, "n 3"], b: FramePoints, normal_b: Float[ndarray, "m 3"]
+) -> Float64[ndarray, "k"]:
+    """Distances of points of one frame from tangent planes of another, where both show the same surface."""
+    if min(len(a), len(b)) < 2:
+        return np.zeros(0)
+    tree = KDTree(b.p_world)
+    spacing = float(np.median(np.asarray(tree.query(b.p_world, 2)[0])[:, 1]))
+    distance, near = (np.asarray(v) for v in tree.query(a.p_world, distance_upper_bound=_SAME_PLACE * spacing))
+    mine = np.flatnonzero(np.isfinite(distance))
+    there = near[mine]
+    same = (normal_a[mine] * normal_b[there]).sum(-1) > _SAME_NORMAL
+    mine, there = mine[same], there[same]
+    off = ((a.p_world[mine] - b.p_world[there]) * normal_b[there]).sum(-1)
+    sigma = np.hypot(a.sigma_along(normal_a)[mine], b.sigma_along(normal_b)[there])
+    return np.abs(off) / sigma

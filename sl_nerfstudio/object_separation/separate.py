@@ -73,7 +73,8 @@ class Separation:
         label[points.row, points.column] = self._of_points(index, points)
         gap = frame.seen & (label == Part.NOTHING)
         if len(points) and gap.any():
-            near = np.asarray(distance_transform_edt(label == Part.NOTHING, return_distances=False, return_indices=True))
+            empty = label == Part.NOTHING
+            near = np.asarray(distance_transform_edt(empty, return_distances=False, return_indices=True))
             label[gap] = label[near[0][gap], near[1][gap]]
         return label
 
