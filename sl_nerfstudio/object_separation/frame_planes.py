@@ -81,11 +81,13 @@ def _corrected(
 
 @dataclass(frozen=True)
 class BarePlaces:
-    """The cells of a grid in a plane in which nothing rises from it."""
+    """The cells of a grid in a plane in which nothing rises from it, and how high its points seem to be; in sigmas."""
 
     plane: Plane
     size: float  # of a cell
     cells: frozenset[tuple[int, int]]
+    near: float  # height up to which a point is part of the plane where something may rise from it
+    bare: float  # and where nothing does
 
     def at(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
         """Whether the plane is bare below points."""
@@ -97,26 +99,44 @@ class BarePlaces:
 def find_bare_places(
     plane: Plane, frames: Sequence[tuple[FramePoints, FramePlane]], size: float, settings: SeparationSettings
 ) -> BarePlaces:
-    """Cells where nearly all points near the plane are part of it, in all frames together."""
-    near, flat = [], []
-    for points, own in frames:
-        z = np.abs(own.in_sigmas(points))
-        some = z < 2 * settings.bare_sigmas
-        near.append(_cells(plane, points.p_world[some], size))
-        flat.append(z[some] < settings.plane_sigmas)
-    cell, place = np.unique(np.concatenate(near), axis=0, return_inverse=True)
+    """Cells where nearly all points near the plane are part of it, in all frames together.
+
+    First with the points' own noise; the errors below the plane in all other cells then say how high points of the
+    plane may seem to be there, and the cells are judged again with that.
+    """
+    p = np.concatenate([points.p_world for points, _ in frames])
+    z = np.concatenate([own.in_sigmas(points) for points, own in frames])
+    first = _bare(plane, p, z, size, settings.plane_sigmas, settings)
+    unsure = z[(z < 0) & (z > -settings.most_sigmas)]
+    unsure = -unsure[~first.at(p[(z < 0) & (z > -settings.most_sigmas)])]
+    measured = float(np.quantile(unsure, settings.error_share)) if len(unsure) >= _FEWEST else 0.0
+    return _bare(plane, p, z, size, max(settings.plane_sigmas, measured), settings)
+
+
+def _bare(
+    plane: Plane,
+    p_world: Float[ndarray, "n 3"],
+    z: Float[ndarray, "n"],
+    size: float,
+    height: float,
+    settings: SeparationSettings,
+) -> BarePlaces:
+    """The cells in which nearly all points near the plane seem to be no higher than `height` (in sigmas)."""
+    bare = max(settings.bare_sigmas, settings.bare_factor * height)
+    near = np.abs(z) < 2 * bare
+    cell, place = np.unique(_cells(plane, p_world[near], size), axis=0, return_inverse=True)
     place = place.reshape(-1)
-    share = np.bincount(place, np.concatenate(flat), len(cell)) / np.maximum(np.bincount(place, minlength=len(cell)), 1)
-    return BarePlaces(plane, size, frozenset((a, b) for a, b in cell[share >= settings.bare_share].tolist()))
+    flat = (np.abs(z[near]) < height).astype(float)
+    share = np.bincount(place, flat, len(cell)) / np.maximum(np.bincount(place, minlength=len(cell)), 1)
+    chosen = cell[share >= settings.bare_share]
+    return BarePlaces(plane, size, frozenset((a, b) for a, b in chosen.tolist()), height, bare)
 
 
-def on_plane(
-    points: FramePoints, own: FramePlane, bare: BarePlaces, settings: SeparationSettings
-) -> Bool[ndarray, "n"]:
+def on_plane(points: FramePoints, own: FramePlane, bare: BarePlaces) -> Bool[ndarray, "n"]:
     """Points that are part of a plane or behind it."""
     z = own.in_sigmas(points)
-    low = z < settings.plane_sigmas
-    unsure = ~low & (z < settings.bare_sigmas)
+    low = z < bare.near
+    unsure = ~low & (z < bare.bare)
     low[unsure] = bare.at(points.p_world[unsure])
     return low
 

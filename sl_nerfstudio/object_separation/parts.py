@@ -31,7 +31,7 @@ class ObjectVoxels:
         """Whether points are in a voxel of the object or within a voxel of one."""
         if not len(self.centres) or not len(p_world):
             return np.zeros(len(p_world), dtype=bool)
-        limit = 2.0 * self.size
+        limit = 1.3 * self.size
         return np.isfinite(KDTree(self.centres).query(p_world, distance_upper_bound=limit)[0])
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
@@ -31,6 +31,7 @@ from sl_nerfstudio.object_separation.parts import ObjectVoxels, find_object
 from sl_nerfstudio.object_separation.plane_judgement import PlaneFinding, judge_plane
 from sl_nerfstudio.object_separation.plane_search import PointPool, find_planes
 from sl_nerfstudio.object_separation.settings import SEPARATION_DEFAULTS, SeparationSettings
+from sl_nerfstudio.object_separation.silhouette import silhouette
 from sl_nerfstudio.object_separation.viewed_region import ViewedRegion, viewed_region
 
 
@@ -61,21 +62,26 @@ class Separation:
     findings: tuple[PlaneFinding, ...]  # all planes that were judged
     surroundings: tuple[Surroundings, ...]  # those that are left out
     voxels: ObjectVoxels
-    settings: SeparationSettings
+    p_object: Float64[ndarray, "n 3"]  # points of the object from all frames
 
     def parts(self, index: int, frame: DecodedFrame) -> UInt8[ndarray, "h w"]:
         """The `Part` at every pixel of a frame, with any stride; `index` counts the frames that were separated.
 
-        Pixels that saw the pattern, but were not decoded, are of the same part as the nearest decoded one.
+        Pixels that saw the pattern, but were not decoded, show the object where its points from all frames are; the
+        others are of the same part as the nearest decoded pixel of the surroundings.
         """
         points = points_of(frame)
         label = np.full(frame.seen.shape, Part.NOTHING, dtype=np.uint8)
         label[points.row, points.column] = self._of_points(index, points)
         gap = frame.seen & (label == Part.NOTHING)
-        if len(points) and gap.any():
-            empty = label == Part.NOTHING
-            near = np.asarray(distance_transform_edt(empty, return_distances=False, return_indices=True))
+        covered = gap & silhouette(frame, self.p_object, self.voxels.size)
+        others = label > Part.OBJECT
+        if others.any():
+            near = np.asarray(distance_transform_edt(~others, return_distances=False, return_indices=True))
             label[gap] = label[near[0][gap], near[1][gap]]
+            label[covered] = Part.OBJECT
+        else:
+            label[gap] = Part.OBJECT
         return label
 
     def keeps(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
@@ -88,7 +94,7 @@ class Separation:
     def _of_points(self, index: int, points: FramePoints) -> UInt8[ndarray, "n"]:
         label = np.where(self.voxels.contain(points.p_world), Part.OBJECT, Part.BEYOND).astype(np.uint8)
         for plane in self.surroundings:
-            label[on_plane(points, plane.frames[index], plane.bare, self.settings)] = Part.PLANE
+            label[on_plane(points, plane.frames[index], plane.bare)] = Part.PLANE
         return label
 
 
@@ -113,12 +119,15 @@ def separate(
         for plane, share in find_planes(pool, region.radius, rng, settings)
     )
     outside = [_surroundings(f, points, pose_noise, region, size, settings) for f in findings if f.is_surroundings]
-    rest = [_without(outside, k, p, settings) for k, p in enumerate(points)]
+    rest = [_without(outside, k, p) for k, p in enumerate(points)]
     voxels = find_object(rest, [s.finding.plane for s in outside], region, size, settings)
     held = sum(int(voxels.contain(p).sum()) for p in rest)
     if held < settings.least_object * sum(map(len, points)):
-        outside, voxels = [], find_object([p.p_world for p in points], [], region, size, settings)
-    return Separation(region, findings, tuple(outside), voxels, settings)
+        outside, rest = [], [p.p_world for p in points]
+        voxels = find_object(rest, [], region, size, settings)
+    p_object = np.concatenate([p[voxels.contain(p)] for p in rest])
+    p_object = p_object[_spread(len(p_object), settings.silhouette_points, rng)]
+    return Separation(region, findings, tuple(outside), voxels, p_object)
 
 
 def _spread(count: int, most: int, rng: np.random.Generator) -> ndarray:
@@ -143,18 +152,16 @@ def _surroundings(
 ) -> Surroundings:
     plane = finding.plane
     own = tuple(plane_in_frame(plane, p, pose_noise, region.radius, settings) for p in points)
-    bare = find_bare_places(plane, list(zip(points, own, strict=True)), size, settings)
+    bare = find_bare_places(plane, list(zip(points, own, strict=True)), size / 2, settings)
     heights = [
         f.noise * float(np.median(p.sigma_along(plane.normal))) for f, p in zip(own, points, strict=True) if len(p)
     ]
-    return Surroundings(finding, bare, own, settings.plane_sigmas * float(np.median(heights)))
+    return Surroundings(finding, bare, own, bare.near * float(np.median(heights)))
 
 
-def _without(
-    outside: Sequence[Surroundings], index: int, points: FramePoints, settings: SeparationSettings
-) -> Float[ndarray, "n 3"]:
+def _without(outside: Sequence[Surroundings], index: int, points: FramePoints) -> Float[ndarray, "n 3"]:
     """The points of a frame that are not part of surroundings."""
     keep = np.ones(len(points), dtype=bool)
     for plane in outside:
-        keep &= ~on_plane(points, plane.frames[index], plane.bare, settings)
+        keep &= ~on_plane(points, plane.frames[index], plane.bare)
     return points.p_world[keep]

@@ -26,11 +26,18 @@ class SeparationSettings:
     clear_sigmas: float = 8.0
     """Distance from a plane above which a point certainly does not belong to it."""
     plane_sigmas: float = 3.0
-    """Height up to which a pixel is part of the plane, wherever the object may be near."""
+    """Height up to which a pixel is part of the plane wherever the object may be near, at least. Decoders err more
+    beside edges than elsewhere, so the height is measured: nothing is below the plane, what seems to be is error."""
+    error_share: float = 0.98
+    """Share of the errors below the plane that the measured height covers."""
+    most_sigmas: float = 30.0
+    """What is farther below the plane is no error of this kind; the measured height is at most this."""
     bare_sigmas: float = 8.0
-    """The same where the plane is bare."""
-    bare_share: float = 0.85
-    """Share of the points near the plane that must lie within `plane_sigmas` for a place to count as bare."""
+    """Height up to which a pixel is part of the plane where the plane is bare, at least."""
+    bare_factor: float = 3.0
+    """The same in measured heights."""
+    bare_share: float = 0.7
+    """Share of the points near the plane that must lie on it for a place to count as bare."""
     cameras_in_front: float = 0.95
     """Share of the cameras that must be in front of a plane that is left out."""
     most_behind: float = 0.05
@@ -60,6 +67,8 @@ class SeparationSettings:
     """Voxels of the smallest part that is kept beside the main part."""
     gap: float = 0.15
     """Distance from the main part within which other parts are kept, as a share of its size."""
+    silhouette_points: int = 200_000
+    """Points of the object that are looked for in every frame, to tell which pixels that were not decoded show it."""
     least_object: float = 0.01
     """Smallest share of the points that the object must hold; with less, nothing is left out."""
 
