@@ -36,6 +36,8 @@ class ExportConfig:
     """Cells along each side of the scene's box; the time grows with its square."""
     keep_unobserved: bool = False
     """Keep the surface that no frame observed. It closes the unseen sides, but is invented by the field."""
+    object_only: bool = False
+    """Remove the plane that the object stands on, walls, and what is not connected to the object."""
     data: Path | None = None
     """Scan folder, if it was moved since the training."""
     overwrite: bool = False
@@ -82,7 +84,9 @@ def export_trained(trained: "TrainedRun", config: ExportConfig) -> str:
 
     scan = trained.model.scan
     _require_other_files(_pose_files(config), scan.root)
-    settings = ExportSettings(config.output, _pose_folder(config), config.resolution, config.keep_unobserved)
+    settings = ExportSettings(
+        config.output, _pose_folder(config), config.resolution, config.keep_unobserved, config.object_only
+    )
     return summary(config, scan, export_run(trained, settings))
 
 
@@ -115,6 +119,7 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
     lines = [
         f"{config.output}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {extent} {unit}",
         *_removed(exported.trimmed),
+        *_cut(exported.cut, unit),
     ]
     if poses is not None:
         known = ""
@@ -149,6 +154,20 @@ def _removed(trimmed: "Trimmed | None") -> list[str]:
     if trimmed.residual_px > _SUSPICIOUS_PX:
         lines.append("  warning: that is a lot. Poses or intrinsics are wrong, or the training has not converged.")
     return lines
+
+
+def _cut(cut: "ObjectCut | None", unit: str) -> list[str]:
+    """What --object-only removed, and which planes it kept."""
+    if cut is None:
+        return []
+    from sl_nerfstudio.processing.selection.object_words import plane_sentence
+
+    share = cut.area_removed / cut.area_before if cut.area_before else 0.0
+    lines = [
+        f"  --object-only removed {cut.area_removed:.4g} square {unit} ({share:.0%} of the surface) with "
+        f"{len(cut.removed)} planes around the object"
+    ]
+    return lines + [f"    {plane_sentence(plane, plane in cut.removed)}" for plane in cut.planes]
 
 
 def _rms(values: "ndarray") -> float:

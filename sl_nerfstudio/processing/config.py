@@ -36,6 +36,11 @@ class ProcessConfig:
     """transforms.json with rough camera poses to start from (within 20 degrees); the scan gets their axes and unit"""
     refine_projector_focal: bool = False
     """the focal length of the projector is only roughly known: estimate it from all frames"""
+    masks: Path | None = None
+    """folder with one mask for each frame, named like the frame: white is used, black is not"""
+    object_only: bool = False
+    """leave out the plane that the object stands on, walls, and what is not connected to the object; the report shows
+    what was left out"""
     jobs: int | None = None
     """number of processes that decode frames; default: one for each core"""
     work: Path | None = None

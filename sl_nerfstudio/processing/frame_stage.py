@@ -25,6 +25,8 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
     }
     todo = [frame for frame in captures.frames if frame.name not in found]
     settings = {"decoder": job.decoder.name, "pattern": str(config.pattern), "images": str(config.images)}
+    if job.masks is not None:
+        settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
     jobs = config.jobs or cores()
     for result in track(run_frames(job, todo, jobs), "decoding and calibrating", len(todo)):

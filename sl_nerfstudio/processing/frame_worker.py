@@ -10,6 +10,7 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.processing.selection.user_masks import UserMasks
 from sl_nerfstudio.processing.store import DecodedStore
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
@@ -26,6 +27,7 @@ class FrameJob:
     camera: Device
     projector: Device
     seed: int
+    masks: UserMasks | None = None  # of the user
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class FrameWorker:
             resumed = decoded is not None
             if decoded is None:
                 decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
+            decoded = self._selected(frame.name, decoded)
         except FileError as error:
             return FrameStageResult(frame, stage="reading", reason=str(error))
         except DecodingError as error:
@@ -92,7 +95,11 @@ class FrameWorker:
                 f"{self._job.work}: the decoded frame {result.name} is missing\n"
                 "    cause:  files were removed while sl-process was running\n    remedy: start again"
             )
-        return decoded
+        return self._selected(result.name, decoded)
+
+    def _selected(self, name: str, decoded: Decoded) -> Decoded:
+        """What the user's mask of a frame selects; without masks, everything."""
+        return decoded if self._job.masks is None else self._job.masks.applied(name, decoded)
 
     def _with_file(self, frame: CapturedFrame, error: UserError) -> str:
         """The error with the file it is about: the image, or the folder of a sequence."""

@@ -11,6 +11,7 @@ from sl_nerfstudio.processing.captures import Captures, find_captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
+from sl_nerfstudio.processing.selection.user_masks import find_masks
 from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length
 from sl_nerfstudio.scan.atomic import require_empty
 
@@ -42,8 +43,9 @@ def read_inputs(config: ProcessConfig) -> Inputs:
         config.projector_model,
         config.procam_step,
     )
+    masks = None if config.masks is None else find_masks(config.masks, names, captures.size)
     return Inputs(
-        FrameJob(config.work_folder, decoder, camera, projector, config.seed),
+        FrameJob(config.work_folder, decoder, camera, projector, config.seed, masks),
         captures,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),

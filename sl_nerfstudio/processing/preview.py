@@ -6,9 +6,12 @@ import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
+from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.scan.images import as_grey
 
 _SIDE = 170  # longest side of a picture, pixels
+_TINTS = {Part.PLANE: (0.85, 0.15, 0.1), Part.BEYOND: (0.95, 0.6, 0.0)}
+_TINT = 0.6  # opacity
 
 
 @dataclass(frozen=True)
@@ -17,14 +20,19 @@ class Preview:
 
     image: Float32[ndarray, "h w 3"] | None
     coords: Float32[ndarray, "h w 3"] | None
+    left_out: Float32[ndarray, "h w 3"] | None = None  # the capture with surroundings in colour
 
 
 def make_preview(
     image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None,
     coords: Float32[ndarray, "_h _w 2"] | None,
     size: tuple[int, int],
+    part: UInt8[ndarray, "_h _w"] | None = None,
 ) -> Preview:
-    """Reduced pictures. `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded."""
+    """Reduced pictures. `part` is what each pixel shows (`Part`), if surroundings were looked for.
+
+    `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded.
+    """
     picture = colours = None
     if image is not None:
         step = _step(image.shape)
@@ -36,7 +44,18 @@ def make_preview(
         place = np.nan_to_num(thin) / np.array(size, dtype=np.float32)
         colours = np.stack([place[..., 0], np.full(thin.shape[:2], 0.35), place[..., 1]], -1).astype(np.float32)
         colours[np.isnan(thin).any(-1)] = 0.85
-    return Preview(picture, colours)
+    if picture is None or part is None:
+        return Preview(picture, colours)
+    step = _step(part.shape)
+    return Preview(picture, colours, _tinted(picture, part[::step, ::step]))
+
+
+def _tinted(picture: Float32[ndarray, "h w 3"], part: UInt8[ndarray, "h w"]) -> Float32[ndarray, "h w 3"]:
+    """The picture with what was left out in colour."""
+    out = picture.copy()
+    for kind, colour in _TINTS.items():
+        out[part == kind] = (1 - _TINT) * out[part == kind] + _TINT * np.array(colour, dtype=np.float32)
+    return out
 
 
 def _step(shape: tuple[int, ...]) -> int:

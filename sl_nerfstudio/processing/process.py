@@ -14,8 +14,10 @@ from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
 from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.refined_focal import refine_focal
-from sl_nerfstudio.processing.result import ProcessResult
+from sl_nerfstudio.processing.result import ProcessResult, with_object_only
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
+from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
+from sl_nerfstudio.processing.selection.object_words import object_sentences
 from sl_nerfstudio.processing.summary import compare_registered, summarise
 from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.register import register
@@ -52,6 +54,10 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     poses = find_scan_poses(clouds, registration, inputs.known, given)
     cross = compare_registered(clouds, registration, poses.adjusted)
     result = summarise(config, job.decoder.name, results, registration, poses, cross)
+    if config.object_only:
+        found = find_object_only(job, results, registration, poses)
+        log("object only: " + "\n    ".join(object_sentences(found)))
+        poses, result = with_usable_scale(poses, found), with_object_only(result, found)
     if result.joint_px is not None:
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(config.output, job, results, poses, result, make_report)

@@ -1,9 +1,11 @@
 """The result of `sl-process`, for the report and for programs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.selection.object_only import ObjectOnly
+from sl_nerfstudio.processing.selection.object_words import object_document
 from sl_nerfstudio.verdict.verdict import Verdict
 
 
@@ -13,7 +15,7 @@ class FrameRecord:
 
     name: str
     in_scan: bool
-    stage: str  # in which it failed: reading, decoding, calibrating, registering; "" if it did not
+    stage: str  # in which it failed: reading, decoding, calibrating, registering, separating; "" if it did not
     reason: str  # problem, cause and remedy
     decode_rate: float | None = None
     mask_share: float | None = None
@@ -61,6 +63,7 @@ class ProcessResult:
     cross_px: tuple[float, float] | None  # the same over all points that two frames saw: median, 95 %
     verdict: Verdict
     versions: dict[str, str]
+    object_only: ObjectOnly | None = None  # None: surroundings were not looked for
 
     @property
     def registered(self) -> int:
@@ -83,6 +86,21 @@ class ProcessResult:
             "remarks": list(self.remarks),
             "recapture": list(self.recapture),
             "joint_adjustment_px": self.joint_px,
+            "object_only": None if self.object_only is None else object_document(self.object_only),
             "cross_frame_px": self.cross_px,
             "versions": self.versions,
         }
+
+
+def with_object_only(result: ProcessResult, found: ObjectOnly) -> ProcessResult:
+    """The result with what was left out; frames that show nothing of the object are not in the scan."""
+    reason = (
+        "shows nothing of the object\n    cause:  all decoded pixels belong to its surroundings, by --object-only\n"
+        "    remedy: capture the object in this view, or leave --object-only out"
+    )
+    empty = set(found.empty_frames())
+    frames = tuple(
+        replace(f, in_scan=False, stage="separating", reason=reason) if f.in_scan and f.name in empty else f
+        for f in result.frames
+    )
+    return replace(result, frames=frames, object_only=found)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
+from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.processing.failures import REPORT
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.preview import Preview, make_preview
@@ -45,16 +46,18 @@ def write_scan(
         for frame, record in zip(track(results, "writing"), result.frames, strict=True):
             image = _image(frame)
             cloud = frame.cloud
-            previews.append(make_preview(image, None if cloud is None else cloud.coords, size))
+            part = None if result.object_only is None else result.object_only.parts.get(frame.name)
+            previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part))
             if not record.in_scan or cloud is None or image is None:
                 continue
             decoded, k = worker.load(frame), row[frame.name]
+            keep = np.ones_like(decoded.mask) if part is None else part == Part.OBJECT
             writer.add_frame(
                 frame.name,
                 image=image,
-                coords=cloud.coords,
-                mask=decoded.mask,
-                pattern=np.rint(255 * decoded.pattern).astype(np.uint8),
+                coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
+                mask=decoded.mask & keep,
+                pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
                 T_world_projector=poses.adjusted.poses.T_world_projector[k],
                 pose_sigma=poses.adjusted.sigma[k],

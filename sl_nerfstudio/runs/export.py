@@ -11,6 +11,7 @@ from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
 from sl_nerfstudio.meshing.trim import Trimmed, trim_to_observed
+from sl_nerfstudio.runs.object_cut import ObjectCut, cut_object
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import PoseSigma, write_transforms
@@ -27,6 +28,7 @@ class ExportSettings:
     pose_folder: Path | None = None  # for transforms.json and training.json; None: the poses are not written
     resolution: int = 512  # cells along each side of the scene's box
     keep_unobserved: bool = False
+    object_only: bool = False  # without planes around the object and what is not connected to it
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,15 @@ class Exported:
     """What was written; lengths in the scan's unit."""
 
     mesh: Mesh
-    trimmed: Trimmed | None  # None: nothing was removed from the surface
+    trimmed: Trimmed | None  # None: nothing was removed for not being observed
+    cut: ObjectCut | None  # None: surroundings were not looked for
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
     extraction_seconds: float
     writing_seconds: float  # trimming and writing
 
 
 def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
-    """Extract the surface, trim it to what the frames observed (unless it is to be kept), and write the files.
+    """Extract the surface, trim it to what was observed, cut out the object, as the settings say, and write the files.
 
     Raises UserError if there is no surface, if no part of it was observed, or if a file cannot be written.
     """
@@ -50,11 +53,13 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     extracted = time.perf_counter()
     trimmed = None if settings.keep_unobserved else trim_to_observed(closed, model.scan, model.poses())
     mesh = closed if trimmed is None else trimmed.mesh
+    cut = cut_object(mesh, model.scan, model.poses()) if settings.object_only else None
+    mesh = mesh if cut is None else cut.mesh
     write_mesh(settings.mesh, mesh)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
         write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
-    return Exported(mesh, trimmed, model.pose_sigma(), extracted - start, time.perf_counter() - extracted)
+    return Exported(mesh, trimmed, cut, model.pose_sigma(), extracted - start, time.perf_counter() - extracted)
 
 
 def _write_poses(path: Path, model: TrainedModel) -> None:

@@ -16,7 +16,11 @@ class SynthConfig:
     """A synthetic scan. Lengths in flags are in millimetres, fractions are between 0 and 1."""
 
     scene: str = "cone-and-cylinder"
-    """cone-and-cylinder, head, frog, or a mesh file (.ply .obj .stl .glb) whose lengths are in --units"""
+    """cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal, or a mesh file (.ply .obj .stl .glb) whose lengths
+    are in --units"""
+    background: Literal["none", "table", "walls"] = "none"
+    """what stands around the object, lit by the same pattern: nothing, a table, or a table with boards and boxes; the
+    devices then stay at least 26 degrees above the table"""
     frames: int = 22
     """number of captures"""
     resolution: int = 400

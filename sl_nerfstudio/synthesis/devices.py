@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, DeviceKind, Intrinsics, project, unproject
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 Distortion = tuple[float, float, float, float]
 _CAMERA_FILL = 0.92  # of half the image, reached by the object in the frame where it extends farthest

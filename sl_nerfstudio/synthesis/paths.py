@@ -7,7 +7,7 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 PathKind = Literal["hand-held", "rigid-rig", "static-projector"]
 DISTANCE = 4.5  # of the devices from the object, in sizes of the object

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.scenes.surroundings import joined
 
 _SAME_POINT = 2e-5  # of the distance: a hit this close to a point is the point
 
@@ -20,18 +21,24 @@ class Hits:
 
 
 class RayCaster:
-    """Casts rays at a scene; lengths in millimetres."""
+    """Casts rays at an object and its surroundings; lengths in millimetres."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Build the search tree of the scene's mesh."""
+    def __init__(self, scene: Scene, surroundings: Scene | None = None) -> None:
+        """Build the search tree of one mesh; in `self.scene` the object's faces come before its surroundings'."""
         import open3d as o3d
 
+        self._object_faces = len(scene.faces)
+        scene = scene if surroundings is None else joined(scene, surroundings)
         self.scene = scene
         self._tensor = o3d.core.Tensor
         self._tree = o3d.t.geometry.RaycastingScene()
         self._tree.add_triangles(
             o3d.core.Tensor(scene.vertices.astype(np.float32)), o3d.core.Tensor(scene.faces.astype(np.uint32))
         )
+
+    def on_object(self, face: Int[ndarray, "n"]) -> Bool[ndarray, "n"]:
+        """Whether faces belong to the object; false for surroundings, and where nothing is hit."""
+        return (face >= 0) & (face < self._object_faces)
 
     def first_hits(self, origin: Float[ndarray, "3"], direction: Float[ndarray, "n 3"]) -> Hits:
         """What unit rays from one place hit first.

@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.image import sample_bilinear
-from sl_nerfstudio.synthesis.appearance import Appearance
+from sl_nerfstudio.synthesis.appearance.plain import Appearance
 from sl_nerfstudio.synthesis.devices import DevicePair, pixels, rays
 from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class RenderedCapture:
 
     coords: Float32[ndarray, "h w 2"]  # exact at pixel centres; NaN outside the mask
     mask: Bool[ndarray, "h w"]
+    object_mask: Bool[ndarray, "h w"]  # the object, lit or not, and not its surroundings
     radiance: Float32[ndarray, "h w"]  # 1 is a white surface facing the projector, in its full light
 
 
@@ -68,13 +69,14 @@ def render_capture(
     w, h = devices.camera.w, devices.camera.h
     corner = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
     coords = np.full((h * w, 2), np.nan, dtype=np.float32)
-    mask, hit = np.zeros((2, h * w), dtype=bool)
-    box = _box_of_the_object(caster.scene, devices, T_world_camera).reshape(-1)
+    mask, hit, on_object = np.zeros((3, h * w), dtype=bool)
+    box = _box_of_the_scene(caster.scene, devices, T_world_camera).reshape(-1)
     at_centres = visible_points(caster, devices, T_world_camera, T_world_projector, corner[box] + 0.5)
     mask[box], hit[box] = at_centres.lit, at_centres.hit
+    on_object[box] = caster.on_object(at_centres.face)
     coords[mask] = at_centres.uv_projector[at_centres.lit]
     radiance = np.full(h * w, appearance.background, dtype=np.float32)
-    near = _near_the_object(hit.reshape(h, w)).reshape(-1)
+    near = _near_a_hit(hit.reshape(h, w)).reshape(-1)
     light = np.zeros(int(near.sum()), dtype=np.float32)
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
@@ -82,13 +84,16 @@ def render_capture(
             seen = visible_points(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
             light += _light(seen, caster.scene, devices, T_world_projector, pattern, appearance)
     radiance[near] = light / supersampling**2
-    return RenderedCapture(coords.reshape(h, w, 2), mask.reshape(h, w), appearance.through_lens(radiance.reshape(h, w)))
+    return RenderedCapture(
+        coords.reshape(h, w, 2),
+        mask.reshape(h, w),
+        on_object.reshape(h, w),
+        appearance.through_lens(radiance.reshape(h, w)),
+    )
 
 
-def _box_of_the_object(
-    scene: Scene, devices: DevicePair, T_world_camera: Float[ndarray, "4 4"]
-) -> Bool[ndarray, "h w"]:
-    """Pixels that may see the object: a rectangle around its vertices, or all if some are behind the camera."""
+def _box_of_the_scene(scene: Scene, devices: DevicePair, T_world_camera: Float[ndarray, "4 4"]) -> Bool[ndarray, "h w"]:
+    """Pixels that may see a surface: a rectangle around its vertices, or all if some are behind the camera."""
     camera = devices.camera
     uv, _ = pixels(camera, T_world_camera, scene.vertices)
     depth = -(scene.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
@@ -100,8 +105,8 @@ def _box_of_the_object(
     return box
 
 
-def _near_the_object(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Pixels with a ray that may hit the object, even if the ray through their centre does not."""
+def _near_a_hit(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Pixels with a ray that may hit a surface, even if the ray through their centre does not."""
     padded = np.pad(hit, 1)
     h, w = hit.shape
     return np.logical_or.reduce([padded[i : i + h, j : j + w] for i in range(3) for j in range(3)])

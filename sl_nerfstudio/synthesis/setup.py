@@ -12,7 +12,7 @@ from sl_nerfstudio.pattern.files import read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 from sl_nerfstudio.scan.types import PoseSigma
-from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
+from sl_nerfstudio.synthesis.appearance.plain import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices
 from sl_nerfstudio.synthesis.noise import Cells
@@ -20,8 +20,9 @@ from sl_nerfstudio.synthesis.paths import DISTANCE, make_paths
 from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, pose_sigma
 from sl_nerfstudio.synthesis.ray_casting import RayCaster
 from sl_nerfstudio.synthesis.render import RenderedCapture, render_capture, visible_points
-from sl_nerfstudio.synthesis.scene import Scene
-from sl_nerfstudio.synthesis.scenes import make_scene
+from sl_nerfstudio.synthesis.scenes.library import make_scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.scenes.surroundings import above_the_table, make_surroundings
 
 _REGISTRATION_GRID = 28  # pixels per side of the grid with which a frame's disturbed points are registered
 
@@ -35,6 +36,7 @@ class Stream(IntEnum):
     COORDS = 4
     SENSOR = 5
     WORLD = 6
+    SURROUNDINGS = 7
 
 
 def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Generator:
@@ -47,6 +49,7 @@ class Setup:
     """A scan before it is rendered; lengths in millimetres, poses in the scene's axes."""
 
     scene: Scene
+    surroundings: Scene | None  # table and walls
     caster: RayCaster
     devices: DevicePair
     pattern: Float32[ndarray, "h w"]
@@ -73,19 +76,23 @@ class Setup:
 def make_setup(config: SynthConfig) -> Setup:
     """Scene, devices, paths and their errors, as configured. Raises UserError for bad files."""
     scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
+    if config.background != "none":
+        scene = above_the_table(scene)
+    surroundings = make_surroundings(scene, config.background, random_stream(config.seed, Stream.SURROUNDINGS))
     pattern, layout = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
     options = DeviceOptions(
         config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
     )
     devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
-    caster = RayCaster(scene)
+    caster = RayCaster(scene, surroundings)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
     start = disturb_poses(truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES))
     return Setup(
         scene=scene,
+        surroundings=surroundings,
         caster=caster,
         devices=devices,
         pattern=pattern,

@@ -19,9 +19,9 @@ from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.types import PoseSigma, Scale
 from sl_nerfstudio.scan.writing import ScanWriter, device_fields, sigma_fields
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
-from sl_nerfstudio.synthesis.mesh_file import encode_ply
 from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords, disturb_image
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
@@ -38,6 +38,7 @@ class SyntheticFrame:
     pattern: UInt8[ndarray, "h w"]
     coords: Float32[ndarray, "h w 2"]
     mask: Bool[ndarray, "h w"]
+    object_mask: Bool[ndarray, "h w"]  # the object and not its surroundings, lit or not
 
 
 def synthesise(config: SynthConfig, output: Path) -> None:
@@ -58,7 +59,8 @@ def synthesise(config: SynthConfig, output: Path) -> None:
             for index, frame in enumerate(_frames(config, setup)):
                 start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
                 _add(writer, frame, start, truth)
-            _add_files(writer, config, setup, "ground_truth/mesh.ply")
+                writer.add_file(f"ground_truth/{_object_mask_path(frame)}", _encode_mask(frame.object_mask))
+            _add_files(writer, config, setup, "ground_truth/")
 
 
 def without_noise(config: SynthConfig) -> SynthConfig:
@@ -95,7 +97,7 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
         image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
         coords = disturb_coords(rendered.coords, rendered.mask, setup.cells, noise, decoder)
         pattern = _pattern_image(image, rendered.mask, setup)
-        yield SyntheticFrame(_frame_name(index), image, pattern, coords, rendered.mask)
+        yield SyntheticFrame(_frame_name(index), image, pattern, coords, rendered.mask, rendered.object_mask)
 
 
 def _frame_name(index: int) -> str:
@@ -157,12 +159,22 @@ def _add(writer: ScanWriter, frame: SyntheticFrame, poses: TwoPoses, truth: TwoP
     )
 
 
-def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, mesh: str) -> None:
-    """The pattern's description and the true surface."""
+def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, truth: str) -> None:
+    """The pattern's description, and below the folder `truth` the surfaces of the object and of what is around it."""
     if setup.layout is not None:
         writer.add_file("pattern.json", setup.layout.encode())
-    vertices = world_from_scene(config, setup.scene).points(setup.scene.vertices)
-    writer.add_file(mesh, encode_ply(vertices, setup.scene.faces))
+    S_world_scene = world_from_scene(config, setup.scene)
+    for name, part in (("mesh", setup.scene), ("surroundings", setup.surroundings)):
+        if part is not None:
+            writer.add_file(f"{truth}{name}.ply", encode_ply(S_world_scene.points(part.vertices), part.faces))
+
+
+def _object_mask_path(frame: SyntheticFrame) -> str:
+    return f"object_masks/{frame.name}.png"
+
+
+def _encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
+    return encode_png(mask.astype(np.uint8) * np.uint8(255))
 
 
 def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
@@ -171,8 +183,9 @@ def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
     with _scan_writer(exact, setup, output / "ground_truth") as truth:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
+            truth.add_file(_object_mask_path(frame), _encode_mask(frame.object_mask))
             write_atomic(output / "images" / f"{frame.name}.png", encode_png(frame.image))
-        _add_files(truth, exact, setup, "mesh.ply")
+        _add_files(truth, exact, setup, "")
     write_atomic(output / "pattern.png", encode_png(_to_8_bit(setup.pattern)))
     if setup.layout is not None:
         write_atomic(output / "pattern.json", setup.layout.encode())

@@ -5,12 +5,17 @@ import pytest
 import trimesh
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
-from sl_nerfstudio.synthesis.frog import frog
-from sl_nerfstudio.synthesis.head import head
-from sl_nerfstudio.synthesis.mesh_file import encode_ply
-from sl_nerfstudio.synthesis.scenes import make_scene
-from sl_nerfstudio.synthesis.sdf import capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
+from sl_nerfstudio.synthesis.scenes.chair import chair
+from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.scenes.dog import dog
+from sl_nerfstudio.synthesis.scenes.frog import frog
+from sl_nerfstudio.synthesis.scenes.head import head
+from sl_nerfstudio.synthesis.scenes.leaf import leaf
+from sl_nerfstudio.synthesis.scenes.library import BUILT_IN, make_scene
+from sl_nerfstudio.synthesis.scenes.medal import medal
+from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
+from sl_nerfstudio.synthesis.scenes.sdf import capsule, carve, cylinder, ellipsoid, half_space, mesh_of, mirrored, union
+from sl_nerfstudio.synthesis.scenes.vase import vase
 
 
 def _mesh(scene):
@@ -19,14 +24,25 @@ def _mesh(scene):
 
 @pytest.fixture(scope="module")
 def scenes():
-    return {"cone-and-cylinder": cone_and_cylinder(), "head": head(cell=4.0), "frog": frog(cell=1.5)}
+    return {
+        "cone-and-cylinder": cone_and_cylinder(),
+        "head": head(cell=4.0),
+        "frog": frog(cell=1.5),
+        "chair": chair(),
+        "leaf": leaf(),
+        "dog": dog(cell=1.5),
+        "vase": vase(),
+        "medal": medal(cell=1.0),
+    }
 
 
-@pytest.mark.parametrize("name", ["cone-and-cylinder", "head", "frog"])
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_surfaces_are_closed_and_oriented_outwards(scenes, name):
     mesh = _mesh(scenes[name])
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
-    assert mesh.euler_number == 2 and mesh.body_count == 1
+    assert mesh.body_count == 1
+    holes = (2 - mesh.euler_number) // 2
+    assert holes == 17 if name == "chair" else holes == 0  # between legs, rungs, slats and spindles
     assert mesh.area_faces.min() > 0
 
 
@@ -38,14 +54,25 @@ def test_the_cone_and_the_cylinder_have_their_volume_and_size(scenes):
     assert scene.size == pytest.approx(80)
 
 
-@pytest.mark.parametrize(("name", "size"), [("head", (147, 195, 201)), ("frog", (120, 99, 68))])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("head", (147, 195, 201)),
+        ("frog", (120, 99, 68)),
+        ("chair", (61, 77, 117)),
+        ("leaf", (81, 137, 26)),
+        ("dog", (36, 147, 108)),
+        ("vase", (84, 84, 129)),
+        ("medal", (96, 96, 8)),
+    ],
+)
 def test_free_forms_have_their_size_and_stand_on_the_ground(scenes, name, size):
     scene = scenes[name]
     np.testing.assert_allclose(np.ptp(scene.vertices, axis=0), size, atol=3)
     assert abs(scene.vertices[:, 2].min()) < 0.5
 
 
-@pytest.mark.parametrize("name", ["head", "frog"])
+@pytest.mark.parametrize("name", ["head", "frog", "chair", "leaf", "dog", "vase", "medal"])
 def test_normals_of_free_forms_point_outwards(scenes, name):
     scene = scenes[name]
     agree = (scene.vertex_normals[scene.faces].mean(1) * scene.face_normals).sum(1)
@@ -74,6 +101,20 @@ def test_a_sphere_from_its_field():
     assert _mesh(scene).volume == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
 
 
+def test_a_vase_is_the_same_from_all_sides(scenes):
+    """Turned by any of its segments, it is itself; the normals are perpendicular to the surface's edges."""
+    scene = scenes["vase"]
+    radius = np.hypot(scene.vertices[:, 0], scene.vertices[:, 1])
+    rings = radius[:-2].reshape(-1, 720)
+    np.testing.assert_allclose(rings, np.broadcast_to(rings[:, :1], rings.shape), rtol=1e-12)
+    assert radius.max() == pytest.approx(42, abs=0.01)
+    # Guldin's rule for the solid: area of the half profile times the way of its centroid
+    r, z = rings[:, 0], scene.vertices[:-2, 2].reshape(-1, 720)[:, 0]
+    r, z = np.append(r, 0), np.append(z, scene.vertices[-1, 2])
+    volume = abs(np.pi / 3 * np.sum((r[:-1] ** 2 + r[:-1] * r[1:] + r[1:] ** 2) * np.diff(z)))
+    assert _mesh(scene).volume == pytest.approx(volume, rel=1e-4)
+
+
 def test_a_form_that_leaves_its_box_is_refused():
     with pytest.raises(ValueError, match="the surface of ball leaves its box"):
         mesh_of("ball", ellipsoid((0, 0, 0), (10, 10, 10)), (-8, -12, -12), (12, 12, 12), 1.0)
@@ -88,6 +129,8 @@ def test_joining_and_carving():
     assert (carve(0.0, a, half_space((0, 0, 1), 0.5))(p) < 0).tolist() == [False] * 5
     far = capsule((0, 0, 0), (0, 0, 5), 1.0, 1.0)(np.array([[3.0, 0, 2], [0, 0, 8], [0, 4, -3]]))
     np.testing.assert_allclose(far, [2, 2, 4])
+    disc = cylinder((0, 0, 0), (0, 0, 4), 5.0)(np.array([[0.0, 0, 1], [7, 0, 2], [8, 0, 8], [0, 0, -3]]))
+    np.testing.assert_allclose(disc, [-1, 2, 5, 3])
     assert mirrored(b)(np.array([[-3.0, 0, 0]]))[0] == pytest.approx(-2, abs=1e-6)
 
 
@@ -111,7 +154,7 @@ def test_a_written_mesh_comes_back_exactly(tmp_path, scenes):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, frog. nor a mesh file"),
+        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal. nor"),
         ("absent.ply", None, "there is no such file"),
         ("text.ply", b"hello", "cannot be read as a mesh"),
         ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"

@@ -12,6 +12,8 @@ from sl_nerfstudio.evaluation.report.pictures import data_uri
 from sl_nerfstudio.processing.advice import first_line
 from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.result import FrameRecord, ProcessResult
+from sl_nerfstudio.processing.selection.object_only import FrameShares
+from sl_nerfstudio.processing.selection.object_words import object_sentences
 
 _TEMPLATE = "processing.html.j2"
 
@@ -23,16 +25,24 @@ class FrameRow:
     record: FrameRecord
     image: str  # data addresses; "" where there is no picture
     coords: str
+    left_out: str
+    shares: FrameShares | None  # of what was left out
 
 
 def render_processing_report(result: ProcessResult, previews: Sequence[Preview]) -> str:
     """The page as text."""
-    rows = [FrameRow(record, *_pictures(preview)) for record, preview in zip(result.frames, previews, strict=True)]
+    found = result.object_only
+    shares = {} if found is None else {share.name: share for share in found.frames}
+    rows = [
+        FrameRow(record, *_pictures(preview), shares.get(record.name))
+        for record, preview in zip(result.frames, previews, strict=True)
+    ]
     values = {
         "result": result,
         "rows": rows,
         "verdict": result.verdict,
         "sentence": _sentence(result),
+        "object_only": () if found is None else object_sentences(found),
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
         "settings": sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
@@ -77,6 +87,7 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
     return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]
 
 
-def _pictures(preview: Preview) -> tuple[str, str]:
-    image, coords = (("" if p is None else data_uri(p)) for p in (preview.image, preview.coords))
-    return image, coords
+def _pictures(preview: Preview) -> tuple[str, str, str]:
+    shown = (preview.image, preview.coords, preview.left_out)
+    image, coords, left_out = (("" if p is None else data_uri(p)) for p in shown)
+    return image, coords, left_out

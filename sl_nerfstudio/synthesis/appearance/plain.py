@@ -8,7 +8,7 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 _WAVES = 14
 

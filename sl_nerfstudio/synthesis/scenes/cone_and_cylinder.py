@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 PLATE = (80.0, 56.0, 6.0)  # x, y, z, millimetres; its upper side is z = 6
 CONE = (-20.0, 19.0, 46.0)  # x of the axis, radius at the foot, height

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.scene import Scene
 
 Number = float | int
 Triple = tuple[Number, Number, Number]
@@ -44,6 +44,23 @@ def capsule(a: Triple, b: Triple, radius_a: Number, radius_b: Number) -> Field:
     def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         t = np.clip((p - start) @ axis / (axis @ axis), 0, 1)
         return _length(p - start - t[:, None] * axis) - (radius_a + t * (radius_b - radius_a))
+
+    return field
+
+
+def cylinder(a: Triple, b: Triple, radius: Number, rounding: Number = 0.0) -> Field:
+    """A cylinder from `a` to `b` with flat ends, its edges rounded."""
+    start, end = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    axis = (end - start) / np.linalg.norm(end - start)
+    half = np.linalg.norm(end - start) / 2
+
+    def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+        q = p - (start + end) / 2
+        along = q @ axis
+        beside = _length(q - along[:, None] * axis) - radius + rounding
+        beyond = np.abs(along) - half + rounding
+        outside = np.sqrt(np.maximum(beside, 0) ** 2 + np.maximum(beyond, 0) ** 2)
+        return outside + np.minimum(np.maximum(beside, beyond), 0) - rounding
 
     return field
 

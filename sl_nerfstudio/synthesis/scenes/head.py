@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from sl_nerfstudio.synthesis.scene import Scene
-from sl_nerfstudio.synthesis.sdf import capsule, carve, ellipsoid, half_space, mesh_of, mirrored, ridges, union
+from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.scenes.sdf import capsule, carve, ellipsoid, half_space, mesh_of, mirrored, ridges, union
 
 
 def head(cell: float = 1.25) -> Scene:

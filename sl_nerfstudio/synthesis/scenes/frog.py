@@ -1,7 +1,17 @@
 """A sitting frog, about 120 x 99 x 68 mm: thin legs, deep folds, many parts that hide others."""
 
-from sl_nerfstudio.synthesis.scene import Scene
-from sl_nerfstudio.synthesis.sdf import Field, Triple, capsule, carve, ellipsoid, half_space, mesh_of, mirrored, union
+from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.scenes.sdf import (
+    Field,
+    Triple,
+    capsule,
+    carve,
+    ellipsoid,
+    half_space,
+    mesh_of,
+    mirrored,
+    union,
+)
 
 
 def frog(cell: float = 0.8) -> Scene:

@@ -7,13 +7,27 @@ from typing import Any
 import numpy as np
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.synthesis.cone_and_cylinder import cone_and_cylinder
-from sl_nerfstudio.synthesis.frog import frog
-from sl_nerfstudio.synthesis.head import head
-from sl_nerfstudio.synthesis.scene import Scene
+from sl_nerfstudio.synthesis.scenes.chair import chair
+from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.scenes.dog import dog
+from sl_nerfstudio.synthesis.scenes.frog import frog
+from sl_nerfstudio.synthesis.scenes.head import head
+from sl_nerfstudio.synthesis.scenes.leaf import leaf
+from sl_nerfstudio.synthesis.scenes.medal import medal
+from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.scenes.vase import vase
 
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
-BUILT_IN: dict[str, Callable[[], Scene]] = {"cone-and-cylinder": cone_and_cylinder, "head": head, "frog": frog}
+BUILT_IN: dict[str, Callable[[], Scene]] = {
+    "cone-and-cylinder": cone_and_cylinder,
+    "head": head,
+    "frog": frog,
+    "chair": chair,
+    "leaf": leaf,
+    "dog": dog,
+    "vase": vase,
+    "medal": medal,
+}
 
 
 def make_scene(name: str, file_unit: float = 1.0) -> Scene:

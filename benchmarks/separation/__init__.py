@@ -1,0 +1,1 @@
+"""What `--object-only` keeps and leaves out, against ray-cast truth: `python -m benchmarks.separation`."""
