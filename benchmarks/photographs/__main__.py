@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from benchmarks.machine import write_rows
-from benchmarks.photographs.scoring import DecodingFigures, PoseError, decoding_figures, pose_errors
+from benchmarks.photographs.scoring import NOTHING_DECODED, DecodingFigures, PoseError, decoding_figures, pose_errors
 from benchmarks.photographs.sets import SETS, CaptureSet, captures_of
 from benchmarks.photographs.truth import Truth, read_truth
 from sl_nerfstudio.cli.run import run
@@ -63,6 +63,7 @@ class Row:
     decoded: float  # share of the object's lit pixels, over all usable frames
     median_px: float
     wrong_pixels: float  # share of the decoded ones that are more than 2 pattern pixels off
+    slipped_pixels: float  # share of them that are more than half a period off
     camera_deg: float  # median over the right frames
     within_1_sigma: float  # share of the frames in the scan; camera rotation
     within_2_5_sigma: float
@@ -114,7 +115,7 @@ def row_of(
     message: str,
 ) -> Row:
     """The figures of a set; a frame in the scan that does not show the object at all counts as wrong."""
-    decoding = decoding or DecodingFigures(0.0, float("nan"), float("nan"))
+    decoding = decoding or NOTHING_DECODED
     right = {error.name for error in errors if error.right}
     ratio = np.array([error.over_sigma for error in errors if np.isfinite(error.over_sigma)])
     usable = truth.usable
@@ -129,6 +130,7 @@ def row_of(
         decoded=decoding.decoded,
         median_px=decoding.median_px,
         wrong_pixels=decoding.wrong,
+        slipped_pixels=decoding.slipped,
         camera_deg=float(np.median([e.camera_deg for e in errors if e.right])) if right else float("nan"),
         within_1_sigma=float((ratio <= 1).mean()) if len(ratio) else float("nan"),
         within_2_5_sigma=float((ratio <= 2.5).mean()) if len(ratio) else float("nan"),
@@ -140,8 +142,8 @@ def row_of(
 
 
 HEAD = (
-    f"{'set':42} {'right':>7} {'wrong':>5} {'out':>4} {'decoded':>8} {'px':>6} {'wrong px':>8} {'cam deg':>8} "
-    f"{'1 s':>5} {'2.5 s':>5}  {'verdict':10} {'s':>4}"
+    f"{'set':42} {'right':>7} {'wrong':>5} {'out':>4} {'decoded':>8} {'px':>6} {'>2 px':>7} {'>10 px':>7} "
+    f"{'cam deg':>8} {'1 s':>5} {'2.5 s':>5}  {'verdict':10} {'s':>4}"
 )
 
 
@@ -149,8 +151,8 @@ def text_of(row: Row) -> str:
     """A line of the table."""
     return (
         f"{row.name:42} {row.right:3d}/{row.usable:<3d} {len(row.wrong):5d} {row.left_out:4d} {row.decoded:8.1%} "
-        f"{row.median_px:6.2f} {row.wrong_pixels:8.2%} {row.camera_deg:8.3f} {row.within_1_sigma:5.0%} "
-        f"{row.within_2_5_sigma:5.0%}  {row.verdict:10} {row.seconds:4.0f}"
+        f"{row.median_px:6.2f} {row.wrong_pixels:7.2%} {row.slipped_pixels:7.2%} "
+        f"{row.camera_deg:8.3f} {row.within_1_sigma:5.0%} {row.within_2_5_sigma:5.0%}  {row.verdict:10} {row.seconds:4.0f}"
         + (f"\n    {row.message.splitlines()[0]}" if row.message else "")
     )
 
@@ -163,11 +165,12 @@ def summary(rows: list[Row]) -> str:
         usable, right = sum(row.usable for row in some), sum(row.right for row in some)
         wrong = sum(len(row.wrong) for row in some)
         quiet = sum(len(row.wrong) for row in some if row.verdict in ("good", "acceptable"))
-        values = [(row.decoded, row.median_px, row.wrong_pixels, row.camera_deg) for row in some]
-        decoded, px, wrong_px, camera = np.nanmedian(np.array(values), axis=0)
+        values = [(r.decoded, r.median_px, r.wrong_pixels, r.slipped_pixels, r.camera_deg) for r in some]
+        decoded, px, wrong_px, slipped, camera = np.nanmedian(np.array(values), axis=0)
         lines.append(
             f"{appearance}: {right / usable:.1%} of the usable frames right, {wrong} wrong ({quiet} of them under good "
-            f"or acceptable); medians over sets: decoded {decoded:.1%}, {px:.2f} px, {wrong_px:.2%} wrong, "
+            f"or acceptable); medians over sets: decoded {decoded:.1%}, {px:.2f} px, {wrong_px:.2%} over 2 px, "
+            f"{slipped:.2%} over 10 px, "
             f"camera {camera:.3f} deg"
         )
     return "\n".join(lines)

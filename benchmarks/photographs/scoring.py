@@ -21,6 +21,7 @@ from sl_nerfstudio.scan import Frame, Scan
 
 WRONG_DEG, WRONG_SHIFT = 3.0, 0.06  # rotation of a device; displacement of the object as a share of its size
 WRONG_PX = 2.0  # error of a decoded pixel
+SLIP_PX = 10.0  # half a period: a pixel of another cell, not one that is merely inaccurate at an edge
 _FEWEST_POINTS = 8  # of the object in a frame that can be judged
 
 
@@ -47,6 +48,10 @@ class DecodingFigures:
     decoded: float  # share
     median_px: float
     wrong: float  # share of the decoded ones that are more than WRONG_PX off
+    slipped: float  # that are more than SLIP_PX off
+
+
+NOTHING_DECODED = DecodingFigures(0.0, float("nan"), float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
@@ -83,8 +88,9 @@ def decoding_figures(work: Path, truth: Truth) -> DecodingFigures:
             errors.append(error[np.isfinite(error)])
     error = np.concatenate(errors)
     if len(error) == 0:
-        return DecodingFigures(0.0, float("nan"), float("nan"))
-    return DecodingFigures(len(error) / lit, float(np.median(error)), float((error > WRONG_PX).mean()))
+        return NOTHING_DECODED
+    wrong, slipped = float((error > WRONG_PX).mean()), float((error > SLIP_PX).mean())
+    return DecodingFigures(len(error) / lit, float(np.median(error)), wrong, slipped)
 
 
 def _placed(found: Frame, true: TrueFrame) -> _Placed:

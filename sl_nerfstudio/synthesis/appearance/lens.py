@@ -53,7 +53,7 @@ def moved(image: Float32[ndarray, "h w 3"], length: float, direction: float) -> 
     if length < 0.1:
         return image
     half = int(np.ceil(length / 2)) + 1
-    steps = np.linspace(-0.5, 0.5, 8 * half) * length
+    steps = ((np.arange(8 * half) + 0.5) / (8 * half) - 0.5) * length
     kernel = np.zeros((2 * half + 1, 2 * half + 1))
     for x, y in zip(half + steps * np.cos(direction), half + steps * np.sin(direction), strict=True):
         i, j = int(y), int(x)
