@@ -38,7 +38,9 @@ class Config:
     resolution: int = 600
     """width of the images, pixels"""
     keep: Path = Path("outputs/photographs")
-    """folder in which captures are kept between runs, and where the scans go"""
+    """folder in which captures are kept between runs"""
+    scans: Path | None = None
+    """folder of the scans made from them; default: scans/ in the folder of the captures"""
     resume: bool = False
     """use the frames that an earlier run decoded; the time is then that of the rest"""
     jobs: int = 4
@@ -77,7 +79,7 @@ def measure(one: CaptureSet, config: Config) -> Row:
     """Process the captures of a set as a user does, and compare."""
     captures = captures_of(one, config.frames, config.resolution, config.keep)
     truth = read_truth(captures, one)
-    output = config.keep / "scans" / captures.name
+    output = (config.scans or config.keep / "scans") / captures.name
     work = output.with_name(output.name + ".work")
     shutil.rmtree(output, ignore_errors=True)
     if not config.resume:
@@ -152,8 +154,8 @@ def text_of(row: Row) -> str:
     return (
         f"{row.name:42} {row.right:3d}/{row.usable:<3d} {len(row.wrong):5d} {row.left_out:4d} {row.decoded:8.1%} "
         f"{row.median_px:6.2f} {row.wrong_pixels:7.2%} {row.slipped_pixels:7.2%} "
-        f"{row.camera_deg:8.3f} {row.within_1_sigma:5.0%} {row.within_2_5_sigma:5.0%}  {row.verdict:10} {row.seconds:4.0f}"
-        + (f"\n    {row.message.splitlines()[0]}" if row.message else "")
+        f"{row.camera_deg:8.3f} {row.within_1_sigma:5.0%} {row.within_2_5_sigma:5.0%}  "
+        f"{row.verdict:10} {row.seconds:4.0f}" + (f"\n    {row.message.splitlines()[0]}" if row.message else "")
     )
 
 
@@ -170,8 +172,7 @@ def summary(rows: list[Row]) -> str:
         lines.append(
             f"{appearance}: {right / usable:.1%} of the usable frames right, {wrong} wrong ({quiet} of them under good "
             f"or acceptable); medians over sets: decoded {decoded:.1%}, {px:.2f} px, {wrong_px:.2%} over 2 px, "
-            f"{slipped:.2%} over 10 px, "
-            f"camera {camera:.3f} deg"
+            f"{slipped:.2%} over 10 px, camera {camera:.3f} deg"
         )
     return "\n".join(lines)
 
