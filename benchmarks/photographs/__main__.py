@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -168,13 +169,19 @@ def summary(rows: list[Row]) -> str:
         wrong = sum(len(row.wrong) for row in some)
         quiet = sum(len(row.wrong) for row in some if row.verdict in ("good", "acceptable"))
         values = [(r.decoded, r.median_px, r.wrong_pixels, r.slipped_pixels, r.camera_deg) for r in some]
-        decoded, px, wrong_px, slipped, camera = np.nanmedian(np.array(values), axis=0)
+        decoded, px, wrong_px, slipped, camera = (_median(column) for column in zip(*values, strict=True))
         lines.append(
             f"{appearance}: {right / usable:.1%} of the usable frames right, {wrong} wrong ({quiet} of them under good "
             f"or acceptable); medians over sets: decoded {decoded:.1%}, {px:.2f} px, {wrong_px:.2%} over 2 px, "
             f"{slipped:.2%} over 10 px, camera {camera:.3f} deg"
         )
     return "\n".join(lines)
+
+
+def _median(values: Sequence[float]) -> float:
+    """Of those that exist."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else float("nan")
 
 
 def chosen_sets(parts: tuple[str, ...]) -> list[CaptureSet]:
