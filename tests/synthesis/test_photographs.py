@@ -90,7 +90,7 @@ def test_same_flags_same_bytes_and_another_seed_another_look(tmp_path, captures)
     assert not np.array_equal(looks[0].material.base, looks[1].material.base)
 
 
-def test_plain_captures_are_those_of_the_first_version():
+def test_plain_captures_are_those_of_the_first_version(tmp_path):
     """Streams 1 to 5 of the seed, and the same light: nothing else has entered the images."""
     assert [s.value for s in Stream][:6] == [1, 2, 3, 4, 5, 6]
     config = SynthConfig(frames=3, resolution=60, seed=9)
@@ -101,10 +101,8 @@ def test_plain_captures_are_those_of_the_first_version():
     direct = render_capture(setup.caster, setup.devices, *at, setup.pattern, setup.appearance, 2)
     assert np.array_equal(direct.radiance, setup.render(1, 2).radiance)
     image = disturb_image(direct.radiance, 1.05, config.sensor_noise, np.random.default_rng([9, 5, 1]))
-    from sl_nerfstudio.synthesis.synthesise import _captured
-
-    frame = _captured(config, setup, 1)
-    assert np.array_equal(frame.image, image) and frame.suffix == ".png"
+    synthesise(replace(config, images_only=True), tmp_path / "captures")
+    assert np.array_equal(read_image(tmp_path / "captures/images/frame_00001.png"), image)
 
 
 def test_a_scan_of_photographs_is_faultless(tmp_path):
