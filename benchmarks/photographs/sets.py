@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.scenes.surroundings import Background
 from sl_nerfstudio.synthesis.synthesise import synthesise
+
+PATTERN = GridPattern(w=920, h=920)
+"""46 x 46 nodes: with the object filling an image of 600 pixels, a period is about 14 of them wide."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,8 @@ def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> 
     root = folder / f"{one.name}-{frames}-{resolution}"
     if root.exists():
         return root
+    pattern = folder / "pattern.json"
+    write_atomic(pattern, PATTERN.encode())
     config = SynthConfig(
         scene=one.scene,
         background=one.background,
@@ -60,6 +67,7 @@ def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> 
         seed=one.seed,
         frames=frames,
         resolution=resolution,
+        pattern=pattern,
         images_only=True,
     )
     # two runs side by side, or one that is interrupted, must not leave half a set under its name
@@ -68,7 +76,12 @@ def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> 
     synthesise(config, started)
     if one.shuffled:
         _shuffle(started / "images", one.seed)
-    started.rename(root)
+    try:
+        started.rename(root)
+    except OSError:
+        if not root.exists():
+            raise
+        shutil.rmtree(started)  # another run was faster
     return root
 
 
