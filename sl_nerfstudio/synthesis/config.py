@@ -18,6 +18,10 @@ class SynthConfig:
     scene: str = "cone-and-cylinder"
     """cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal, or a mesh file (.ply .obj .stl .glb) whose lengths
     are in --units"""
+    appearance: Literal["plain", "realistic", "hard"] = "plain"
+    """plain: grey images of a matte surface; realistic: colour photographs with texture, gloss, defocus, motion, room
+    light, interreflection, changing exposure, gamma, JPEG and, among --images-only, a few useless frames; hard: all of
+    it stronger"""
     background: Literal["none", "table", "walls"] = "none"
     """what stands around the object, lit by the same pattern: nothing, a table, or a table with boards and boxes; the
     devices then stay at least 26 degrees above the table"""

@@ -1,5 +1,6 @@
 """What a camera sees of a scene lit by a projector: exact correspondences, and the reflected light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,35 @@ class RenderedCapture:
     radiance: Float32[ndarray, "h w"]  # 1 is a white surface facing the projector, in its full light
 
 
+@dataclass(frozen=True)
+class SampledView:
+    """What rays through the pixels of a camera meet."""
+
+    at_centres: VisiblePoints  # (h * w) pixels, row by row
+    radiance: Float32[ndarray, "h w *c"]  # mean over each pixel
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the image."""
+        return self.radiance.shape[0], self.radiance.shape[1]
+
+    @property
+    def mask(self) -> Bool[ndarray, "h w"]:
+        """Pixels with coordinates."""
+        return self.at_centres.lit.reshape(self.shape)
+
+    @property
+    def coords(self) -> Float32[ndarray, "h w 2"]:
+        """Exact at pixel centres; NaN outside the mask."""
+        coords = np.full((self.at_centres.lit.size, 2), np.nan, dtype=np.float32)
+        coords[self.at_centres.lit] = self.at_centres.uv_projector[self.at_centres.lit]
+        return coords.reshape(*self.shape, 2)
+
+
+Light = Callable[[VisiblePoints, Int64[ndarray, "n"]], Float32[ndarray, "n *c"]]
+"""Light that the points seen through some pixels (numbered row by row) send to the camera."""
+
+
 def visible_points(
     caster: RayCaster,
     devices: DevicePair,
@@ -66,30 +96,65 @@ def render_capture(
     supersampling: int = 2,
 ) -> RenderedCapture:
     """Render a frame: correspondences at pixel centres, light as the mean of `supersampling`^2 rays per pixel."""
+
+    def light(seen: VisiblePoints, _: Int64[ndarray, "n"]) -> Float32[ndarray, "n"]:
+        return _light(seen, caster.scene, devices, T_world_projector, pattern, appearance)
+
+    nothing = np.float32(appearance.background)
+    centres = visible_centres(caster, devices, T_world_camera, T_world_projector)
+    view = sample_view(caster, devices, T_world_camera, T_world_projector, centres, light, nothing, supersampling)
+    on_object = caster.on_object(centres.face).reshape(view.shape)
+    return RenderedCapture(view.coords, view.mask, on_object, appearance.through_lens(view.radiance))
+
+
+def visible_centres(
+    caster: RayCaster,
+    devices: DevicePair,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+) -> VisiblePoints:
+    """What the rays through all pixel centres meet, row by row."""
+    n = devices.camera.w * devices.camera.h
+    box = np.flatnonzero(_box_of_the_scene(caster.scene, devices, T_world_camera))
+    uv = _corners(devices)[box] + 0.5
+    found = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    hit, lit = np.zeros((2, n), dtype=bool)
+    face, p_world, uv_projector = np.full(n, -1), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
+    hit[box], lit[box], face[box] = found.hit, found.lit, found.face
+    p_world[box], uv_projector[box] = found.p_world, found.uv_projector
+    return VisiblePoints(hit, face, p_world, uv_projector, lit)
+
+
+def sample_view(
+    caster: RayCaster,
+    devices: DevicePair,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+    centres: VisiblePoints,
+    light: Light,
+    nothing: Float32[ndarray, "*c"] | np.float32,
+    supersampling: int,
+) -> SampledView:
+    """Light as the mean of `supersampling`^2 rays per pixel; `nothing` is what is seen where no surface is."""
     w, h = devices.camera.w, devices.camera.h
-    corner = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
-    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
-    mask, hit, on_object = np.zeros((3, h * w), dtype=bool)
-    box = _box_of_the_scene(caster.scene, devices, T_world_camera).reshape(-1)
-    at_centres = visible_points(caster, devices, T_world_camera, T_world_projector, corner[box] + 0.5)
-    mask[box], hit[box] = at_centres.lit, at_centres.hit
-    on_object[box] = caster.on_object(at_centres.face)
-    coords[mask] = at_centres.uv_projector[at_centres.lit]
-    radiance = np.full(h * w, appearance.background, dtype=np.float32)
-    near = _near_a_hit(hit.reshape(h, w)).reshape(-1)
-    light = np.zeros(int(near.sum()), dtype=np.float32)
+    corner = _corners(devices)
+    radiance = np.empty((h * w, *np.shape(nothing)), dtype=np.float32)
+    radiance[:] = nothing
+    near = np.flatnonzero(_near_a_hit(centres.hit.reshape(h, w)))
+    total = np.zeros((len(near), *np.shape(nothing)), dtype=np.float32)
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
         for dx in step:
             seen = visible_points(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
-            light += _light(seen, caster.scene, devices, T_world_projector, pattern, appearance)
-    radiance[near] = light / supersampling**2
-    return RenderedCapture(
-        coords.reshape(h, w, 2),
-        mask.reshape(h, w),
-        on_object.reshape(h, w),
-        appearance.through_lens(radiance.reshape(h, w)),
-    )
+            total += light(seen, near)
+    radiance[near] = total / supersampling**2
+    return SampledView(centres, radiance.reshape(h, w, *np.shape(nothing)))
+
+
+def _corners(devices: DevicePair) -> Int64[ndarray, "n 2"]:
+    """Upper left corners (x, y) of all pixels, row by row."""
+    w, h = devices.camera.w, devices.camera.h
+    return np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
 
 
 def _box_of_the_scene(scene: Scene, devices: DevicePair, T_world_camera: Float[ndarray, "4 4"]) -> Bool[ndarray, "h w"]:
@@ -123,7 +188,7 @@ def _light(
     """Light reflected by a matte surface: from the projector (cosine and inverse-square law) and from the room."""
     out = np.full(len(seen.hit), appearance.background, dtype=np.float32)
     p = seen.p_world[seen.hit]
-    normal = _shading_normals(scene, seen.face[seen.hit], p).astype(np.float32)
+    normal = shading_normals(scene, seen.face[seen.hit], p).astype(np.float32)
     light = appearance.ambient(normal)
     lit = seen.lit[seen.hit]
     uv = seen.uv_projector[seen.hit][lit]
@@ -136,7 +201,7 @@ def _light(
     return out
 
 
-def _shading_normals(scene: Scene, face: Int64[ndarray, "n"], p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+def shading_normals(scene: Scene, face: Int64[ndarray, "n"], p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
     """Normals interpolated between the vertices if the scene has them, else those of the faces."""
     if scene.vertex_normals is None:
         return scene.face_normals[face]

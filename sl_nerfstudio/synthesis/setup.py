@@ -12,11 +12,15 @@ from sl_nerfstudio.pattern.files import read_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 from sl_nerfstudio.scan.types import PoseSigma
+from sl_nerfstudio.synthesis.appearance.look import Look, make_look
 from sl_nerfstudio.synthesis.appearance.plain import Appearance, make_appearance
+from sl_nerfstudio.synthesis.appearance.ranges import RANGES
+from sl_nerfstudio.synthesis.capture_plan import Shot, choose_useless, plan_shots, turn_away
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices
 from sl_nerfstudio.synthesis.noise import Cells
 from sl_nerfstudio.synthesis.paths import DISTANCE, make_paths
+from sl_nerfstudio.synthesis.photograph import Photograph, Stage, take_photograph
 from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, pose_sigma
 from sl_nerfstudio.synthesis.ray_casting import RayCaster
 from sl_nerfstudio.synthesis.render import RenderedCapture, render_capture, visible_points
@@ -37,11 +41,23 @@ class Stream(IntEnum):
     SENSOR = 5
     WORLD = 6
     SURROUNDINGS = 7
+    LOOK = 8
+    SHOTS = 9
+    USELESS = 10
+    AWAY = 11
 
 
 def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Generator:
     """The generator of one use of randomness in one frame."""
     return np.random.default_rng([seed, int(stream), frame])
+
+
+@dataclass(frozen=True)
+class Photography:
+    """How the frames of a scan that is not plain are photographed."""
+
+    look: Look
+    shots: tuple[Shot, ...]
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,7 @@ class Setup:
     layout: PatternLayout | None  # None: the pattern is a plain image
     cells: Cells
     appearance: Appearance
+    photography: Photography | None  # None: plain images
     truth: DevicePoses
     start: DevicePoses
     sigma: PoseSigma | None
@@ -72,6 +89,13 @@ class Setup:
             supersampling,
         )
 
+    def photograph(self, frame: int, supersampling: int, photography: Photography, seed: int) -> Photograph:
+        """Frame number `frame` as a camera takes it."""
+        poses = self.truth.T_world_camera[frame], self.truth.T_world_projector[frame]
+        stage = Stage(self.caster, self.devices, *poses)
+        noise = random_stream(seed, Stream.SENSOR, frame)
+        return take_photograph(stage, photography.look, photography.shots[frame], supersampling, noise)
+
 
 def make_setup(config: SynthConfig) -> Setup:
     """Scene, devices, paths and their errors, as configured. Raises UserError for bad files."""
@@ -85,6 +109,10 @@ def make_setup(config: SynthConfig) -> Setup:
         config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
     )
     devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
+    photography = _make_photography(config, scene, pattern)
+    if photography is not None:
+        away = [random_stream(config.seed, Stream.AWAY, n) for n in range(config.frames)]
+        truth = turn_away(truth, photography.shots, away)
     caster = RayCaster(scene, surroundings)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
@@ -99,6 +127,7 @@ def make_setup(config: SynthConfig) -> Setup:
         layout=layout,
         cells=make_cells(pattern, None if layout is None else layout.lattice),
         appearance=make_appearance(scene, DISTANCE * scene.size, random_stream(config.seed, Stream.TEXTURE)),
+        photography=photography,
         truth=truth,
         start=start,
         sigma=pose_sigma(truth, start, scene.centre),
@@ -119,6 +148,20 @@ def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], Pattern
         return read_pattern(config.pattern)
     grid = GridPattern()
     return grid.render(), grid
+
+
+def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarray, "h w"]) -> Photography | None:
+    """None for plain images. A scan must have coordinates in every frame, so only captures have useless ones."""
+    if config.appearance == "plain":
+        return None
+    ranges, distance = RANGES[config.appearance], DISTANCE * scene.size
+    look_rng = random_stream(config.seed, Stream.LOOK)
+    look = make_look(scene, distance, pattern, config.resolution, ranges, config.sensor_noise, look_rng)
+    useless: frozenset[int] = frozenset()
+    if config.images_only:
+        useless = choose_useless(config.frames, ranges, random_stream(config.seed, Stream.USELESS))
+    rngs = [random_stream(config.seed, Stream.SHOTS, n) for n in range(config.frames)]
+    return Photography(look, plan_shots(ranges, rngs, useless))
 
 
 def _matches(

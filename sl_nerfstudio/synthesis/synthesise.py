@@ -15,9 +15,9 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.atomic import require_empty, write_atomic
-from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.images import as_grey, encode_png
 from sl_nerfstudio.scan.types import PoseSigma, Scale
-from sl_nerfstudio.scan.writing import ScanWriter, device_fields, sigma_fields
+from sl_nerfstudio.scan.writing import ScanWriter, device_fields, encode_json, sigma_fields
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords, disturb_image
 from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
@@ -34,7 +34,9 @@ class SyntheticFrame:
     """One frame as it is written."""
 
     name: str
-    image: UInt8[ndarray, "h w"]
+    image: UInt8[ndarray, "h w *c"]
+    encoded: bytes  # the file that the camera writes
+    suffix: str  # of that file
     pattern: UInt8[ndarray, "h w"]
     coords: Float32[ndarray, "h w 2"]
     mask: Bool[ndarray, "h w"]
@@ -92,24 +94,39 @@ def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
     """Rendered and disturbed frames, one in memory at a time."""
     noise = CoordinateNoise(config.noise, config.missing, config.wrong)
     for index in track(range(config.frames), "rendering", config.frames):
-        rendered = setup.render(index, config.supersampling)
-        sensor, decoder = (random_stream(config.seed, stream, index) for stream in (Stream.SENSOR, Stream.COORDS))
-        image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
-        coords = disturb_coords(rendered.coords, rendered.mask, setup.cells, noise, decoder)
-        pattern = _pattern_image(image, rendered.mask, setup)
-        yield SyntheticFrame(_frame_name(index), image, pattern, coords, rendered.mask, rendered.object_mask)
+        frame = _captured(config, setup, index)
+        decoder = random_stream(config.seed, Stream.COORDS, index)
+        yield replace(frame, coords=disturb_coords(frame.coords, frame.mask, setup.cells, noise, decoder))
+
+
+def _captured(config: SynthConfig, setup: Setup, index: int) -> SyntheticFrame:
+    """One frame with exact coordinates: a grey PNG of a plain scan, else a JPEG in colour."""
+    name = _frame_name(index)
+    if setup.photography is not None:
+        photo = setup.photograph(index, config.supersampling, setup.photography, config.seed)
+        pattern = _pattern_image(as_grey(photo.image), photo.mask, setup)
+        return SyntheticFrame(
+            name, photo.image, photo.jpeg, ".jpg", pattern, photo.coords, photo.mask, photo.object_mask
+        )
+    rendered = setup.render(index, config.supersampling)
+    sensor = random_stream(config.seed, Stream.SENSOR, index)
+    image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
+    pattern = _pattern_image(image / 255, rendered.mask, setup)
+    return SyntheticFrame(
+        name, image, encode_png(image), ".png", pattern, rendered.coords, rendered.mask, rendered.object_mask
+    )
 
 
 def _frame_name(index: int) -> str:
     return f"frame_{index:05d}"
 
 
-def _pattern_image(image: UInt8[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
+def _pattern_image(grey: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], setup: Setup) -> UInt8[ndarray, "h w"]:
     """The captured image without albedo, shading and fall-off."""
     # both devices are about equally far away, so the focal lengths give the apparent size of a period
     period = setup.cells.period * setup.devices.camera.fl_x / setup.devices.projector.fl_x
     mean, contrast = float(setup.pattern.mean()), float(setup.pattern.std())
-    return _to_8_bit(normalise_locally(image / 255, mask, _WINDOW * period, mean, contrast))
+    return _to_8_bit(normalise_locally(grey, mask, _WINDOW * period, mean, contrast))
 
 
 def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
@@ -177,6 +194,20 @@ def _encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
     return encode_png(mask.astype(np.uint8) * np.uint8(255))
 
 
+def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
+    """Which frames are of use, and what the others lack."""
+    shots = [None] * config.frames if setup.photography is None else setup.photography.shots
+    frames = [
+        {
+            "name": _frame_name(index),
+            "usable": shot is None or shot.fault is None,
+            "fault": None if shot is None else shot.fault,
+        }
+        for index, shot in enumerate(shots)
+    ]
+    return {"appearance": config.appearance, "background": config.background, "frames": frames}
+
+
 def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
     """The images that a decoder starts from, and separately the scan that it should produce."""
     exact = replace(config, noise=0.0, missing=0.0, wrong=0.0, pose_sigma=False)
@@ -184,7 +215,8 @@ def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
             truth.add_file(_object_mask_path(frame), _encode_mask(frame.object_mask))
-            write_atomic(output / "images" / f"{frame.name}.png", encode_png(frame.image))
+            write_atomic(output / "images" / f"{frame.name}{frame.suffix}", frame.encoded)
+        truth.add_file("captures.json", encode_json(_captures_document(config, setup)))
         _add_files(truth, exact, setup, "")
     write_atomic(output / "pattern.png", encode_png(_to_8_bit(setup.pattern)))
     if setup.layout is not None:

@@ -42,7 +42,16 @@ def test_help_is_there_without_slow_imports():
     assert done.returncode == 0, done.stderr
     assert done.stdout.rstrip().endswith("imported []")
     flags = "output scene frames resolution pose-error autocalibration-error noise missing wrong seed units clean"
-    for flag in [*flags.split(), "projector-model", "images-only", "world-turn", "path", "pattern"]:
+    for flag in [
+        *flags.split(),
+        "projector-model",
+        "images-only",
+        "appearance",
+        "background",
+        "world-turn",
+        "path",
+        "pattern",
+    ]:
         assert f"--{flag}" in done.stdout, flag
 
 

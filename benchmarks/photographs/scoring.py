@@ -1,0 +1,141 @@
+"""What a scan made of photographs is worth, against the truth.
+
+A scan's gauge is free. It is aligned with the truth by the similarity that most frames agree with, so that a frame that
+is far off does not tilt the others. What is compared is where a frame puts the points of the object, which depends on
+both its poses and on its baseline, and how its devices are turned.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.photographs.truth import TrueFrame, Truth
+from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
+from sl_nerfstudio.scan import Frame, Scan
+
+WRONG_DEG, WRONG_SHIFT = 3.0, 0.06  # rotation of a device; displacement of the object as a share of its size
+WRONG_PX = 2.0  # error of a decoded pixel
+SLIP_PX = 10.0  # half a period: a pixel of another cell, not one that is merely inaccurate at an edge
+_FEWEST_POINTS = 8  # of the object in a frame that can be judged
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How far one frame of a scan is off."""
+
+    name: str
+    camera_deg: float
+    projector_deg: float
+    shift: float  # of the object, as a share of its size
+    over_sigma: float  # camera rotation error per axis over the stated sigma; NaN if none is stated
+
+    @property
+    def right(self) -> bool:
+        """Whether the frame is where it belongs."""
+        return max(self.camera_deg, self.projector_deg) <= WRONG_DEG and self.shift <= WRONG_SHIFT
+
+
+@dataclass(frozen=True)
+class DecodingFigures:
+    """Lit pixels of the object in the usable frames."""
+
+    decoded: float  # share
+    median_px: float
+    wrong: float  # share of the decoded ones that are more than WRONG_PX off
+    slipped: float  # that are more than SLIP_PX off
+
+
+NOTHING_DECODED = DecodingFigures(0.0, float("nan"), float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """One frame of the scan beside its truth."""
+
+    found: Frame
+    true: TrueFrame
+    p_scan: Float[ndarray, "n 3"]
+    p_true: Float[ndarray, "n 3"]
+
+
+def pose_errors(scan: Scan, truth: Truth) -> list[PoseError]:
+    """Errors of the frames in the scan that show the object, after the alignment that most frames agree with."""
+    placed = [_placed(frame, truth.frames[frame.name]) for frame in scan.frames]
+    placed = [p for p in placed if len(p.p_true) >= _FEWEST_POINTS]
+    if not placed:
+        return []
+    S_truth_scan = _consensus(placed, truth.size)
+    return [_error(p, S_truth_scan, truth.size) for p in placed]
+
+
+def decoding_figures(work: Path, truth: Truth) -> DecodingFigures:
+    """Figures of the maps that sl-process kept in its work folder; a frame that it did not decode has no pixels."""
+    kept = json.loads((work / "manifest.json").read_text())["frames"]
+    lit, errors = 0, [np.zeros(0)]
+    for name in truth.usable:
+        coords = truth.frames[name].object_coords()
+        lit += int(np.isfinite(coords[..., 0]).sum())
+        key = kept.get(name, {}).get("key")
+        if key:
+            with np.load(work / "decoded" / f"{name}-{key}.npz") as stored:
+                error = np.linalg.norm(stored["coords"] - coords, axis=-1)
+            errors.append(error[np.isfinite(error)])
+    error = np.concatenate(errors)
+    if len(error) == 0:
+        return NOTHING_DECODED
+    wrong, slipped = float((error > WRONG_PX).mean()), float((error > SLIP_PX).mean())
+    return DecodingFigures(len(error) / lit, float(np.median(error)), wrong, slipped)
+
+
+def _placed(found: Frame, true: TrueFrame) -> _Placed:
+    p_scan = true.triangulated(found.T_world_camera, found.T_world_projector)
+    p_true = true.triangulated(true.frame.T_world_camera, true.frame.T_world_projector)
+    known = np.isfinite(p_scan).all(1) & np.isfinite(p_true).all(1)
+    return _Placed(found, true, p_scan[known], p_true[known])
+
+
+def _consensus(placed: Sequence[_Placed], size: float) -> Similarity:
+    """The similarity with which most frames are right, refined with these; each frame counts alike.
+
+    Every frame alone and every pair of frames proposes one: a frame has thousands of points in space.
+    """
+    groups = [[p] for p in placed] + [[p, q] for k, p in enumerate(placed) for q in placed[k + 1 :]]
+    best: tuple[int, float] = (-1, 0.0)
+    chosen = Similarity.identity()
+    for group in groups:
+        S = _fitted(group)
+        errors = [_error(p, S, size) for p in placed]
+        right = [e.shift for e in errors if e.right]
+        score = len(right), -float(np.median(right)) if right else 0.0
+        if score > best:
+            best, chosen = score, S
+    for _ in range(3):
+        right = [p for p in placed if _error(p, chosen, size).right]
+        chosen = _fitted(right) if right else chosen
+    return chosen
+
+
+def _fitted(group: Sequence[_Placed]) -> Similarity:
+    """Maps the scan's points onto the true ones."""
+    weights = np.concatenate([np.full(len(p.p_true), 1 / len(p.p_true)) for p in group])
+    scan, true = (np.concatenate(parts) for parts in zip(*[(p.p_scan, p.p_true) for p in group], strict=True))
+    return fit_similarity(scan, true, weights=weights)
+
+
+def _error(placed: _Placed, S_truth_scan: Similarity, size: float) -> PoseError:
+    found, true = placed.found, placed.true.frame
+    camera = _turn_deg(S_truth_scan.R @ found.T_world_camera[:3, :3], true.T_world_camera[:3, :3])
+    projector = _turn_deg(S_truth_scan.R @ found.T_world_projector[:3, :3], true.T_world_projector[:3, :3])
+    shift = np.linalg.norm(S_truth_scan.points(placed.p_scan) - placed.p_true, axis=1)
+    sigma = float("nan") if found.pose_sigma is None else found.pose_sigma.camera_rotation_deg
+    return PoseError(found.name, camera, projector, float(np.median(shift)) / size, camera / np.sqrt(3) / sigma)
+
+
+def _turn_deg(R: Float[ndarray, "3 3"], true: Float[ndarray, "3 3"]) -> float:
+    return float(np.degrees(Rotation.from_matrix(true.T @ R).magnitude()))

@@ -1,0 +1,102 @@
+"""The sets of captures: scenes, appearances and surroundings that no network was trained on."""
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.atomic import write_atomic
+from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.scenes.surroundings import Background
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+PATTERN = GridPattern(w=920, h=920)
+"""46 x 46 nodes: with the object filling an image of 600 pixels, a period is about 14 of them wide."""
+
+
+@dataclass(frozen=True)
+class CaptureSet:
+    """One set; `shuffled` ones come in random order, which sl-process is told only if `unordered`."""
+
+    scene: str
+    background: Background
+    appearance: AppearanceKind
+    seed: int
+    shuffled: bool = False
+    unordered: bool = False
+
+    @property
+    def name(self) -> str:
+        """Unique, and changes with everything that changes the images."""
+        return f"{self.scene}-{self.background}-{self.appearance}-{self.seed}{'-shuffled' if self.shuffled else ''}"
+
+
+SETS = (
+    CaptureSet("frog", "none", "plain", 501),
+    CaptureSet("dog", "table", "plain", 502),
+    CaptureSet("vase", "walls", "plain", 503),
+    CaptureSet("chair", "none", "plain", 504, shuffled=True),
+    CaptureSet("head", "table", "realistic", 505),
+    CaptureSet("chair", "table", "realistic", 506),
+    CaptureSet("leaf", "walls", "realistic", 507),
+    CaptureSet("medal", "table", "realistic", 508),
+    CaptureSet("dog", "none", "realistic", 509, shuffled=True, unordered=True),
+    CaptureSet("vase", "none", "realistic", 510),
+    CaptureSet("frog", "walls", "hard", 511),
+    CaptureSet("leaf", "table", "hard", 512),
+    CaptureSet("chair", "walls", "hard", 513),
+    CaptureSet("cone-and-cylinder", "none", "hard", 514),
+)
+
+
+def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> Path:
+    """The captures of a set below `folder`, rendered unless an earlier run did so completely."""
+    root = folder / f"{one.name}-{frames}-{resolution}"
+    if root.exists():
+        return root
+    pattern = folder / "pattern.json"
+    write_atomic(pattern, PATTERN.encode())
+    config = SynthConfig(
+        scene=one.scene,
+        background=one.background,
+        appearance=one.appearance,
+        seed=one.seed,
+        frames=frames,
+        resolution=resolution,
+        pattern=pattern,
+        images_only=True,
+    )
+    # two runs side by side, or one that is interrupted, must not leave half a set under its name
+    started = folder / f".{root.name}-{os.getpid()}"
+    shutil.rmtree(started, ignore_errors=True)
+    synthesise(config, started)
+    if one.shuffled:
+        _shuffle(started / "images", one.seed)
+    try:
+        started.rename(root)
+    except OSError:
+        if not root.exists():
+            raise
+        shutil.rmtree(started)  # another run was faster
+    return root
+
+
+def frame_names(one: CaptureSet, frames: int) -> dict[str, int]:
+    """Number in the truth of each image of a set."""
+    order = np.random.default_rng(one.seed).permutation(frames) if one.shuffled else np.arange(frames)
+    return {_image_name(one, place): int(number) for place, number in enumerate(order)}
+
+
+def _image_name(one: CaptureSet, place: int) -> str:
+    return f"photo_{place:03d}" if one.shuffled else f"frame_{place:05d}"
+
+
+def _shuffle(images: Path, seed: int) -> None:
+    """New names in random order."""
+    found = sorted(images.iterdir())
+    for place, number in enumerate(np.random.default_rng(seed).permutation(len(found))):
+        found[number].rename(images / f"photo_{place:03d}{found[number].suffix}")

@@ -1,0 +1,165 @@
+"""The benchmark of photographs: what it calls right, wrong and decoded, on scans with errors made on purpose."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.photographs.__main__ import chosen_sets, row_of, summary, text_of
+from benchmarks.photographs.scoring import decoding_figures, pose_errors
+from benchmarks.photographs.sets import SETS, CaptureSet, captures_of, frame_names
+from benchmarks.photographs.truth import read_truth
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.types import PoseSigma
+
+_SET = CaptureSet("cone-and-cylinder", "table", "plain", 3, shuffled=True)
+_GAUGE = Similarity(0.37, Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([30.0, -5.0, 8.0]))
+_SIGMA = PoseSigma(0.1, 0.05, 0.1, 0.05)
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    return captures_of(_SET, 7, 72, tmp_path_factory.mktemp("sets"))
+
+
+@pytest.fixture(scope="module")
+def truth(captures):
+    return read_truth(captures, _SET)
+
+
+def _scan(captures, moved=None, names=None):
+    """The truth in another gauge under the names of the images, some frames moved by a function of both poses."""
+    scan = read_scan(captures / "ground_truth")
+    frames = []
+    for name, number in frame_names(_SET, 7).items():
+        if names is not None and name not in names:
+            continue
+        T = scan.frames[number].T_world_camera, scan.frames[number].T_world_projector
+        T = (moved or {}).get(name, lambda *poses: poses)(*T)
+        camera, projector = (_GAUGE.poses(pose) for pose in T)
+        frame = replace(scan.frames[number], name=name, T_world_camera=camera, T_world_projector=projector)
+        frames.append(replace(frame, pose_sigma=_SIGMA))
+    return replace(scan, frames=tuple(frames))
+
+
+def _turned(degrees, axis=(0.0, 0.0, 1.0)):
+    """A motion of a frame as a whole about the world's origin, which is near the object."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix()
+    return lambda camera, projector: (T @ camera, T @ projector)
+
+
+def _with_baseline(factor):
+    def move(camera, projector):
+        other = projector.copy()
+        other[:3, 3] = camera[:3, 3] + factor * (projector[:3, 3] - camera[:3, 3])
+        return camera, other
+
+    return move
+
+
+def _with_projector_turned(degrees):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, 0, np.radians(degrees)]).as_matrix()
+    return lambda camera, projector: (camera, projector @ T)
+
+
+def test_a_perfect_scan_in_any_gauge_is_right(captures, truth):
+    errors = pose_errors(_scan(captures), truth)
+    assert len(errors) == 7 and all(e.right for e in errors)
+    assert max(e.camera_deg for e in errors) < 1e-5 and max(e.shift for e in errors) < 1e-6
+    assert truth.size == pytest.approx(80)
+
+
+@pytest.mark.parametrize(
+    ("move", "right"),
+    [
+        (_turned(25.0), False),
+        (_turned(2.0), True),
+        (_turned(4.0), False),
+        (_with_baseline(1.1), False),
+        (_with_baseline(1.005), True),
+        (_with_projector_turned(3.5), False),
+    ],
+)
+def test_a_stray_is_found_and_tilts_no_other_frame(captures, truth, move, right):
+    errors = {e.name: e for e in pose_errors(_scan(captures, {"photo_002": move}), truth)}
+    assert errors["photo_002"].right == right
+    others = [e for name, e in errors.items() if name != "photo_002"]
+    assert all(e.right for e in others)
+    if not right:
+        assert max(e.camera_deg for e in others) < 1e-3
+
+
+def test_strays_that_agree_with_each_other_are_still_strays(captures, truth):
+    moved = dict.fromkeys(("photo_000", "photo_003", "photo_005"), _turned(40.0, (0.0, 1.0, 0.0)))
+    errors = pose_errors(_scan(captures, moved), truth)
+    assert {e.name for e in errors if not e.right} == set(moved)
+
+
+def test_the_error_over_sigma_is_that_of_one_axis(captures, truth):
+    moved = {name: _turned(angle) for name, angle in zip(sorted(truth.frames), [0.3, *[0.0] * 6], strict=True)}
+    error = next(e for e in pose_errors(_scan(captures, moved), truth) if e.name == sorted(truth.frames)[0])
+    assert error.over_sigma == pytest.approx(error.camera_deg / np.sqrt(3) / 0.05)
+    assert 0.2 < error.camera_deg < 0.3, "a seventh of it goes into the alignment"
+
+
+def test_images_are_shuffled_and_the_truth_knows_how(captures, truth):
+    assert sorted(truth.frames) == [f"photo_{n:03d}" for n in range(7)]
+    numbers = [frame_names(_SET, 7)[name] for name in sorted(truth.frames)]
+    assert sorted(numbers) == list(range(7)) and numbers != sorted(numbers)
+    for name, frame in truth.frames.items():
+        assert np.array_equal(read_image(captures / "images" / f"{name}.png"), frame.frame.read_image())
+
+
+def test_decoded_pixels_of_the_object_are_counted(captures, truth, tmp_path):
+    """A quarter of the pixels missing, one in ten off by 5 pattern pixels, the rest off by 0.3; one frame refused."""
+    rng = np.random.default_rng(0)
+    kept, lit, lit_of_refused = {}, 0, 0
+    (tmp_path / "decoded").mkdir()
+    for name, frame in truth.frames.items():
+        coords = frame.frame.read_coords().copy()
+        own = np.isfinite(frame.object_coords()[..., 0])
+        lit += own.sum()
+        assert 0 < own.sum() < np.isfinite(coords[..., 0]).sum(), "the table is not the object"
+        if name == "photo_004":
+            kept[name] = {"key": "", "status": "failed in decoding"}
+            lit_of_refused = own.sum()
+            continue
+        draw = rng.random(own.shape)
+        coords[..., 0] += np.where(draw < 0.1, 5.0, 0.3)
+        coords[draw > 0.75] = np.nan
+        np.savez(tmp_path / "decoded" / f"{name}-k.npz", coords=coords)
+        kept[name] = {"key": "k", "status": "decoded"}
+    (tmp_path / "manifest.json").write_text(json.dumps({"frames": kept}))
+    figures = decoding_figures(tmp_path, truth)
+    assert figures.decoded == pytest.approx(0.75 * (1 - lit_of_refused / lit), abs=0.02)
+    assert figures.median_px == pytest.approx(0.3, abs=1e-3)
+    assert figures.wrong == pytest.approx(0.1 / 0.75, abs=0.02) and figures.slipped == 0
+
+
+def test_a_row_counts_frames_and_a_failed_run_has_none_right(captures, truth):
+    scan = _scan(captures, {"photo_001": _turned(90.0)}, names=[f"photo_{n:03d}" for n in range(5)])
+    kept = tuple(frame.name for frame in scan.frames)
+    row = row_of(_SET, truth, kept, pose_errors(scan, truth), None, "good", 1.0, "")
+    assert (row.right, row.wrong, row.left_out, row.usable) == (4, ("photo_001",), 2, 7)
+    assert "1 of them under good or acceptable" in summary([row])
+    failed = row_of(_SET, truth, (), [], None, "-", 1.0, "error: 1 of 7 frames could be used\nmore")
+    assert (failed.right, failed.wrong, failed.left_out) == (0, (), 7)
+    assert text_of(failed).endswith("\n    error: 1 of 7 frames could be used")
+
+
+def test_the_sets_cover_what_they_should():
+    assert len({one.name for one in SETS}) == len(SETS) >= 12
+    count = {a: sum(one.appearance == a for one in SETS) for a in ("plain", "realistic", "hard")}
+    assert count["plain"] >= 4 and count["realistic"] >= 5 and count["hard"] >= 3
+    assert {one.background for one in SETS} == {"none", "table", "walls"}
+    assert any(one.shuffled and one.unordered for one in SETS) and any(one.shuffled > one.unordered for one in SETS)
+    assert [one.scene for one in chosen_sets(("medal",))] == ["medal"] and chosen_sets(()) == list(SETS)
+    with pytest.raises(UserError, match="--sets teapot: no set is named so"):
+        chosen_sets(("frog", "teapot"))
