@@ -1,12 +1,14 @@
 """Sentences for what relative pose estimation and registration found out about frames."""
 
+from collections.abc import Sequence
+
 from sl_nerfstudio.registration.result import (
-    AmbiguousPose,
     Exclusion,
-    InconsistentPair,
     NoCommonSurface,
+    SeparateComponent,
     SurfaceDisagrees,
     Uncertainty,
+    UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
 
@@ -46,11 +48,11 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         )
     if isinstance(exclusion, NoCommonSurface):
         return "no other frame shows any of its surface; capture views in between"
-    if isinstance(exclusion, InconsistentPair):
-        return (
-            f"its best partner, {exclusion.partner}, contradicts the pose that other frames give it, or is not "
-            "connected to them either; capture views in between"
-        )
+    if isinstance(exclusion, SeparateComponent):
+        others = [name for name in exclusion.component if name != exclusion.frame]
+        group = f"it and {_listed(others)} form a group whose" if others else "its"
+        remedy = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
+        return f"{group} connection to the other frames is not certain; capture views {remedy}"
     return (
         f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "
         f"{exclusion.fitness:.0%} of what both saw agrees (needed: {exclusion.least_overlap:.0%} and "
@@ -60,9 +62,18 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
 
 def uncertainty_sentence(uncertainty: Uncertainty) -> str:
     """What is uncertain about a registered frame."""
-    if isinstance(uncertainty, AmbiguousPose):
-        return f"{uncertainty.frame}: a clearly different pose fits nearly as well (symmetric surface?)"
+    if isinstance(uncertainty, UndecidedProjector):
+        return (
+            f"{uncertainty.frame}: two poses of the projector, {uncertainty.angle_deg:.0f} degrees apart, explain its "
+            "coordinates, and the other frames do not decide between them"
+        )
     return (
-        f"{uncertainty.frame}: its rotation is known only to {uncertainty.sigma_deg:.1f} degrees (surface of "
-        "revolution?)"
+        f"{uncertainty.frame}: it may slip along the surface; its rotation is known only to "
+        f"{uncertainty.sigma_deg:.1f} degrees (surface of revolution, or plane?)"
     )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Some names in a sentence."""
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
