@@ -7,6 +7,7 @@ the scan, and written. A frame that fails is left out, with its reason. The scan
 from collections.abc import Callable, Sequence
 
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
 from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
@@ -18,7 +19,7 @@ from sl_nerfstudio.processing.result import ProcessResult, with_object_only
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
 from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
 from sl_nerfstudio.processing.selection.object_words import object_sentences
-from sl_nerfstudio.processing.summary import compare_registered, summarise
+from sl_nerfstudio.processing.summary import summarise
 from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
@@ -51,9 +52,10 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
     _require_registered(config, inputs, results, registration, make_report)
 
-    poses = find_scan_poses(clouds, registration, inputs.known, given)
-    cross = compare_registered(clouds, registration, poses.adjusted)
-    result = summarise(config, job.decoder.name, results, registration, poses, cross)
+    consistent = adjust_consistent(clouds, registration, log)
+    registration = consistent.registration
+    poses = find_scan_poses(clouds, registration, consistent.adjusted, inputs.known, given)
+    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross)
     if config.object_only:
         found = find_object_only(job, results, registration, poses)
         log("object only: " + "\n    ".join(object_sentences(found)))

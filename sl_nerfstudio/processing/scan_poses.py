@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames, adjust_registered
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.given_poses import GivenPoses, align_to
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
@@ -22,15 +22,19 @@ class ScanPoses:
 
 
 def find_scan_poses(
-    clouds: Sequence[FrameCloud], registration: Registration, known: KnownLength | None, given: GivenPoses | None
+    clouds: Sequence[FrameCloud],
+    registration: Registration,
+    adjusted: AdjustedFrames,
+    known: KnownLength | None,
+    given: GivenPoses | None,
 ) -> ScanPoses:
-    """Adjust all registered frames together, then bring them to the axes and the unit that are known.
+    """The adjusted poses in the axes and the unit that are known.
 
     A known length overrules the unit of given poses. Raises UserError if it is in a frame that cannot be used.
     """
     if known is not None:
         _require_frames(known, clouds)
-    poses = ScanPoses(adjust_registered(clouds, registration), "arbitrary", Scale(False))
+    poses = ScanPoses(adjusted, "arbitrary", Scale(False))
     if given is not None:
         poses = _in_given_axes(poses, registration, given)
     if known is not None:

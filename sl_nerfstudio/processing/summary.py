@@ -8,7 +8,6 @@ import numpy as np
 
 from sl_nerfstudio import __version__
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
@@ -16,12 +15,10 @@ from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration, UncertainRotation
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
 from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
 from sl_nerfstudio.verdict.judge import judge_scan
-from sl_nerfstudio.verdict.scan_agreement import compare_frames
 
 _ALONE = "too few other frames could be used"
 
@@ -77,18 +74,6 @@ def summarise(
             )
         ),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
-    )
-
-
-def compare_registered(
-    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames
-) -> CrossFrameAgreement:
-    """Coordinates of all registered frames against each other; the poses count as exact, so that errors show."""
-    index = np.flatnonzero(registration.registered)
-    chosen = [clouds[k] for k in index]
-    poses = DevicePoses(adjusted.poses.T_world_camera[index], adjusted.poses.T_world_projector[index])
-    return compare_frames(
-        [c.camera for c in chosen], clouds[0].projector, poses, [c.coords for c in chosen], [None] * len(chosen)
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from sl_nerfstudio.registration.result import (
+    CoordinatesDisagree,
     Exclusion,
     NoCommonSurface,
     SeparateComponent,
@@ -48,6 +49,12 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         )
     if isinstance(exclusion, NoCommonSurface):
         return "no other frame shows any of its surface; capture views in between"
+    if isinstance(exclusion, CoordinatesDisagree):
+        others = [name for name in exclusion.group if name != exclusion.frame]
+        who = (
+            f"its coordinates and those of {_listed(others)} agree with each other but" if others else "its coordinates"
+        )
+        return f"{who} contradict those of the other frames wherever these place it; capture this view again"
     if isinstance(exclusion, SeparateComponent):
         others = [name for name in exclusion.component if name != exclusion.frame]
         group = f"it and {_listed(others)} form a group whose" if others else "its"

@@ -54,7 +54,15 @@ class PoorPair:
     least_fitness: float
 
 
-Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair
+@dataclass(frozen=True)
+class CoordinatesDisagree:
+    """A frame was left out after the joint adjustment: its coordinates contradict those of the other frames."""
+
+    frame: str
+    group: tuple[str, ...]  # frames that agree with each other but not with the rest
+
+
+Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair | CoordinatesDisagree
 """Why a frame was not registered."""
 
 

@@ -1,0 +1,99 @@
+"""Registration and joint adjustment re-examined: frames whose coordinates contradict the others are taken out.
+
+Registration compares surfaces, which are known only as well as each frame's own relative pose. After the joint
+adjustment the coordinates themselves can be compared, through both devices of every pair of frames, and a wrong frame
+that surfaces could not tell from a right one stands out.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames, adjust_registered
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration
+from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
+from sl_nerfstudio.verdict.blocks import agreeing_groups
+from sl_nerfstudio.verdict.scan_agreement import compare_frames
+
+_ROUNDS = 4
+_FEWEST = 2  # frames of a scan
+
+
+@dataclass(frozen=True)
+class ConsistentFrames:
+    """Frames that agree with each other, adjusted together."""
+
+    registration: Registration
+    adjusted: AdjustedFrames
+    cross: CrossFrameAgreement  # of the registered frames, in their order
+
+
+def adjust_consistent(
+    clouds: Sequence[FrameCloud], registration: Registration, log: Callable[[str], None]
+) -> ConsistentFrames:
+    """Adjust all registered frames, and again without those that contradict the largest group that agrees.
+
+    Raises UserError if fewer than two frames are registered.
+    """
+    found = _adjusted(clouds, registration)
+    for _ in range(_ROUNDS):
+        groups = agreeing_groups(found.cross)
+        index = np.flatnonzero(found.registration.registered)
+        lost = [[int(index[k]) for k in group] for group in groups[1:]]
+        if not lost or len(index) - sum(map(len, lost)) < _FEWEST:
+            break
+        names = ", ".join(registration.names[k] for group in lost for k in group)
+        log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")
+        found = _adjusted(clouds, without_groups(found.registration, lost))
+    return found
+
+
+def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) -> Registration:
+    """The registration with groups of frames as components of their own."""
+    registered, component = registration.registered.copy(), registration.component.copy()
+    T, baseline, fitness = (
+        registration.T_world_camera.copy(),
+        registration.baseline.copy(),
+        registration.fitness.copy(),
+    )
+    exclusions = list(registration.exclusions)
+    number = int(component.max()) + 1
+    for group in groups:
+        frames = list(group)
+        names = tuple(registration.names[k] for k in frames)
+        exclusions += [CoordinatesDisagree(name, names) for name in names]
+        registered[frames] = False
+        T[frames], baseline[frames], fitness[frames] = np.nan, np.nan, np.nan
+        component[frames] = number if len(frames) > 1 else -1
+        number += len(frames) > 1
+    names = {registration.names[k] for group in groups for k in group}
+    return replace(
+        registration,
+        registered=registered,
+        component=component,
+        T_world_camera=T,
+        baseline=baseline,
+        fitness=fitness,
+        exclusions=tuple(exclusions),
+        uncertainties=tuple(u for u in registration.uncertainties if u.frame not in names),
+    )
+
+
+def _adjusted(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
+    adjusted = adjust_registered(clouds, registration)
+    return ConsistentFrames(registration, adjusted, compare_registered(clouds, registration, adjusted))
+
+
+def compare_registered(
+    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames
+) -> CrossFrameAgreement:
+    """Coordinates of all registered frames against each other; the poses count as exact, so that errors show."""
+    index = np.flatnonzero(registration.registered)
+    chosen = [clouds[k] for k in index]
+    poses = DevicePoses(adjusted.poses.T_world_camera[index], adjusted.poses.T_world_projector[index])
+    return compare_frames(
+        [c.camera for c in chosen], clouds[0].projector, poses, [c.coords for c in chosen], [None] * len(chosen)
+    )
