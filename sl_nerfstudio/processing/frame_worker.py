@@ -54,6 +54,12 @@ def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
     return [result.cloud for result in results if result.cloud is not None]
 
 
+def with_clouds(results: Sequence[FrameStageResult], clouds: Sequence[FrameCloud]) -> list[FrameStageResult]:
+    """The results with other clouds of the same frames, in the order of `clouds_of`."""
+    found = iter(clouds)
+    return [result if result.cloud is None else replace(result, cloud=next(found)) for result in results]
+
+
 class FrameWorker:
     """Decodes and calibrates frames one after the other."""
 

@@ -6,11 +6,14 @@ the scan, and written. A frame that fails is left out, with its reason. The scan
 
 from collections.abc import Callable, Sequence
 
+from jaxtyping import Float64
+from numpy import ndarray
+
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
 from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage
-from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
 from sl_nerfstudio.processing.preview import Preview
@@ -21,8 +24,10 @@ from sl_nerfstudio.processing.selection.object_only import find_object_only, wit
 from sl_nerfstudio.processing.selection.object_words import object_sentences
 from sl_nerfstudio.processing.summary import summarise
 from sl_nerfstudio.processing.writing import write_scan
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.projector_choice import ProjectorChoice, choose_projectors
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.result import Registration, with_undecided
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]
@@ -48,7 +53,11 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     clouds = clouds_of(results)
     given = _given_for_clouds(inputs.given, results)
     start = None if given is None else given.T_world_camera
-    registration = register(clouds, not config.unordered, config.seed, start, log)
+    choice, registration = _register(clouds, not config.unordered, config.seed, start, log)
+    if not (config.unordered or registration.ordered):
+        log("the frames do not follow each other in the order of capture: --unordered says so")
+        choice, registration = _register(clouds, False, config.seed, start, log)
+    clouds, results = list(choice.clouds), with_clouds(results, choice.clouds)
     log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
     _require_registered(config, inputs, results, registration, make_report)
 
@@ -64,6 +73,14 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(config.output, job, results, poses, result, make_report)
     return result
+
+
+def _register(
+    clouds: Sequence[FrameCloud], sequence: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
+) -> tuple[ProjectorChoice, Registration]:
+    """The pose of every frame's projector where several are possible, then the poses of the frames."""
+    choice = choose_projectors(clouds, sequence, seed)
+    return choice, with_undecided(register(choice.clouds, sequence, seed, start, log), choice.undecided)
 
 
 def _require_clouds(

@@ -8,9 +8,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.assembly import Component
-from sl_nerfstudio.registration.edge_weights import is_accepted, is_ambiguous, quality
 from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.edge_weights import is_accepted, is_ambiguous, quality
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.surface_agreement import Tolerance, agreement_at
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.result import (
     Edge,
@@ -23,11 +24,10 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     Uncertainty,
 )
-from sl_nerfstudio.registration.surface_agreement import Tolerance, agreement_at
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
 
-def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
+def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
     """Poses and baselines of the largest component; every other frame with its reason."""
     edges, settings = graph.edges, graph.settings
     components = graph.assemble()
@@ -60,6 +60,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph) -> Registration:
             for k in np.flatnonzero(~registered).tolist()
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
+        ordered,
     )  # fmt: skip
 
 

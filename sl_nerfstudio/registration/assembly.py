@@ -13,16 +13,26 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.edge_weights import edge_weights, quality
 from sl_nerfstudio.registration.graph_residuals import Pivots, node_at
-from sl_nerfstudio.registration.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.increments import log_at
+from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings
-from sl_nerfstudio.registration.surface_agreement import Side, Tolerance, agreement
 
 Component = dict[int, Similarity]  # S_component_camera of each frame
-Link = tuple[Similarity, float]  # a similarity between two components that a pair says, and its quality
+
+
+@dataclass(frozen=True)
+class Link:
+    """A similarity between two components that a pair across says."""
+
+    S_first_second: Similarity
+    quality: float
+    edge: PairMatch
+    best: bool  # of the pair: False for a rival
 
 
 @dataclass(frozen=True)
@@ -105,11 +115,12 @@ class Assembly:
     def _joints(self, first: Component, second: Component) -> list[Joint]:
         """The clearly different similarities between two components that pairs across say, with their votes."""
         links = [self._links(e, first, second) for e in self._crossing(first, second)]
-        distinct: list[Similarity] = []
-        for S, _ in sorted((one for link in links for one in link), key=lambda one: -one[1]):
-            if all(self._differ(S, other, second) for other in distinct):
-                distinct.append(S)
-        return [self._judge(first, second, S, links) for S in distinct[: self._settings.assembly.most_compared]]
+        distinct: list[Link] = []
+        for link in sorted((one for of_pair in links for one in of_pair), key=lambda one: -one.quality):
+            if not any(self._same(link, other.S_first_second, first, second) for other in distinct):
+                distinct.append(link)
+        most = self._settings.assembly.most_compared
+        return [self._judge(first, second, one.S_first_second, links) for one in distinct[:most]]
 
     def _crossing(self, first: Component, second: Component) -> list[PairMatch]:
         return [
@@ -124,16 +135,32 @@ class Assembly:
         target, source = (e.target, e.source) if forward else (e.source, e.target)
         best = e.overlap * e.fitness**2
         results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
-        return [(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q) for S, q in results]
+        return [
+            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q, e, k == 0)
+            for k, (S, q) in enumerate(results)
+        ]
+
+    def _same(self, link: Link, S: Similarity, first: Component, second: Component) -> bool:
+        """Whether a similarity is that of a link, to within the uncertainty of its pair."""
+        if not self._differ(S, link.S_first_second, second):
+            return True
+        if not link.best:
+            return False
+        e = link.edge
+        T = S if e.source in second else S.inverse()
+        own, other = (first, second) if e.source in second else (second, first)
+        D = own[e.target].inverse() @ T @ other[e.source] @ e.S_target_source.inverse()
+        x = log_at(D, self._pivots.centre[e.target], self._pivots.radius[e.target])
+        return bool(x @ e.information @ x < self._settings.assembly.same_chi2)
 
     def _judge(self, first: Component, second: Component, S: Similarity, links: Sequence[Sequence[Link]]) -> Joint:
         """Votes of the pairs across, and the points of all frames across that see the same side."""
         s, a = self._settings.assembly, self._settings.pair.agreement
         votes, same = 0.0, 0
-        for link in links:
-            near = [(number, q) for number, (T, q) in enumerate(link) if not self._differ(S, T, second)]
-            votes += max((q for _, q in near), default=0.0)
-            same += any(number == 0 for number, _ in near)
+        for of_pair in links:
+            near = [link for link in of_pair if self._same(link, S, first, second)]
+            votes += max((link.quality for link in near), default=0.0)
+            same += any(link.best for link in near)
         tolerance = Tolerance(0.0, s.tolerance_sigmas)
         agreeing = contradicting = 0.0
         for i, j in self._facing(first, second, S):

@@ -28,6 +28,7 @@ class FrameCloud:
     points: Float64[ndarray, "n 3"]
     sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
     sigma_pose: Float64[ndarray, "n"]  # along the camera ray, from the pose's covariance: points err together
+    alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     @property
     def sigma(self) -> Float64[ndarray, "n"]:
@@ -53,7 +54,7 @@ def frame_cloud(
     pose: RelativePose,
     settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
 ) -> FrameCloud:
-    """Triangulate one frame. `coords` are those from which `pose` was found.
+    """Triangulate one frame, with each pose that explains it. `coords` are those from which `pose` was found.
 
     Raises RelativePoseError where hardly any point agrees with the pose.
     """
@@ -89,6 +90,11 @@ def frame_cloud(
         points,
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
         sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
+        alternatives=tuple(
+            frame_cloud(name, coords, camera, projector, other, settings)
+            for other in pose.alternatives
+            if other.inliers.sum() >= settings.fewest_points
+        ),
     )
 
 

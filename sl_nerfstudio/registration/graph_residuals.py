@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.increments import log_at
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 
 Nodes = Sequence[Similarity | None]  # S_world_camera of every frame; None where it is not known
 
@@ -35,21 +35,6 @@ def node_at(nodes: Nodes, k: int) -> Similarity:
     if S is None:
         raise ValueError(f"frame {k} has no pose in the graph")
     return S
-
-
-def log_at(D: Similarity, centre: Float64[ndarray, "3"], radius: float) -> Float64[ndarray, "7"]:
-    """Increment (v, w, l) about a pivot that is the similarity D."""
-    v = (D.points(centre[None])[0] - centre) / radius
-    return np.concatenate([v, Rotation.from_matrix(D.R).as_rotvec(), [np.log(D.scale)]])
-
-
-def exp_at(
-    x: Float64[ndarray, "7"], centre: Float64[ndarray, "3"], radius: float, largest_log_scale: float
-) -> Similarity:
-    """The similarity of an increment about a pivot."""
-    R = Rotation.from_rotvec(x[3:6]).as_matrix()
-    scale = float(np.exp(np.clip(x[6], -largest_log_scale, largest_log_scale)))
-    return Similarity(scale, R, centre - scale * R @ centre + radius * x[:3])
 
 
 def residual(edge: PairMatch, nodes: Nodes, pivots: Pivots) -> Float64[ndarray, "7"]:

@@ -13,8 +13,9 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots, adjoint, chi_square, exp_at, node_at, residual
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots, adjoint, chi_square, node_at, residual
+from sl_nerfstudio.registration.increments import exp_at
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PoseGraphSettings
 
 

@@ -13,6 +13,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.acceptance import accept_frames
+from sl_nerfstudio.registration.assembly import Component
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
@@ -29,7 +30,7 @@ def register(
     progress: Callable[[str], None] | None = None,
     settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
-    """Camera poses of all frames in one world.
+    """Camera poses of all frames in one world; alternatives of the clouds are not considered.
 
     Args:
         clouds: the frames, in the order of capture if `sequence`.
@@ -51,15 +52,25 @@ def register(
     if start is not None:
         graph.try_overlapping(rough)
         graph.try_overlapping(centred)
-    elif sequence:
+    ordered = sequence
+    if start is None and sequence:
         for gap in selection.sequence_gaps:
             graph.try_pairs([(k, k + gap) for k in range(n - gap)], settings.pair.neighbours)
-    else:
-        graph.try_pairs([(i, j) for i in range(n) for j in range(i + 1, n)], settings.pair.anywhere)
+        ordered = _in_order(graph.assemble(), n, selection.least_joined)
+    if start is None and not ordered:
+        report("comparing all frames")
+        graph.try_all()
     for _ in range(selection.rounds):
         report("closing loops")
         components = graph.assemble()
         for component in (c for c in components if len(c) > 1):
             graph.try_overlapping(graph.solve(component).S_world_camera)
         graph.bridge(components)
-    return accept_frames(tuple(c.name for c in clouds), graph)
+    return accept_frames(tuple(c.name for c in clouds), graph, ordered)
+
+
+def _in_order(components: Sequence[Component], n: int, least: float) -> bool:
+    """Whether successive frames mostly are in the same component."""
+    number = {k: c for c, frames in enumerate(components) for k in frames}
+    joined = sum(number[k] == number[k + 1] for k in range(n - 1))
+    return joined >= least * (n - 1)

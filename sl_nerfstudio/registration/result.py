@@ -1,6 +1,7 @@
 """What registration found: poses, the pairs that support them, frames that were left out, and what is uncertain."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
@@ -99,3 +100,11 @@ class Registration:
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
     uncertainties: tuple[Uncertainty, ...]
+    ordered: bool = True  # frames follow each other in the order of capture; False: stated, or found not to be so
+
+
+def with_undecided(registration: Registration, undecided: Sequence[UndecidedProjector]) -> Registration:
+    """The registration with what is uncertain about the projectors of its registered frames."""
+    names = {name for name, here in zip(registration.names, registration.registered, strict=True) if here}
+    doubts = tuple(u for u in undecided if u.frame in names)
+    return replace(registration, uncertainties=registration.uncertainties + doubts)

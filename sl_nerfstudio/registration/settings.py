@@ -138,6 +138,10 @@ class PairSettings:
     """error of a pair's translation that all points share, in standard deviations of the surfaces"""
     turn_sigmas: float = 0.4
     """the same of its rotation and its scale, as lengths at one radius"""
+    slip_angles_deg: tuple[float, ...] = (4.0, 8.0, 12.0)
+    """rotations, in degrees, by which slipping is tried"""
+    slip_loss: float = 0.12
+    """share of the score that is lost where a motion is noticed"""
     same_rotation_deg: float = 6.0
     """rotation between two results, in degrees, below which they are one"""
     same_shift: float = 0.12
@@ -202,6 +206,9 @@ class AssemblySettings:
     """standard deviation of the least known rotation, in degrees, of a pair that joins two components on its own"""
     largest_rival: float = 0.85
     """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
+    same_chi2: float = 30.0
+    """chi square (7 degrees of freedom) of the difference between two similarities, by the uncertainty of a pair, up
+    to which they are one: a pair that may slip does not contradict another that slipped"""
     most_compared: int = 8
     """clearly different similarities that are compared at most"""
     same_rotation_deg: float = 8.0
@@ -228,6 +235,12 @@ class PairSelectionSettings:
     """pairs of each frame that are tried for closing cycles"""
     rounds: int = 2
     """rounds of closing cycles"""
+    least_joined: float = 0.5
+    """share of successive frames that must be joined for the order of the frames to be that of capture"""
+    likely_partners: int = 8
+    """frames with which each frame is registered where no order is known: those that look most alike"""
+    bridged: int = 4
+    """components, the largest ones, that are bridged with all others"""
     bridges: int = 8
     """pairs of frames across two components that are registered in order to join them"""
     most_compared: int = 40
@@ -242,6 +255,16 @@ class StartSettings:
 
     least_distance: float = 0.2
     """distance of a camera from the object, relative to the median, below which it is not used"""
+
+
+@dataclass(frozen=True)
+class ProjectorChoiceSettings:
+    """Which of several poses of a frame's projector is right."""
+
+    reach: int = 2
+    """frames before and after a frame with which each of its poses is compared"""
+    rival: float = 0.8
+    """support of another pose, relative to the best one, from which the choice is not certain"""
 
 
 @dataclass(frozen=True)
@@ -272,6 +295,8 @@ class RegistrationSettings:
     """rough camera poses"""
     pair: PairSettings = field(default_factory=PairSettings)
     """registration of one frame to another"""
+    choice: ProjectorChoiceSettings = field(default_factory=ProjectorChoiceSettings)
+    """which of several poses of a frame's projector is right"""
     selection: PairSelectionSettings = field(default_factory=PairSelectionSettings)
     """which pairs are registered"""
     edge: EdgeSettings = field(default_factory=EdgeSettings)

@@ -8,13 +8,13 @@ import numpy as np
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.assembly import Assembly, Component
-from sl_nerfstudio.registration.edge_weights import edge_weights, is_accepted, quality
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
-from sl_nerfstudio.registration.pair_match import PairMatch
-from sl_nerfstudio.registration.pair_registration import register_pair, search_score
+from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, quality
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.pair_registration import register_pair, search_score
+from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings, Search
-from sl_nerfstudio.registration.surface_agreement import Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 Pair = tuple[int, int]
@@ -59,11 +59,26 @@ class ViewGraph:
             if guess is not None:
                 self._register(pair, self.settings.pair.nearby, guess)
 
+    def try_all(self) -> None:
+        """Register every frame with those that look most like it, wherever they are in the order."""
+        n, likely = len(self.maps), self.settings.selection.likely_partners
+        likeness = np.full((n, n), -np.inf)
+        for i, j in track(list(combinations(range(n), 2)), "comparing frames"):
+            likeness[i, j] = likeness[j, i] = self._likeness((i, j))
+        pairs = {
+            (min(i, j), max(i, j))
+            for i in range(n)
+            for j in np.argsort(-likeness[i], kind="stable")[:likely].tolist()
+            if i != j
+        }
+        self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
+
     def bridge(self, components: Sequence[Component]) -> None:
-        """Search between components everywhere: one may be upside down."""
+        """Search between the largest components and all others, everywhere: one may be upside down."""
         pairs: set[Pair] = set()
-        for first, second in combinations(components, 2):
-            pairs |= set(self._bridges(first, second))
+        for number, first in enumerate(components[: self.settings.selection.bridged]):
+            for second in components[number + 1 :]:
+                pairs |= set(self._bridges(first, second))
         self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
 
     def assemble(self) -> list[Component]:

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.edge_weights import edge_weights, is_accepted, is_ambiguous, quality
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, is_ambiguous, quality
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import (
     AmbiguousPose,

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pair_registration import register_pair
-from sl_nerfstudio.registration.rotation_search import around_guess, rotations, without_guess
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.pair_registration import register_pair
+from sl_nerfstudio.registration.pairs.rotation_search import around_guess, rotations, without_guess
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, Search
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of

@@ -18,7 +18,7 @@ from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.models import pixel_of
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 

@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.pairs.slip import slip_deg, weakest_rotation
+from sl_nerfstudio.registration.pairs.surface_agreement import Agreement, Side, Tolerance
 from sl_nerfstudio.registration.settings import PairSettings
-from sl_nerfstudio.registration.surface_agreement import Agreement
-from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,12 @@ def match_from(
     found: Agreement,
     k: int,
     rivals: tuple[Rival, ...],
-    target: SurfaceMap,
+    sides: tuple[Side, Side],
+    common: Tolerance,
     settings: PairSettings,
 ) -> PairMatch:
-    """The edge for similarity k of `found`, with the uncertainty that follows from the sums."""
+    """The edge for similarity k of `found`, with the uncertainty that follows from the sums and from slipping."""
+    target = sides[1].map
     D = np.array([target.radius] * 3 + [1] * 4)
     H = found.H[k] * D[:, None] * D / target.radius**2
     # No pair is assumed to fit better than the surfaces are known: errors of the relative pose bend them.
@@ -68,22 +70,18 @@ def match_from(
     information = H * (settings.independent_points / count / rms**2) + settings.least_information * np.eye(7)
     # Errors of the two relative poses move and bend a surface as a whole: more points do not average them.
     bending = np.array([settings.shift_sigmas] * 3 + [settings.turn_sigmas] * 4) * rms
-    information = np.linalg.inv(np.linalg.inv(information) + np.diag(bending**2))
-    sigma = np.sqrt(1 / np.linalg.eigvalsh(_rotation_information(information))[0])
+    covariance = np.linalg.inv(information) + np.diag(bending**2)
+    direction = weakest_rotation(information)
+    slip = np.radians(slip_deg(sides, S_target_source, direction, common, settings))
+    covariance = covariance + slip**2 * np.outer(direction, direction)
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])
     return PairMatch(
         *pair,
         S_target_source,
-        information,
+        np.linalg.inv(covariance),
         float(found.agreeing[k]),
         float(found.fitness[k]),
         rms,
         rivals,
         float(np.degrees(sigma)),
     )
-
-
-def _rotation_information(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "3 3"]:
-    """Information on the rotation with translation and scale free (Schur complement)."""
-    other = [0, 1, 2, 6]
-    cross = information[3:6][:, other]
-    return information[3:6, 3:6] - cross @ np.linalg.solve(information[np.ix_(other, other)], cross.T)

@@ -6,7 +6,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.settings import Search
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 

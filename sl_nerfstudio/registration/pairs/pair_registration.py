@@ -8,11 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pair_match import PairMatch, Rival, match_from
-from sl_nerfstudio.registration.rotation_search import around_guess, without_guess
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival, match_from
+from sl_nerfstudio.registration.pairs.rotation_search import around_guess, without_guess
+from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PairSettings, Search
-from sl_nerfstudio.registration.surface_agreement import Side, Tolerance, agreement
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 Sides = tuple[Side, Side]  # of the source and the target
@@ -156,4 +156,4 @@ def _best_match(
         if score[k] > 0 and all(_differ(found, k, j, target, settings) for j in [best, *different]):
             different.append(k)
     rivals = tuple(Rival(found.similarity(k), float(score[k] / max(score[best], 1e-9))) for k in different)
-    return match_from(pair, found.similarity(best), sums, best, rivals, target, settings)
+    return match_from(pair, found.similarity(best), sums, best, rivals, sides, common, settings)

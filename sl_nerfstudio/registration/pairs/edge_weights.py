@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.registration.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, EdgeSettings
 
 
