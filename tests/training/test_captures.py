@@ -50,7 +50,7 @@ def test_nodes_of_drawn_patterns_are_where_the_codes_say():
     pattern = draw_pattern(np.random.default_rng(0))
     middle = np.rint((np.arange(CELLS) + 0.5) * pattern.period).astype(int)
     plain = pattern.codes == 0
-    assert pattern.picture[np.ix_(middle, middle)][plain].min() > 0.95
+    assert pattern.pictures[..., 0][np.ix_(middle, middle)][plain].min() > 0.95
 
 
 @pytest.mark.parametrize("turn", range(4))
