@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
-from sl_nerfstudio.decoding.grid.consensus import Assignment
+from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
 from sl_nerfstudio.decoding.grid.detection import LEAST_NODES, DetectedGrid, GridDetector
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
 from sl_nerfstudio.decoding.grid.likelihood import symbol_log_ratio
 from sl_nerfstudio.decoding.grid.phase_reader import PixelPhases, map_from_pixels, sample_pixels, to_pixel_coordinates
-from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
+from sl_nerfstudio.decoding.grid.refusal.causes import refusal
 from sl_nerfstudio.decoding.grid.unwrap import spread
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.pattern.codes import rotate_codes
@@ -42,8 +41,7 @@ class GridImageDecoder:
 
     def __init__(self, pattern: GridPattern) -> None:
         self.pattern = pattern
-        self._detector = GridDetector()
-        self._recogniser = NodeRecogniser(pattern)
+        self._detector = GridDetector(pattern)
 
     def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """Projector coordinates of every pixel that shows the pattern.
@@ -53,39 +51,17 @@ class GridImageDecoder:
         """
         grey = as_grey(image)
         found = self._detector.detect(grey)
-        assignment = self._recognise(found)
+        if found is None or found.known < LEAST_NODES:
+            raise refusal(grey, found, self._detector, self.pattern)
         phases = sample_pixels(found.maps, found.rectified, (grey.shape[0], grey.shape[1]))
-        coords = self._coordinates(phases, found, assignment)
+        coords = self._coordinates(phases, found)
         coords = self._refine(grey, coords, found.appearance.period)
         mask = phases.mask | np.isfinite(coords[..., 0])
         return Decoded(coords, mask, self._normalise(grey, mask, found.appearance.period))
 
-    def _recognise(self, found: DetectedGrid) -> Assignment:
-        """The place of every node in the pattern. Raises DecodingError if too few have one."""
-        seen, most = len(found.graph.place), self.pattern.rows * self.pattern.columns
-        if seen > _MOST_NODES * most:
-            raise DecodingError(
-                f"shows {seen} crossings of lines, and the pattern has only {most}",
-                "the image is mostly noise, or it shows another pattern",
-                "give the pattern.json of the pattern that was projected; capture again with more light",
-            )
-        assignment = self._recogniser.assign(found.graph)
-        known = int(assignment.known.sum())
-        if known < max(LEAST_NODES, _LEAST_KNOWN * seen):
-            raise DecodingError(
-                f"shows a grid of {seen} crossings, but only {known} of them fit the pattern",
-                "the pattern's description is that of another pattern, the image is mirrored, or it is too blurred or "
-                "noisy for the symbols to be read",
-                "give the pattern.json of the pattern that was projected; capture again in focus, or from a shorter "
-                "distance",
-            )
-        return assignment
-
-    def _coordinates(
-        self, phases: PixelPhases, found: DetectedGrid, assignment: Assignment
-    ) -> Float32[ndarray, "h w 2"]:
+    def _coordinates(self, phases: PixelPhases, found: DetectedGrid) -> Float32[ndarray, "h w 2"]:
         """Coordinates in pattern pixels from the nodes' places and the phases."""
-        known = assignment.known
+        assignment, known = found.assignment, found.assignment.known
         at = np.floor(to_pixel_coordinates(found.graph.place[known], found.rectified)).astype(np.int32)
         turned = spread(phases.phase, phases.clear, np.ascontiguousarray(at[:, ::-1]), assignment.place[known])
         codes = rotate_codes(np.asarray(self.pattern.codes), assignment.turn)
