@@ -59,7 +59,7 @@ def _reflected(rng: np.random.Generator, surface: Surface, pattern: DrawnPattern
     coords = coords * np.float32(log_uniform(rng, 0.5, 1.5)) + rng.uniform(-8, 8, 2).astype(np.float32)
     blur = np.full((n, n), rng.uniform(0.08, 0.2), dtype=np.float32)
     near = np.clip(0.5 + smooth_field(rng, n, int(rng.integers(1, 4))), 0, 1)
-    return rng.uniform(0.05, 0.4) * near * pattern.defocused(np.ascontiguousarray(coords), blur)
+    return rng.uniform(0.05, 0.25) * near * pattern.defocused(np.ascontiguousarray(coords), blur)
 
 
 def _gloss(

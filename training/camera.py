@@ -43,12 +43,18 @@ def _lens(
         share = np.clip(0.5 + smooth_field(rng, len(light), 1), 0, 1)
         blurred = blurred + share * (other - blurred)
     if rng.random() < 0.1 + 0.3 * hard:
-        length = max(3, round(sampling * rng.uniform(2, 6)))
-        kernel = np.zeros((length, length), dtype=np.float32)
-        cv2.line(kernel, (0, int(rng.integers(length))), (length - 1, int(rng.integers(length))), (1.0,))
-        kernel = kernel.T if rng.random() < 0.5 else kernel
-        blurred = cv2.filter2D(blurred, -1, kernel / kernel.sum())
+        blurred = cv2.filter2D(blurred, -1, _path(rng, sampling * rng.uniform(1, 3)))
     return blurred
+
+
+def _path(rng: np.random.Generator, half: float) -> Float32[ndarray, "k k"]:
+    """A straight path of the camera, symmetric about the middle: the truth lies where the image is on average."""
+    middle, angle = max(1, int(np.ceil(half))), rng.uniform(0, np.pi)
+    kernel = np.zeros((2 * middle + 1, 2 * middle + 1), dtype=np.float32)
+    dx, dy = round(half * np.cos(angle)), round(half * np.sin(angle))
+    cv2.line(kernel, (middle - dx, middle - dy), (middle + dx, middle + dy), (1.0,))
+    kernel = kernel + kernel[::-1, ::-1]
+    return kernel / kernel.sum()
 
 
 def _speckle(rng: np.random.Generator, signal: Float32[ndarray, "n n"], hard: float) -> Float32[ndarray, "n n"]:
