@@ -32,10 +32,10 @@ class DrawnPattern:
         return (seen * weight).sum(-1)
 
 
-def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
+def random_grid(rng: np.random.Generator) -> GridPattern:
     """Random symbols, line width, gap and darkness."""
     side = CELLS * _PERIOD
-    grid = GridPattern(
+    return GridPattern(
         w=side,
         h=side,
         period=float(_PERIOD),
@@ -44,6 +44,10 @@ def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
         dark=float(rng.uniform(0, 0.08)),
         codes=rng.integers(0, SYMBOLS, (CELLS, CELLS)).astype(np.int8),
     )
+
+
+def draw_pattern(grid: GridPattern) -> DrawnPattern:
+    """The pictures of a random grid."""
     assert grid.codes is not None
     picture = grid.render(supersampling=1)
     blurred = [cv2.GaussianBlur(picture, (0, 0), blur * _PERIOD) if blur > 0 else picture for blur in _BLURS]
@@ -55,7 +59,7 @@ class PatternStock:
 
     def __init__(self, rng: np.random.Generator, count: int) -> None:
         self._rng = rng
-        self._patterns = [draw_pattern(rng) for _ in range(count)]
+        self._patterns = [draw_pattern(random_grid(rng)) for _ in range(count)]
         self._next = 0
 
     def pick(self) -> DrawnPattern:
@@ -64,5 +68,5 @@ class PatternStock:
 
     def renew(self) -> None:
         """Replace the oldest pattern by a new one."""
-        self._patterns[self._next] = draw_pattern(self._rng)
+        self._patterns[self._next] = draw_pattern(random_grid(self._rng))
         self._next = (self._next + 1) % len(self._patterns)

@@ -27,7 +27,7 @@ _LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
 _ROUNDS = 4
 _SMOOTHING = 0.35  # window in which coordinates are taken to be linear, periods
-_LARGEST_SHIFT = 0.25  # periods, of all rounds together
+_LARGEST_SHIFT = 0.12  # periods, of all rounds together
 
 
 def fit_densely(

@@ -14,7 +14,8 @@ from sl_nerfstudio.decoding.grid.rectify import GridAppearance, RectifiedImage, 
 from sl_nerfstudio.decoding.grid.unet import STRIDE, UNet
 
 # Pixels of the capture that are used.
-_LEAST_MASK = 0.4  # probability that the pattern is there
+LEAST_MASK = 0.4
+"""Probability above which a pixel shows the pattern."""
 _LEAST_VECTOR = 0.35  # length of a phase's (cosine, sine) below which the phase is unknown
 # Places of the maps by which the grid's appearance is measured: only clear ones.
 _CLEAR_MASK, _CLEAR_VECTOR = 0.5, 0.6
@@ -26,8 +27,13 @@ class PixelPhases:
     """Phases at the pixels of the capture."""
 
     phase: Float32[ndarray, "h w 2"]  # periods, from -0.5 to 0.5
-    mask: Bool[ndarray, "h w"]  # the pattern is there
+    probability: Float32[ndarray, "h w"]  # that the pattern is there
     clear: Bool[ndarray, "h w"]  # the pattern is there and its phases are known
+
+    @property
+    def mask(self) -> Bool[ndarray, "h w"]:
+        """Pixels that show the pattern."""
+        return self.probability > LEAST_MASK
 
 
 def predict_maps(rectified: RectifiedImage, network: UNet) -> PhaseMaps:
@@ -80,8 +86,8 @@ def sample_pixels(maps: PhaseMaps, rectified: RectifiedImage, shape: tuple[int, 
     mask, vector = parts[0][..., 0], parts[1]
     phase = np.stack([np.arctan2(vector[..., 1], vector[..., 0]), np.arctan2(vector[..., 3], vector[..., 2])], -1)
     strength = np.minimum(np.hypot(vector[..., 0], vector[..., 1]), np.hypot(vector[..., 2], vector[..., 3]))
-    seen = mask > _LEAST_MASK
-    return PixelPhases((phase / (2 * np.pi)).astype(np.float32), seen, seen & (strength > _LEAST_VECTOR))
+    clear = (mask > LEAST_MASK) & (strength > _LEAST_VECTOR)
+    return PixelPhases((phase / (2 * np.pi)).astype(np.float32), mask, clear)
 
 
 def map_from_pixels(rectified: RectifiedImage) -> Float64[ndarray, "2 3"]:

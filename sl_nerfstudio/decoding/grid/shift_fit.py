@@ -20,7 +20,7 @@ _LIGHT_MOMENTS = [0, 1, 4, 10, 11]  # those that contrast and brightness follow 
 _LEAST_CONTRAST, _WELL_LIT = 0.25, 0.9  # share of the contrast at this quantile of the image
 # Shift.
 _LARGEST_STEP = 0.2  # periods
-_PRIOR = 0.02  # weight of a shift of one period, as a share of the window's contrast
+_PRIOR = 0.1  # weight of a shift of one period, as a share of the window's contrast
 _LEAST_RELATIVE_CONTRAST = 0.05  # of the contrast that the image has in the window
 
 
