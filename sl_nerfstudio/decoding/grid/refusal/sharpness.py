@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD, network_channels
@@ -11,8 +11,9 @@ from sl_nerfstudio.decoding.grid.rectify import RectifiedImage
 from sl_nerfstudio.decoding.grid.unet import STRIDE
 from sl_nerfstudio.pattern.grid import GridPattern
 
-_SMOOTHING = 1.5  # sigma against noise, pixels
+_SMOOTHING = 1.0  # sigma against noise, pixels
 _AGAIN = 2.5  # sigma of the second blur, with which the first is compared, pixels
+_DIFFERENCE = 1 / 3  # variance of what a central difference blurs, pixels squared
 _STRONGEST = 0.01  # share of the pixels that count as edges
 _BLURS = np.linspace(0.03, 0.33, 16)  # periods
 _BETWEEN = 0.2  # periods from the lines of the other family
@@ -35,7 +36,7 @@ def edge_width(grey: Float32[ndarray, "h w"]) -> float:
     ratio = float(np.median(slope[edge] / np.maximum(slope_after[edge], 1e-9)))
     if ratio <= 1:
         return float("inf")
-    return float(np.sqrt(max(_AGAIN**2 / (ratio**2 - 1) - _SMOOTHING**2, 0.0)))
+    return float(np.sqrt(max(_AGAIN**2 / (ratio**2 - 1) - _SMOOTHING**2 - _DIFFERENCE, 0.0)))
 
 
 def _slope(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
@@ -65,7 +66,7 @@ def line_blur(
     return float(np.interp(-measured, -np.array(known), _BLURS[: len(known)]))  # overtones fall as the blur grows
 
 
-def _overtone(contrast: Float32[ndarray, "n"], x: Float32[ndarray, "n"], y: Float32[ndarray, "n"]) -> float | None:
+def _overtone(contrast: Float[ndarray, "n"], x: Float[ndarray, "n"], y: Float[ndarray, "n"]) -> float | None:
     """Strength of the second harmonic relative to the first, across both families of lines; None without a first."""
     first, second = 0.0, 0.0
     for across, along in ((x, y), (y, x)):

@@ -4,7 +4,7 @@ import numpy as np
 
 from sl_nerfstudio.decoding.grid.graph import DOWN, LEFT, RIGHT, UP, GridGraph, component_of
 
-_MIRRORED_SYMBOL = (0, 2, 1, 4, 3)
+MIRRORED_SYMBOL = (0, 2, 1, 4, 3)
 """What a left-right mirror makes of each symbol: its lines left and right change places, those above and below lean to
 the other side."""
 _LEAST_GRID = 40  # nodes of the largest component
@@ -18,7 +18,7 @@ def mirrored(graph: GridGraph) -> GridGraph:
     order = np.empty(4, dtype=int)
     order[[RIGHT, DOWN, LEFT, UP]] = LEFT, DOWN, RIGHT, UP
     place = graph.place * np.array([-1, 1], dtype=np.float32)
-    return GridGraph(place, graph.neighbour[:, order].copy(), graph.score[:, list(_MIRRORED_SYMBOL)].copy())
+    return GridGraph(place, graph.neighbour[:, order].copy(), graph.score[:, list(MIRRORED_SYMBOL)].copy())
 
 
 def shows_grid(graph: GridGraph) -> bool:
