@@ -26,10 +26,8 @@ from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.scan.images import as_grey
 
-# Which captures are refused.
-_MOST_NODES = 1.5  # of the pattern's own: at the edges of surfaces some nodes are seen twice
-_LEAST_KNOWN = 0.2  # share of the crossings whose place must be found; with fewer it is another pattern
 # Which pixels are kept.
+_LEAST_TRUST = 0.02  # weight in the fit of a pixel that hardly shows the pattern
 _LEAST_LOG_RATIO = 0.3  # log-likelihood ratio of the symbols around a pixel
 _LEAST_AGREEMENT = 0.35  # correlation of the image with the drawn pattern
 _MOST_WRONG = 0.2  # probability that the pixel is wrong
@@ -77,7 +75,8 @@ class GridImageDecoder:
         log_ratio = symbol_log_ratio(turned, codes, found.maps.symbol, to_map, found.appearance.period)
         turned = np.where((log_ratio > _LEAST_LOG_RATIO)[..., None], turned, np.float32(np.nan))
         read = self._turn_back(turned, assignment.turn)
-        fitted, agreement = fit_densely(grey, read, self._drawn, found.appearance.period)
+        trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
+        fitted, agreement = fit_densely(grey, read, trust, self._drawn, found.appearance.period)
         return Evidence(read, fitted, agreement, log_ratio, phases.probability)
 
     def _turn_back(self, turned: Float32[ndarray, "h w 2"], turn: int) -> Float32[ndarray, "h w 2"]:
