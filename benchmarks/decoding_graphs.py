@@ -56,8 +56,7 @@ def answers(recogniser: NodeRecogniser, graph: DamagedGraph) -> dict[str, np.nda
     around = neighbourhoods(graph.neighbour)
     places = np.column_stack([pattern.turn, pattern.place]).astype(np.int64)
     places = np.vstack([places, np.full((1, 3), -1)])
-    with torch.inference_mode():
-        alone = recogniser.logits(torch.from_numpy(graph.score), around).argmax(1).numpy()
+    alone = recogniser.logits(graph.as_grid()).argmax(1).numpy()
     assignment = recogniser.assign(graph.as_grid())
     together = np.column_stack([np.full(len(alone), assignment.turn), assignment.place])
     return dict(

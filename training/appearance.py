@@ -1,4 +1,4 @@
-"""Random light, texture, lens and sensor: from a surface and its pattern to the image of a camera."""
+"""Random light and texture: from a surface and its pattern to the light that reaches the camera."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from numpy import ndarray
 from training.noise_fields import log_uniform, smooth_field
 from training.patterns import DrawnPattern
 from training.surfaces import Surface
+from training.textures import natural, printed
 
 
 @dataclass(frozen=True)
@@ -31,86 +32,71 @@ def illuminate(
     rng: np.random.Generator, surface: Surface, pattern: DrawnPattern, hard: Difficulty
 ) -> Float32[ndarray, "n n"]:
     """Light that leaves the surface; 1 is a white surface in the full light of the projector."""
-    place = ((surface.coords + 0.5) * pattern.period - 0.5).astype(np.float32)
-    lines = cv2.remap(pattern.picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    lines = pattern.defocused(surface.coords, surface.defocus)
     leak = np.float32(rng.uniform(0, 0.08))
     projected = (leak + (1 - leak) * lines) * surface.lit * surface.shading
     n = len(lines)
     ambient = rng.uniform(0, 0.6 * hard.light) * (1 + 0.4 * smooth_field(rng, n, 2))
     ambient = np.clip(ambient, 0, None) + rng.uniform(0, 0.1)
     glow = rng.uniform(0, 0.5 * hard.light) * cv2.GaussianBlur(_small(projected), (0, 0), rng.uniform(2, 8))
-    glow = cv2.resize(glow, (n, n), interpolation=cv2.INTER_LINEAR)
-    light = (projected + ambient + glow) * _albedo(rng, surface, hard.texture)
-    background = rng.uniform(0.0, 0.06) if rng.random() < 0.7 else rng.uniform(0.0, 0.4) * hard.light
-    return np.where(surface.layer >= 0, light, background).astype(np.float32)
+    light = projected + ambient + cv2.resize(glow, (n, n), interpolation=cv2.INTER_LINEAR)
+    if rng.random() < 0.4 * hard.light:
+        light = light + _reflected(rng, surface, pattern)
+    light = light * _albedo(rng, surface, hard.texture)
+    if rng.random() < 0.4 * hard.light:
+        light = light + _gloss(rng, projected, ambient)
+    return np.where(surface.layer >= 0, light, _background(rng, n, surface.pixels_a_period, hard)).astype(np.float32)
 
 
 def _small(image: Float32[ndarray, "n n"]) -> Float32[ndarray, "m m"]:
     return cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
 
 
+def _reflected(rng: np.random.Generator, surface: Surface, pattern: DrawnPattern) -> Float32[ndarray, "n n"]:
+    """A second, blurred copy of the pattern from elsewhere, as one surface throws it onto another."""
+    n, cells = len(surface.layer), np.array(pattern.codes.shape, dtype=np.float32)
+    coords = cells - surface.coords if rng.random() < 0.5 else surface.coords[:, ::-1]
+    coords = coords * np.float32(log_uniform(rng, 0.5, 1.5)) + rng.uniform(-8, 8, 2).astype(np.float32)
+    blur = np.full((n, n), rng.uniform(0.08, 0.2), dtype=np.float32)
+    near = np.clip(0.5 + smooth_field(rng, n, int(rng.integers(1, 4))), 0, 1)
+    return rng.uniform(0.05, 0.25) * near * pattern.defocused(np.ascontiguousarray(coords), blur)
+
+
+def _gloss(
+    rng: np.random.Generator, projected: Float32[ndarray, "n n"], ambient: Float32[ndarray, "n n"]
+) -> Float32[ndarray, "n n"]:
+    """Highlights with soft borders: of the projector, in which the pattern remains until it saturates, or of a lamp."""
+    n = len(projected)
+    spots = np.clip(smooth_field(rng, n, int(rng.integers(3, 16))) - rng.uniform(0.8, 1.8), 0, None)
+    mirrored = projected if rng.random() < 0.6 else ambient + 0.3
+    return log_uniform(rng, 0.5, 12.0) * spots * mirrored
+
+
 def _albedo(rng: np.random.Generator, surface: Surface, hard: float) -> Float32[ndarray, "n n"]:
-    """Blotches, fine grain, stripes and printed patches, different on each layer."""
+    """Blotches, fine grain, prints and patches, different on each layer."""
     n = len(surface.layer)
     albedo = np.exp(rng.uniform(0.05, 0.1 + 0.35 * hard) * smooth_field(rng, n, int(rng.integers(2, 10))))
     if rng.random() < 0.3 + 0.4 * hard:
         albedo *= np.exp(rng.uniform(0, 0.25 * hard) * smooth_field(rng, n, int(rng.integers(12, 60))))
     if rng.random() < 0.5 * hard:
         patches = smooth_field(rng, n, int(rng.integers(3, 12))) > rng.uniform(-0.5, 1.0)
-        albedo *= np.where(patches, rng.uniform(0.3, 1.0), 1.0)
-    if rng.random() < 0.3 * hard:
-        row, column = np.mgrid[:n, :n].astype(np.float32)
-        angle, length = rng.uniform(0, np.pi), n * log_uniform(rng, 0.03, 0.5)
-        wave = np.sin((np.cos(angle) * row + np.sin(angle) * column) * np.float32(2 * np.pi / length))
-        albedo *= 1 - rng.uniform(0, 0.6) * (wave > rng.uniform(-0.7, 0.9))
-    shades = rng.uniform(0.6, 1.0, 6)
+        albedo *= np.where(patches, rng.uniform(0.1, 1.0), 1.0)
+    for layer in range(int(surface.layer.max(initial=0)) + 1):
+        if rng.random() < 0.6 * hard:
+            make = printed(rng, n, surface.pixels_a_period) if rng.random() < 0.6 else natural(rng, n)
+            albedo = np.where(surface.layer == layer, albedo * make, albedo)
+    shades = rng.uniform(0.6, 1.0, 6) * np.where(rng.random(6) < 0.3 * hard, rng.uniform(0.15, 0.6, 6), 1.0)
     return (0.8 * albedo * shades[surface.layer]).astype(np.float32)
 
 
-def photograph(
-    rng: np.random.Generator, light: Float32[ndarray, "n n"], size: int, sampling: int, hard: Difficulty
-) -> Float32[ndarray, "s s"]:
-    """Lens, exposure, noise and rounding; the camera's pixels may be larger or smaller than those of the result.
-
-    The decoder scales a capture until its grid has a fixed period, so noise and sharpness depend on the resolution of
-    the camera: `native` is the size of a pixel of the result in pixels of the camera.
-    """
-    native = log_uniform(rng, 0.55, 2.0)
-    own = max(8, round(size * min(native, 1.0)))  # finer cameras are averaged, which only reduces their noise
-    blurred = _lens(rng, light, sampling, hard.blur)
-    image = cv2.resize(blurred, (own, own), interpolation=cv2.INTER_AREA)
-    exposure = log_uniform(rng, 0.25, 1.5) if rng.random() < 0.8 else log_uniform(rng, 1.5, 3.5)
-    signal = image * np.float32(exposure)
-    signal = _speckle(rng, signal, hard.noise)
-    sigma = rng.uniform(0.002, 0.015 + 0.06 * hard.noise) / max(native, 1.0)
-    signal = signal + sigma * np.sqrt(0.15 + 0.85 * signal) * rng.standard_normal(signal.shape, dtype=np.float32)
-    if rng.random() < 0.15:
-        signal = np.maximum(signal, 0) ** rng.uniform(0.6, 1.5)
-    rounded = np.rint(255 * np.clip(signal, 0, 1)).astype(np.float32) / 255
-    return rounded if own == size else cv2.resize(rounded, (size, size), interpolation=cv2.INTER_CUBIC)
-
-
-def _lens(
-    rng: np.random.Generator, light: Float32[ndarray, "n n"], sampling: int, hard: float
-) -> Float32[ndarray, "n n"]:
-    """Defocus, or the camera's motion."""
-    sigma = sampling * rng.uniform(0.2, 0.8 + 1.8 * hard)
-    blurred = cv2.GaussianBlur(light, (0, 0), sigma)
-    if rng.random() < 0.25 * hard:
-        length = max(3, round(sampling * rng.uniform(2, 5)))
-        kernel = np.zeros((length, length), dtype=np.float32)
-        cv2.line(kernel, (0, int(rng.integers(length))), (length - 1, int(rng.integers(length))), (1.0,))
-        kernel = kernel.T if rng.random() < 0.5 else kernel
-        blurred = cv2.filter2D(blurred, -1, kernel / kernel.sum())
-    return blurred
-
-
-def _speckle(rng: np.random.Generator, signal: Float32[ndarray, "n n"], hard: float) -> Float32[ndarray, "n n"]:
-    """Laser speckle: multiplies the light, in spots of about a pixel."""
-    if rng.random() > 0.3 + 0.5 * hard:
-        return signal
-    grain = rng.standard_normal(signal.shape, dtype=np.float32)
-    spot = rng.uniform(0.3, 1.0)
-    grain = cv2.GaussianBlur(grain, (0, 0), spot)
-    contrast = rng.uniform(0, 0.1 + 0.25 * hard)
-    return signal * np.maximum(1 + contrast * grain / grain.std(), 0)
+def _background(
+    rng: np.random.Generator, n: int, pixels_a_period: float, hard: Difficulty
+) -> Float32[ndarray, "n n"] | float:
+    """What lies behind the object, out of the projector's light: dark, bright, or with a texture of its own."""
+    if rng.random() < 0.5:
+        return rng.uniform(0.0, 0.06) if rng.random() < 0.7 else rng.uniform(0.0, 0.4) * hard.light
+    brightness = log_uniform(rng, 0.03, 0.9)
+    texture = printed(rng, n, pixels_a_period) if rng.random() < 0.6 else natural(rng, n)
+    if rng.random() < 0.2:
+        texture = texture * printed(rng, n, pixels_a_period)
+    return brightness * texture * (1 + 0.2 * smooth_field(rng, n, 2))

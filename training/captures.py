@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float32, Int8
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid.channels import network_channels
-from training.appearance import illuminate, photograph, random_difficulty
+from training.appearance import illuminate, random_difficulty
+from training.camera import photograph
 from training.noise_fields import log_uniform
 from training.patterns import CELLS, PatternStock
 from training.surfaces import Surface, random_surface
@@ -30,8 +31,8 @@ def random_capture(rng: np.random.Generator, stock: PatternStock, size: int) -> 
     """One random surface under one random pattern in random light."""
     surface, pattern, hard = random_surface(rng, size, _SAMPLING, CELLS), stock.pick(), random_difficulty(rng)
     light = illuminate(rng, surface, pattern, hard)
-    view = photograph(rng, light, size, _SAMPLING, hard)
-    bright = float(np.quantile(view, 0.995)) * log_uniform(rng, 0.9, 2.5)  # other parts of the image may be brighter
+    view = photograph(rng, light, size, _SAMPLING, hard.blur, hard.noise)
+    bright = float(np.quantile(view, 0.995)) * log_uniform(rng, 0.9, 4.0)  # other parts of the image may be brighter
     coords, lit, certain = _at_corners(surface)
     node = np.clip(np.rint(coords), 0, CELLS - 1).astype(np.int64)
     return Capture(network_channels(view, bright), lit, certain, coords, pattern.codes[node[..., 1], node[..., 0]])

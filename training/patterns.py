@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Float32, Int8
 from numpy import ndarray
@@ -11,21 +12,30 @@ from sl_nerfstudio.pattern.grid import GridPattern
 
 CELLS = 34  # nodes along each side
 _PERIOD = 20  # pixels, of the picture that is sampled
+_BLURS = (0.0, 0.05, 0.1, 0.2)  # sigma, periods: degrees of the projector's defocus
 
 
 @dataclass(frozen=True)
 class DrawnPattern:
     """A random pattern as a picture; node (i, j) lies at ((j + 0.5) * period, (i + 0.5) * period)."""
 
-    picture: Float32[ndarray, "h w"]
+    pictures: Float32[ndarray, "h w 4"]  # each as blurred as `_BLURS` says
     codes: Int8[ndarray, "rows columns"]
     period: float
 
+    def defocused(self, coords: Float32[ndarray, "n n 2"], sigma: Float32[ndarray, "n n"]) -> Float32[ndarray, "n n"]:
+        """Brightness at coordinates (x, y) in periods, where the projector blurs by `sigma` periods; 0 outside."""
+        place = ((coords + 0.5) * self.period - 0.5).astype(np.float32)
+        seen = cv2.remap(self.pictures, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        level = np.interp(sigma, _BLURS, range(len(_BLURS))).astype(np.float32)
+        weight = np.clip(1 - np.abs(level[..., None] - np.arange(len(_BLURS), dtype=np.float32)), 0, 1)
+        return (seen * weight).sum(-1)
 
-def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
+
+def random_grid(rng: np.random.Generator) -> GridPattern:
     """Random symbols, line width, gap and darkness."""
     side = CELLS * _PERIOD
-    grid = GridPattern(
+    return GridPattern(
         w=side,
         h=side,
         period=float(_PERIOD),
@@ -34,8 +44,14 @@ def draw_pattern(rng: np.random.Generator) -> DrawnPattern:
         dark=float(rng.uniform(0, 0.08)),
         codes=rng.integers(0, SYMBOLS, (CELLS, CELLS)).astype(np.int8),
     )
+
+
+def draw_pattern(grid: GridPattern) -> DrawnPattern:
+    """The pictures of a random grid."""
     assert grid.codes is not None
-    return DrawnPattern(grid.render(supersampling=1), grid.codes, grid.period)
+    picture = grid.render(supersampling=1)
+    blurred = [cv2.GaussianBlur(picture, (0, 0), blur * _PERIOD) if blur > 0 else picture for blur in _BLURS]
+    return DrawnPattern(np.stack(blurred, -1), grid.codes, grid.period)
 
 
 class PatternStock:
@@ -43,7 +59,7 @@ class PatternStock:
 
     def __init__(self, rng: np.random.Generator, count: int) -> None:
         self._rng = rng
-        self._patterns = [draw_pattern(rng) for _ in range(count)]
+        self._patterns = [draw_pattern(random_grid(rng)) for _ in range(count)]
         self._next = 0
 
     def pick(self) -> DrawnPattern:
@@ -52,5 +68,5 @@ class PatternStock:
 
     def renew(self) -> None:
         """Replace the oldest pattern by a new one."""
-        self._patterns[self._next] = draw_pattern(self._rng)
+        self._patterns[self._next] = draw_pattern(random_grid(self._rng))
         self._next = (self._next + 1) % len(self._patterns)

@@ -24,8 +24,12 @@ def log_row(folder: Path, row: Mapping[str, Any]) -> None:
         stream.write(line + "\n")
 
 
+def settings(config: Any) -> dict[str, str]:
+    """The settings of a training (a dataclass) as metadata of its weights."""
+    return {key: str(value) for key, value in asdict(config).items() if key != "output"}
+
+
 def save_weights(network: nn.Module, path: Path, config: Any, **more: str) -> None:
-    """Write a network as safetensors, with the settings of its training (a dataclass) and `more` as its metadata."""
-    settings = {key: str(value) for key, value in asdict(config).items() if key != "output"}
+    """Write a network as safetensors, with the settings of its training and `more` as its metadata."""
     weights = {key: value.contiguous() for key, value in network.state_dict().items()}
-    save_file(weights, path, {**more, **settings})
+    save_file(weights, path, {**more, **settings(config)})

@@ -27,33 +27,43 @@ class Surface:
     layer: Int8[ndarray, "n n"]
     lit: Bool[ndarray, "n n"]
     shading: Float32[ndarray, "n n"]
+    defocus: Float32[ndarray, "n n"]  # of the projector: sigma in periods
+    pixels_a_period: float  # typical, in samples
 
 
 def random_surface(rng: np.random.Generator, size: int, sampling: int, cells: int) -> Surface:
-    """`size` pixels per side, `sampling` samples per pixel and direction, of a pattern of `cells` periods per side."""
+    """`size` pixels per side, `sampling` samples per pixel and direction, of a pattern of `cells` periods per side.
+
+    In a part of the captures the first surface is a background that is much nearer or farther than the others.
+    """
     n = size * sampling
     place = ((np.arange(n, dtype=np.float32) + 0.5) / sampling) - size / 2
     x, y = np.meshgrid(place, place)
     jacobian = _random_jacobian(rng)
     centre = cells / 2 + rng.uniform(-1, 1, 2) * (cells / 2 - 3) * (1.0 if rng.random() < 0.25 else 0.5)
     parallax = rng.uniform(0, 2 * np.pi)
-    coords, shading = _field(rng, x, y, jacobian, centre, parallax)
+    coords, shading = _field(rng, x, y, _distant(rng, jacobian), centre, parallax)
+    blur, defocus = rng.uniform(0, 0.16) if rng.random() < 0.5 else 0.0, np.zeros((n, n), dtype=np.float32)
+    defocus[:] = _defocus(rng, n, blur)
     layer, lit = np.zeros((n, n), dtype=np.int8), np.ones((n, n), dtype=bool)
     for index in range(1, 1 + rng.choice(4, p=(0.35, 0.3, 0.2, 0.15))):
         shape = _random_shape(rng, x, y, size)
         lit &= ~_shadow(rng, shape, sampling)
         layer[shape], lit[shape] = index, True
+        defocus[shape] = _defocus(rng, n, blur)[shape]
         slip = rng.uniform(-8, 8) * np.array([np.cos(parallax), np.sin(parallax)]) + rng.uniform(-0.5, 0.5, 2)
         own, own_shading = _field(rng, x, y, _nearby(rng, jacobian), centre + slip, parallax)
         coords[shape], shading[shape] = own[shape], own_shading[shape]
-    if rng.random() < 0.6:
+    if layer.any() and rng.random() < 0.2:  # nothing but the objects in front is lit
+        layer[layer == 0] = -1
+    elif rng.random() < 0.6:
         layer[_random_shape(rng, x, y, size)] = -1
     if rng.random() < 0.3:
         lit &= ~_holes(rng, n)
     lit &= layer >= 0
     for axis in (0, 1):
         lit &= (coords[..., axis] > -0.5) & (coords[..., axis] < cells - 0.5)
-    return Surface(coords, layer, lit, shading)
+    return Surface(coords, layer, lit, shading, defocus, sampling / float(np.sqrt(abs(np.linalg.det(jacobian)))))
 
 
 def _random_jacobian(rng: np.random.Generator) -> Float32[ndarray, "2 2"]:
@@ -70,6 +80,23 @@ def _nearby(rng: np.random.Generator, jacobian: Float32[ndarray, "2 2"]) -> Floa
     turn = _rotation(rng.normal(0, np.radians(5.0)))
     steep = np.exp(abs(rng.normal(0, 0.25)))
     return (turn @ jacobian @ _stretch(rng.uniform(0, np.pi), steep) * np.exp(rng.normal(0, 0.08))).astype(np.float32)
+
+
+def _distant(rng: np.random.Generator, jacobian: Float32[ndarray, "2 2"]) -> Float32[ndarray, "2 2"]:
+    """The map of the first surface: as given, or with periods up to twice as short or long, and other slopes."""
+    if rng.random() < 0.65:
+        return jacobian
+    shortest = 1 / np.linalg.norm(jacobian, 2)  # period at its steepest, pixels
+    scale = log_uniform(rng, max(0.5, _SHORTEST / shortest), 2.0)
+    return (jacobian @ _stretch(rng.uniform(0, np.pi), rng.uniform(1, 1.2)) / scale).astype(np.float32)
+
+
+def _defocus(rng: np.random.Generator, n: int, largest: float) -> Float32[ndarray, "n n"]:
+    """Blur by the projector, sigma in periods: it grows with the distance from the depth at which it is sharp."""
+    if largest == 0:
+        return np.zeros((n, n), dtype=np.float32)
+    depth = rng.uniform(-1, 1) + rng.uniform(0, 0.8) * smooth_field(rng, n, 1)
+    return (0.02 + largest * np.minimum(np.abs(depth), 1.2)).astype(np.float32)
 
 
 def _rotation(angle: float) -> Float32[ndarray, "2 2"]:
@@ -137,8 +164,8 @@ def _shading(
 def _random_shape(
     rng: np.random.Generator, x: Float32[ndarray, "n n"], y: Float32[ndarray, "n n"], size: int
 ) -> Bool[ndarray, "n n"]:
-    """A half plane, an ellipse, a bar, or a blob."""
-    kind, angle = rng.integers(4), rng.uniform(0, 2 * np.pi)
+    """A half plane, an ellipse, a bar, a blob, or a few thin bars that may be bent."""
+    kind, angle = rng.integers(5), rng.uniform(0, 2 * np.pi)
     along, across = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
     shift = rng.uniform(-0.45, 0.45, 2) * size
     if kind == 0:
@@ -149,7 +176,21 @@ def _random_shape(
         return ((along - shift[0]) / radii[0]) ** 2 + ((across - shift[1]) / radii[1]) ** 2 < 1
     if kind == 2:
         return np.abs(along - shift[0]) < size * rng.uniform(0.03, 0.2)
-    return smooth_field(rng, len(x), int(rng.integers(2, 6))) > rng.uniform(0.2, 1.0)
+    if kind == 3:
+        return smooth_field(rng, len(x), int(rng.integers(2, 6))) > rng.uniform(0.2, 1.0)
+    return _thin_shapes(rng, len(x))
+
+
+def _thin_shapes(rng: np.random.Generator, n: int) -> Bool[ndarray, "n n"]:
+    """Wires, legs, stalks: lines from one side of the image to another, or ending within it."""
+    drawn = np.zeros((n, n), dtype=np.uint8)
+    for _ in range(rng.integers(1, 6)):
+        start, end = rng.uniform(-0.1, 1.1, 2) * n, rng.uniform(-0.1, 1.1, 2) * n
+        t = np.linspace(0, 1, 24)[:, None]
+        bent = rng.normal(0, 0.15, 2) * n * 4 * t * (1 - t)
+        line = np.rint(start + t * (end - start) + bent).astype(np.int32)
+        cv2.polylines(drawn, [line], False, (1,), round(n * log_uniform(rng, 0.04, 0.2)))
+    return drawn.astype(bool)
 
 
 def _shadow(rng: np.random.Generator, shape: Bool[ndarray, "n n"], sampling: int) -> Bool[ndarray, "n n"]:

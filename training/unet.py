@@ -17,6 +17,7 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
+from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -45,6 +46,8 @@ class Config:
     """highest learning rate, of AdamW"""
     seed: int = 0
     """determines captures and initial weights"""
+    start: Path | None = None
+    """weights to start from, as safetensors, instead of random ones"""
     threads: int = 1
     """processor threads of torch; one more generates captures"""
     log_every: int = 50
@@ -138,6 +141,8 @@ def train(config: Config) -> None:
     config.output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)
     network = UNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if config.start is not None:
+        network.load_state_dict(load_file(config.start))
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-3)
     first = _resume(config, network, optimizer)
     sums: dict[str, float] = {}

@@ -1,13 +1,17 @@
 """From the maps of the U-Net back to the pixels of the capture, with maps that are known exactly."""
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD
-from sl_nerfstudio.decoding.grid.graph import phase_maps
+from sl_nerfstudio.decoding.grid.graph import PhaseMaps, build_graph, phase_maps
 from sl_nerfstudio.decoding.grid.phase_reader import (
+    clear_places,
     map_from_pixels,
     measure_appearance,
+    node_places,
     predict_maps,
     sample_pixels,
     to_pixel_coordinates,
@@ -46,14 +50,31 @@ def test_places_and_pixels_are_inverse(rectified):
 
 @pytest.mark.parametrize(("period", "roll"), [(RECTIFIED_PERIOD, 0.0), (10.0, 0.2), (20.0, -0.25)])
 def test_the_appearance_is_measured_from_the_phases(rectified, period, roll):
-    found = measure_appearance(maps_of(rectified, period, roll), APPEARANCE)
+    maps = maps_of(rectified, period, roll)
+    found = measure_appearance(maps, APPEARANCE, clear_places(maps))
     assert found.period == pytest.approx(APPEARANCE.period * period / RECTIFIED_PERIOD, rel=1e-3)
     assert found.roll == pytest.approx(APPEARANCE.roll + roll, abs=1e-3)
 
 
 def test_without_clear_phases_there_is_no_appearance(rectified):
     maps = maps_of(rectified, 14.0, 0.0)
-    assert measure_appearance(maps_of(rectified, 14.0, 0.0, np.full_like(maps.mask, 0.4)), APPEARANCE) is None
+    unclear = maps_of(rectified, 14.0, 0.0, np.full_like(maps.mask, 0.4))
+    assert measure_appearance(unclear, APPEARANCE, clear_places(unclear)) is None
+
+
+def test_other_textures_do_not_count_where_the_nodes_are_known(rectified):
+    """The upper half shows the grid, the lower half something finer that reads like one."""
+    maps, other = maps_of(rectified, 16.0, 0.1), maps_of(rectified, 9.0, -0.2)
+    half = maps.mask.shape[0] // 2
+    mixed = PhaseMaps(
+        *(
+            np.concatenate([a[..., :half, :], b[..., half:, :]], -2)
+            for a, b in zip(astuple(maps), astuple(other), strict=True)
+        )
+    )
+    graph = build_graph(mixed)
+    found = measure_appearance(mixed, APPEARANCE, node_places(mixed, graph, graph.place[:, 1] < half - 4))
+    assert found.period == pytest.approx(APPEARANCE.period * 16 / RECTIFIED_PERIOD, rel=0.01)
 
 
 def test_phases_at_pixels_are_those_of_the_pixels_places(rectified):

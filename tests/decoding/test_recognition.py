@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.baselines.window_matching import match_windows
-from sl_nerfstudio.decoding.grid.consensus import agree
+from sl_nerfstudio.decoding.grid.consensus import agree, believe
 from sl_nerfstudio.decoding.grid.gcn import one_hot, turned_pattern
 from sl_nerfstudio.decoding.grid.graph import OFFSETS, GridGraph, neighbourhoods
 from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
@@ -66,7 +65,7 @@ def test_the_graph_network_beats_window_matching_on_damaged_graphs(recogniser):
         network = windows = total = 0
         for graph in graphs(Damage(misread, 0.2)):
             around = neighbourhoods(graph.neighbour)
-            judged = recogniser.logits(torch.from_numpy(graph.score), around).argmax(1).numpy()
+            judged = recogniser.logits(graph.as_grid()).argmax(1).numpy()
             true = (pattern.turn == graph.turn) & (pattern.place[:, None] == graph.place).all(-1).T  # node, candidate
             rows = np.arange(len(graph.place))
             network += true[rows, judged].sum()
@@ -102,8 +101,8 @@ def test_small_pieces_that_fit_several_places_are_dropped():
     for k in range(9):
         belief[k, 4 + k // 3, 4 + k % 3] = 0  # every node is certain, and all agree
     graph = GridGraph(np.zeros((9, 2), np.float32), neighbour, score)
-    assert not agree(belief, graph, codes, 0).known.any()
+    assert (agree(believe(belief, neighbour), graph, codes) < 0).all()
     unique = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
     certain = GridGraph(graph.place, neighbour, np.eye(5, dtype=np.float32)[unique[4:7, 4:7].reshape(-1)])
-    settled = agree(belief, certain, unique, 0)
-    assert settled.known.all() and (settled.place[0] == (4, 4)).all()
+    settled = agree(believe(belief, neighbour), certain, unique)
+    assert (settled >= 0).all() and (settled[0] == (4, 4)).all()

@@ -7,7 +7,7 @@ from sl_nerfstudio.decoding.grid.graph import STEPS, neighbourhoods
 from sl_nerfstudio.pattern.codes import rotate_codes
 from training.captures import random_capture
 from training.graphs import Damage, damage_graph, soft_scores
-from training.patterns import CELLS, PatternStock, draw_pattern
+from training.patterns import CELLS, PatternStock, draw_pattern, random_grid
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +47,10 @@ def test_the_same_seed_gives_the_same():
 
 
 def test_nodes_of_drawn_patterns_are_where_the_codes_say():
-    pattern = draw_pattern(np.random.default_rng(0))
+    pattern = draw_pattern(random_grid(np.random.default_rng(0)))
     middle = np.rint((np.arange(CELLS) + 0.5) * pattern.period).astype(int)
     plain = pattern.codes == 0
-    assert pattern.picture[np.ix_(middle, middle)][plain].min() > 0.95
+    assert pattern.pictures[..., 0][np.ix_(middle, middle)][plain].min() > 0.95
 
 
 @pytest.mark.parametrize("turn", range(4))

@@ -22,8 +22,8 @@ _ROUNDS = 4
 _TRUST = 0.7  # weight of a neighbour's belief
 _FLOOR = -12.0  # the lowest log probability: no node excludes a place more than this
 # Pieces.
-_LEAST_PIECE = 4  # nodes
-_LEAST_LOG_ODDS = 3.0  # of a piece's place against all other places, and no place, together
+LEAST_PIECE = 4  # nodes
+_LEAST_LOG_ODDS = 3.0  # that no piece of the graph is at a wrong place by chance
 _GROWTH = 3  # rounds in which places spread from pieces to their neighbours
 _CHECKED = 2  # edges from a node within which symbols must agree with the places
 
@@ -41,40 +41,49 @@ class Assignment:
         return self.place[:, 0] >= 0
 
 
-def choose_turn(log_probability: Float32[ndarray, "n m"], turn_of: ndarray) -> int:
-    """The quarter turn that is most probable for all nodes together, each at its best place."""
-    sums = [
-        np.sum(np.maximum(log_probability[:, turn_of == turn].max(-1), _FLOOR)) if (turn_of == turn).any() else -np.inf
-        for turn in range(4)
-    ]
-    return int(np.argmax(sums))
+def choose_turn(best: Float32[ndarray, "n 4"]) -> int:
+    """The quarter turn in which most nodes are recognised; `best` is each node's highest log probability in each.
+
+    A sum of probabilities, not of their logarithms: many nodes of another texture must not outvote a few certain ones.
+    """
+    return int(np.argmax(np.exp(best).sum(0)))
 
 
-def agree(
-    log_probability: Float32[ndarray, "n rows columns"],
-    graph: GridGraph,
-    codes: Int8[ndarray, "rows columns"],
-    turn: int,
-) -> Assignment:
-    """Assignments for one quarter turn.
+def believe(
+    log_probability: Float32[ndarray, "n rows columns"], neighbour: Int32[ndarray, "n 4"]
+) -> Int32[ndarray, "n 2"]:
+    """The place (row, column) of each node that is most probable by itself and its neighbours.
 
-    `log_probability` is that of every place in the turned array `codes`, for each node.
+    `log_probability` is that of every place in the turned array, for each node.
     """
     n, _, columns = log_probability.shape
     own = np.maximum(log_probability, _FLOOR)
     belief = own
     for _ in range(_ROUNDS):
-        belief = _exchange(own, belief, graph.neighbour)
+        belief = _exchange(own, belief, neighbour)
     best = belief.reshape(n, -1).argmax(-1)
-    place = np.stack([best // columns, best % columns], -1).astype(np.int32)
-    piece = _pieces(place, graph.neighbour)
-    for number in np.unique(piece[piece >= 0]):
+    return np.stack([best // columns, best % columns], -1).astype(np.int32)
+
+
+def agree(
+    place: Int32[ndarray, "n 2"], graph: GridGraph, codes: Int8[ndarray, "rows columns"]
+) -> Int32[ndarray, "n 2"]:
+    """The places on which pieces of the graph agree, and which their symbols prove; -1 for other nodes.
+
+    `place` is what each node believes, and `codes` the turned array.
+    """
+    place, piece = place.copy(), _pieces(place, graph.neighbour)
+    sizes = np.bincount(piece[piece >= 0], minlength=1)
+    place[sizes[piece] < LEAST_PIECE] = -1
+    judged = np.nonzero(sizes >= LEAST_PIECE)[0]
+    # The more pieces there are, the more often one of them fits by chance.
+    least = _LEAST_LOG_ODDS + np.log(max(len(judged), 1))
+    for number in judged:
         inside = piece == number
-        place[inside] = _best_place(place[inside], graph.score[inside], codes)
+        place[inside] = _best_place(place[inside], graph.score[inside], codes, float(least))
     for _ in range(_GROWTH):
         place = _grow(place, graph.neighbour, codes.shape)
-    place = _without_contradicted(place, graph, codes)
-    return Assignment(turn, place)
+    return _without_contradicted(place, graph, codes)
 
 
 def _without_contradicted(
@@ -96,12 +105,10 @@ def _without_contradicted(
 
 
 def _best_place(
-    place: Int32[ndarray, "k 2"], score: Float32[ndarray, "k 5"], codes: Int8[ndarray, "rows columns"]
+    place: Int32[ndarray, "k 2"], score: Float32[ndarray, "k 5"], codes: Int8[ndarray, "rows columns"], least: float
 ) -> Int32[ndarray, "k 2"]:
     """The places of a piece's nodes, shifted together to where their symbols fit; -1 if no place is clearly best."""
     nowhere = np.full_like(place, -1)
-    if len(place) < _LEAST_PIECE:
-        return nowhere
     first, extent = place.min(0), place.max(0) - place.min(0)
     shape = np.array(codes.shape) - extent  # places of its upper left corner with all of it inside
     fit = np.zeros(shape, dtype=np.float64)
@@ -112,7 +119,7 @@ def _best_place(
     others[top] = 0
     # The piece may show no part of this pattern, and fit one of the many places by chance.
     chance = fit.size * np.exp(np.minimum(-len(place) * np.log(score.shape[1]) - fit[top], 50))
-    if -np.log(max(others.sum() + chance, 1e-30)) < _LEAST_LOG_ODDS:
+    if -np.log(max(others.sum() + chance, 1e-30)) < least:
         return nowhere
     return (place - first + np.array(top)).astype(np.int32)
 

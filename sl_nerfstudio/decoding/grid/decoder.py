@@ -17,7 +17,7 @@ class NetworkDecoder(Decoder[GridPattern]):
     """Decodes single images with the trained networks of this package."""
 
     name: ClassVar[str] = "network"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     reads: ClassVar[str] = GridPattern.kind
     sequence: ClassVar[bool] = False
 

@@ -27,17 +27,19 @@ _LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
 _ROUNDS = 4
 _SMOOTHING = 0.35  # window in which coordinates are taken to be linear, periods
-_LARGEST_SHIFT = 0.25  # periods, of all rounds together
+_LARGEST_SHIFT = 0.12  # periods, of all rounds together
 
 
 def fit_densely(
     image: Float32[ndarray, "h w"],
     coords: Float32[ndarray, "h w 2"],
+    trust: Float32[ndarray, "h w"],
     grids: tuple[DrawnGrid, ...],
     pixels_a_period: float,
 ) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
     """Refined coordinates in pattern pixels, and the correlation of pattern and image there (-1 to 1).
 
+    `trust` is the weight of each pixel, from 0 to 1: in a shadow the image must not pull at the pattern.
     `coords` may be off by a quarter of a period; regions smaller than a period squared are left out.
     """
     out = np.full_like(coords, np.nan)
@@ -47,7 +49,7 @@ def fit_densely(
     for box, inside in _regions(coords, grids[0].period):
         if inside.sum() < least:
             continue
-        coarse = _coarser(image[box], coords[box], inside, factor)
+        coarse = _coarser(image[box], coords[box], trust[box] * inside, inside, factor)
         values, fit = _refine(*coarse, grids, pixels_a_period / factor)
         values, fit = _finer(values, inside.shape, factor), _finer(fit, inside.shape, factor)
         out[box][inside], agreement[box][inside] = values[inside], fit[inside]
@@ -55,19 +57,24 @@ def fit_densely(
 
 
 def _coarser(
-    image: Float32[ndarray, "h w"], coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], factor: int
-) -> tuple[Float32[ndarray, "a b"], Float32[ndarray, "a b 2"], Bool[ndarray, "a b"]]:
+    image: Float32[ndarray, "h w"],
+    coords: Float32[ndarray, "h w 2"],
+    trust: Float32[ndarray, "h w"],
+    inside: Bool[ndarray, "h w"],
+    factor: int,
+) -> tuple[Float32[ndarray, "a b"], Float32[ndarray, "a b 2"], Float32[ndarray, "a b"], Bool[ndarray, "a b"]]:
     """Means over squares of `factor` pixels: faster for fine captures, and as accurate."""
     if factor == 1:
-        return image, coords, inside
+        return image, coords, trust, inside
     h, w = inside.shape
     size = (-(-w // factor), -(-h // factor))
     weight = inside.astype(np.float32)
     values = np.where(inside[..., None], coords, 0)
-    mean = shrink(np.dstack([weight, image * weight, values]).astype(np.float32), size, factor)
+    mean = shrink(np.dstack([weight, image * weight, values, trust]).astype(np.float32), size, factor)
     known = np.maximum(mean[..., :1], 1e-6)
     mean[..., 1:] /= known
-    return mean[..., 1].copy(), mean[..., 2:].copy(), mean[..., 0] > _LEAST_INSIDE
+    covered = mean[..., 0] > _LEAST_INSIDE
+    return mean[..., 1].copy(), mean[..., 2:4].copy(), mean[..., 4] * covered, covered
 
 
 def _finer(values: Float32[ndarray, "a b *c"], shape: tuple[int, ...], factor: int) -> Float32[ndarray, "h w *c"]:
@@ -121,6 +128,7 @@ def _number_regions(coords: ndarray, tear: float, number: ndarray) -> None:
 def _refine(
     image: Float32[ndarray, "h w"],
     coords: Float32[ndarray, "h w 2"],
+    trust: Float32[ndarray, "h w"],
     inside: Bool[ndarray, "h w"],
     grids: tuple[DrawnGrid, ...],
     pixels_a_period: float,
@@ -133,15 +141,15 @@ def _refine(
         return np.full_like(coords, np.nan), np.zeros_like(image)
     coords, period = local_planes(coords, inside, _SMOOTHING * pixels_a_period), grids[0].period
     start, even = coords, Light.even(image.shape)
-    fits = [fit_shift(image, coords, inside, grid, even, pixels_a_period) for grid in grids]
+    fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period) for grid in grids]
     best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
-    shift, light = fits[best][0], measure_light(image, coords, inside, grids[best], pixels_a_period)
+    shift, light = fits[best][0], measure_light(image, coords, trust, grids[best], pixels_a_period)
     for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)
         if index == 0:  # the network's remaining noise; smoothing in every round would flatten the surface
             coords = local_planes(coords, inside, _SMOOTHING * pixels_a_period)
-        shift, _ = fit_shift(image, coords, inside, grids[best], light, pixels_a_period)
+        shift, _ = fit_shift(image, coords, trust, grids[best], light, pixels_a_period)
     # Judged in even light: what only the fitted light explains must not count as agreement.
-    return coords, fit_shift(image, coords, inside, grids[best], even, pixels_a_period)[1]
+    return coords, fit_shift(image, coords, trust, grids[best], even, pixels_a_period)[1]

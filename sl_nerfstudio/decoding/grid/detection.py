@@ -1,4 +1,4 @@
-"""Where in an image the grid is: its scale and roll, the phases and symbols that the U-Net reads, and its nodes."""
+"""Where in an image the grid is: its scale and roll, what the networks read there, and where its nodes belong."""
 
 from dataclasses import dataclass
 
@@ -6,76 +6,86 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.graph import GridGraph, PhaseMaps, build_graph
-from sl_nerfstudio.decoding.grid.phase_reader import measure_appearance, predict_maps
-from sl_nerfstudio.decoding.grid.rectify import GridAppearance, RectifiedImage, guess_appearances, rectify
+from sl_nerfstudio.decoding.grid.consensus import LEAST_PIECE, Assignment
+from sl_nerfstudio.decoding.grid.graph import GridGraph, PhaseMaps, build_graph, without_fragments
+from sl_nerfstudio.decoding.grid.phase_reader import clear_places, measure_appearance, node_places, predict_maps
+from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
+from sl_nerfstudio.decoding.grid.rectify import PERIODS, GridAppearance, RectifiedImage, guess_appearances, rectify
 from sl_nerfstudio.decoding.grid.trained import load_unet
+from sl_nerfstudio.pattern.grid import GridPattern
 
-LEAST_NODES = 12  # fewer show no grid
-_LEAST_RANGE = 4 / 255  # of brightness: an image with less is blank
-# When a guess of the grid's appearance is good enough.
-_BETTER = 1.3  # times the nodes of the best guess so far: only then another guess replaces it
-_MANY_NODES = 100  # with so many nodes ...
-_MANY_EDGES = 2.5  # ... and so many neighbours per node, further guesses are not tried
+LEAST_NODES = 12  # fewer known places show no grid
+# When further guesses of the grid's appearance are not tried.
+_MANY_NODES = 100
+_MOST = 0.6  # share of all nodes that have a place
 # When an image is rectified a second time, by the appearance that was measured in the first.
 _SCALE_RANGE = (0.75, 1.3)  # measured over guessed period
 _ROLL_RANGE = np.radians(15.0)
-_PERIODS = (3.0, 80.0)  # pixels
 
 
 @dataclass(frozen=True)
 class DetectedGrid:
-    """The grid of an image as the U-Net read it."""
+    """The grid of an image as the networks read it."""
 
     appearance: GridAppearance
     rectified: RectifiedImage
     maps: PhaseMaps
     graph: GridGraph
+    assignment: Assignment
+
+    @property
+    def nodes(self) -> int:
+        """Number of crossings that are joined to others."""
+        return len(self.graph.place)
+
+    @property
+    def known(self) -> int:
+        """Number of crossings whose place in the pattern is known."""
+        return int(self.assignment.known.sum())
 
 
 class GridDetector:
-    """Finds the grid in images, with the trained U-Net."""
+    """Finds the grid of one pattern in images, with the trained networks."""
 
-    def __init__(self) -> None:
+    def __init__(self, pattern: GridPattern) -> None:
         self._unet = load_unet()
+        self._recogniser = NodeRecogniser(pattern)
 
-    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
-        """Try the most probable appearances of the grid. Raises DecodingError if none shows enough crossings."""
-        if float(np.ptp(grey)) < _LEAST_RANGE:
-            raise DecodingError(
-                "is blank: all pixels have nearly the same brightness",
-                "the projector was off, or the exposure far too short or too long",
-                "look at the image, and capture it again with the pattern visible",
-            )
+    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid | None:
+        """The reading in which most nodes have a place, after trying the most probable appearances of the grid.
+
+        Textures show crossings, too, but hardly any of them fits the pattern. None for an image without contrast.
+        """
         best: DetectedGrid | None = None
         for appearance in guess_appearances(grey):
             found = self._read(grey, appearance)
-            if best is None or len(found.graph.place) > _BETTER * len(best.graph.place):
+            if best is None or (found.known, found.nodes) > (best.known, best.nodes):
                 best = found
-            nodes, edges = len(best.graph.place), int((best.graph.neighbour >= 0).sum())
-            if edges > _MANY_EDGES * nodes > _MANY_EDGES * _MANY_NODES:
+            if best.known > max(_MANY_NODES, _MOST * best.nodes):
                 break
-        if best is None or len(best.graph.place) < LEAST_NODES:
-            count = 0 if best is None else len(best.graph.place)
-            raise DecodingError(
-                f"shows no grid of lines ({count} crossings were found, {LEAST_NODES} are needed)",
-                "the pattern is outside the camera's view, far out of focus, or too weak against other light; or it is "
-                "not the coded grid",
-                "capture again with the pattern sharp and well exposed, and a period at least 8 pixels wide",
-            )
         return best
 
+    def assign(self, graph: GridGraph) -> Assignment:
+        """The places of a graph's nodes in the pattern."""
+        return self._recogniser.assign(graph)
+
     def _read(self, grey: Float32[ndarray, "h w"], appearance: GridAppearance) -> DetectedGrid:
-        """Rectify by a guess and read; once more if the phases show that the guess was far off."""
+        """Rectify by a guess and read; once more if what fits the pattern shows that the guess was far off."""
+        found = self._read_once(grey, appearance)
+        known = found.assignment.known
+        where = clear_places(found.maps) if found.known < LEAST_NODES else node_places(found.maps, found.graph, known)
+        measured = measure_appearance(found.maps, appearance, where)
+        if measured is None or not _far_off(measured, appearance):
+            return found
+        period = float(np.clip(measured.period, *PERIODS))
+        again = self._read_once(grey, GridAppearance(period, measured.roll))
+        return again if (again.known, again.nodes) > (found.known, found.nodes) else found
+
+    def _read_once(self, grey: Float32[ndarray, "h w"], appearance: GridAppearance) -> DetectedGrid:
         rectified = rectify(grey, appearance)
         maps = predict_maps(rectified, self._unet)
-        measured = measure_appearance(maps, appearance)
-        if measured is not None and _far_off(measured, appearance):
-            appearance = GridAppearance(float(np.clip(measured.period, *_PERIODS)), measured.roll)
-            rectified = rectify(grey, appearance)
-            maps = predict_maps(rectified, self._unet)
-        return DetectedGrid(appearance, rectified, maps, build_graph(maps))
+        graph = without_fragments(build_graph(maps), LEAST_PIECE)
+        return DetectedGrid(appearance, rectified, maps, graph, self.assign(graph))
 
 
 def _far_off(measured: GridAppearance, guess: GridAppearance) -> bool:

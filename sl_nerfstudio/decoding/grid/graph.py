@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 from scipy.ndimage import maximum_filter, uniform_filter1d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 RIGHT, DOWN, LEFT, UP = range(4)
@@ -47,6 +49,12 @@ class GridGraph:
     neighbour: Int32[ndarray, "n 4"]
     score: Float32[ndarray, "n 5"]  # probability of each symbol
 
+    def part(self, index: Int32[ndarray, "k"]) -> "GridGraph":
+        """The nodes of the given numbers, with the edges between them."""
+        number = np.full(len(self.place) + 1, -1, dtype=np.int32)  # the last stands for no neighbour
+        number[index] = np.arange(len(index), dtype=np.int32)
+        return GridGraph(self.place[index], number[self.neighbour[index]], self.score[index])
+
 
 def phase_maps(
     mask: Float32[ndarray, "h w"], vector: Float32[ndarray, "4 h w"], symbol: Float32[ndarray, "5 h w"]
@@ -75,6 +83,21 @@ def build_graph(maps: PhaseMaps) -> GridGraph:
         for direction in (RIGHT, DOWN):
             _join(maps, place, jacobian, tree, neighbour, direction)
     return GridGraph(place, neighbour, _symbol_scores(maps, place))
+
+
+def component_of(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n"]:
+    """Number of the connected component that each node lies in."""
+    n = len(neighbour)
+    node, direction = np.nonzero(neighbour >= 0)
+    ends = (node, neighbour[node, direction])
+    return connected_components(coo_matrix((np.ones(len(node), dtype=bool), ends), shape=(n, n)), directed=False)[1]
+
+
+def without_fragments(graph: GridGraph, least: int) -> GridGraph:
+    """The components of at least `least` nodes: single crossings are seen in any texture."""
+    component = component_of(graph.neighbour)
+    size = np.bincount(component, minlength=1)
+    return graph.part(np.nonzero(size[component] >= least)[0].astype(np.int32))
 
 
 def _find_nodes(maps: PhaseMaps) -> tuple[Float32[ndarray, "n 2"], Float32[ndarray, "n 2 2"]]:

@@ -10,14 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
-from sl_nerfstudio.decoding.grid.consensus import Assignment
+from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
 from sl_nerfstudio.decoding.grid.detection import LEAST_NODES, DetectedGrid, GridDetector
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
 from sl_nerfstudio.decoding.grid.likelihood import symbol_log_ratio
-from sl_nerfstudio.decoding.grid.phase_reader import PixelPhases, map_from_pixels, sample_pixels, to_pixel_coordinates
-from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
+from sl_nerfstudio.decoding.grid.phase_reader import LEAST_MASK, map_from_pixels, sample_pixels, to_pixel_coordinates
+from sl_nerfstudio.decoding.grid.refusal.causes import refusal
+from sl_nerfstudio.decoding.grid.reliability import Evidence
+from sl_nerfstudio.decoding.grid.trained import load_reliability
 from sl_nerfstudio.decoding.grid.unwrap import spread
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.pattern.codes import rotate_codes
@@ -25,13 +26,11 @@ from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.scan.images import as_grey
 
-# Which captures are refused.
-_MOST_NODES = 1.5  # of the pattern's own: at the edges of surfaces some nodes are seen twice
-_LEAST_KNOWN = 0.2  # share of the crossings whose place must be found; with fewer it is another pattern
 # Which pixels are kept.
+_LEAST_TRUST = 0.02  # weight in the fit of a pixel that hardly shows the pattern
 _LEAST_LOG_RATIO = 0.3  # log-likelihood ratio of the symbols around a pixel
 _LEAST_AGREEMENT = 0.35  # correlation of the image with the drawn pattern
-_RELATIVE_AGREEMENT = 0.66  # the same, relative to the median: a sharp capture agrees nearly everywhere
+_MOST_WRONG = 0.2  # probability that the pixel is wrong
 _SMALLEST_REGION = 2.0  # periods squared
 _TEAR = 0.5  # periods between neighbouring pixels
 _NORMALISING = 0.8  # window of the local intensity normalisation, periods
@@ -42,8 +41,8 @@ class GridImageDecoder:
 
     def __init__(self, pattern: GridPattern) -> None:
         self.pattern = pattern
-        self._detector = GridDetector()
-        self._recogniser = NodeRecogniser(pattern)
+        self._detector = GridDetector(pattern)
+        self._reliability = load_reliability()
 
     def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """Projector coordinates of every pixel that shows the pattern.
@@ -52,47 +51,33 @@ class GridImageDecoder:
         pattern.
         """
         grey = as_grey(image)
+        found = self.detect(grey)
+        evidence = self.examine(grey, found)
+        fitted = self._select(evidence, found.appearance.period)
+        mask = (evidence.probability > LEAST_MASK) | np.isfinite(fitted[..., 0])
+        return Decoded(fitted, mask, self._normalise(grey, mask, found.appearance.period))
+
+    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
+        """The grid in an image. Raises DecodingError if too little of it fits the pattern."""
         found = self._detector.detect(grey)
-        assignment = self._recognise(found)
+        if found is None or found.known < LEAST_NODES:
+            raise refusal(grey, found, self._detector, self.pattern)
+        return found
+
+    def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> Evidence:
+        """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
+        assignment, known = found.assignment, found.assignment.known
         phases = sample_pixels(found.maps, found.rectified, (grey.shape[0], grey.shape[1]))
-        coords = self._coordinates(phases, found, assignment)
-        coords = self._refine(grey, coords, found.appearance.period)
-        mask = phases.mask | np.isfinite(coords[..., 0])
-        return Decoded(coords, mask, self._normalise(grey, mask, found.appearance.period))
-
-    def _recognise(self, found: DetectedGrid) -> Assignment:
-        """The place of every node in the pattern. Raises DecodingError if too few have one."""
-        seen, most = len(found.graph.place), self.pattern.rows * self.pattern.columns
-        if seen > _MOST_NODES * most:
-            raise DecodingError(
-                f"shows {seen} crossings of lines, and the pattern has only {most}",
-                "the image is mostly noise, or it shows another pattern",
-                "give the pattern.json of the pattern that was projected; capture again with more light",
-            )
-        assignment = self._recogniser.assign(found.graph)
-        known = int(assignment.known.sum())
-        if known < max(LEAST_NODES, _LEAST_KNOWN * seen):
-            raise DecodingError(
-                f"shows a grid of {seen} crossings, but only {known} of them fit the pattern",
-                "the pattern's description is that of another pattern, the image is mirrored, or it is too blurred or "
-                "noisy for the symbols to be read",
-                "give the pattern.json of the pattern that was projected; capture again in focus, or from a shorter "
-                "distance",
-            )
-        return assignment
-
-    def _coordinates(
-        self, phases: PixelPhases, found: DetectedGrid, assignment: Assignment
-    ) -> Float32[ndarray, "h w 2"]:
-        """Coordinates in pattern pixels from the nodes' places and the phases."""
-        known = assignment.known
         at = np.floor(to_pixel_coordinates(found.graph.place[known], found.rectified)).astype(np.int32)
         turned = spread(phases.phase, phases.clear, np.ascontiguousarray(at[:, ::-1]), assignment.place[known])
         codes = rotate_codes(np.asarray(self.pattern.codes), assignment.turn)
         to_map = map_from_pixels(found.rectified)
         log_ratio = symbol_log_ratio(turned, codes, found.maps.symbol, to_map, found.appearance.period)
         turned = np.where((log_ratio > _LEAST_LOG_RATIO)[..., None], turned, np.float32(np.nan))
-        return self._turn_back(turned, assignment.turn)
+        read = self._turn_back(turned, assignment.turn)
+        trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
+        fitted, agreement = fit_densely(grey, read, trust, self._drawn, found.appearance.period)
+        return Evidence(read, fitted, agreement, log_ratio, phases.probability)
 
     def _turn_back(self, turned: Float32[ndarray, "h w 2"], turn: int) -> Float32[ndarray, "h w 2"]:
         """From periods (x, y) in the turned array to pattern pixels; NaN outside the pattern."""
@@ -107,17 +92,13 @@ class GridImageDecoder:
         coords = np.stack([grid.x0 + j * grid.period, grid.y0 + i * grid.period], -1).astype(np.float32)
         return np.where(_inside(coords, grid)[..., None], coords, np.float32(np.nan))
 
-    def _refine(
-        self, grey: Float32[ndarray, "h w"], coords: Float32[ndarray, "h w 2"], pixels_a_period: float
-    ) -> Float32[ndarray, "h w 2"]:
-        """Fitted to the image, without pixels that do not agree with it and without small regions."""
-        refined, agreement = fit_densely(grey, coords, self._drawn, pixels_a_period)
-        known = np.isfinite(coords[..., 0])
-        usual = float(np.median(agreement[known])) if known.any() else 0.0
-        kept = (agreement > max(_LEAST_AGREEMENT, _RELATIVE_AGREEMENT * usual)) & _inside(refined, self.pattern)
-        refined = np.where(kept[..., None], refined, np.float32(np.nan))
+    def _select(self, evidence: Evidence, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
+        """The fitted coordinates without pixels that are probably wrong and without small regions."""
+        wrong = self._reliability.wrong(evidence.features(self.pattern.period, pixels_a_period))
+        kept = (wrong < _MOST_WRONG) & (evidence.agreement > _LEAST_AGREEMENT) & _inside(evidence.fitted, self.pattern)
+        coords = np.where(kept[..., None], evidence.fitted, np.float32(np.nan))
         least = round(_SMALLEST_REGION * pixels_a_period**2)
-        return drop_small_regions(refined, _TEAR * self.pattern.period, least)
+        return drop_small_regions(coords, _TEAR * self.pattern.period, least)
 
     @cached_property
     def _drawn(self) -> tuple[DrawnGrid, ...]:

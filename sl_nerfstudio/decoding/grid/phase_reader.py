@@ -9,16 +9,17 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD, network_channels
-from sl_nerfstudio.decoding.grid.graph import PhaseMaps, phase_maps
+from sl_nerfstudio.decoding.grid.graph import GridGraph, PhaseMaps, phase_maps
 from sl_nerfstudio.decoding.grid.rectify import GridAppearance, RectifiedImage, integer_centres
 from sl_nerfstudio.decoding.grid.unet import STRIDE, UNet
 
 # Pixels of the capture that are used.
-_LEAST_MASK = 0.4  # probability that the pattern is there
+LEAST_MASK = 0.4
+"""Probability above which a pixel shows the pattern."""
 _LEAST_VECTOR = 0.35  # length of a phase's (cosine, sine) below which the phase is unknown
 # Places of the maps by which the grid's appearance is measured: only clear ones.
 _CLEAR_MASK, _CLEAR_VECTOR = 0.5, 0.6
-_FEWEST_CLEAR = 20
+_FEWEST = 12
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,13 @@ class PixelPhases:
     """Phases at the pixels of the capture."""
 
     phase: Float32[ndarray, "h w 2"]  # periods, from -0.5 to 0.5
-    mask: Bool[ndarray, "h w"]  # the pattern is there
+    probability: Float32[ndarray, "h w"]  # that the pattern is there
     clear: Bool[ndarray, "h w"]  # the pattern is there and its phases are known
+
+    @property
+    def mask(self) -> Bool[ndarray, "h w"]:
+        """Pixels that show the pattern."""
+        return self.probability > LEAST_MASK
 
 
 def predict_maps(rectified: RectifiedImage, network: UNet) -> PhaseMaps:
@@ -39,15 +45,27 @@ def predict_maps(rectified: RectifiedImage, network: UNet) -> PhaseMaps:
     return phase_maps(mask.numpy(), output.phase[0].contiguous().numpy(), output.symbol[0].contiguous().numpy())
 
 
-def measure_appearance(maps: PhaseMaps, guess: GridAppearance) -> GridAppearance | None:
-    """Period and roll of the grid in the capture by the phases that were read; `guess` is what it was rectified by.
+def clear_places(maps: PhaseMaps) -> Bool[ndarray, "h w"]:
+    """Places of the maps at which the network is certain."""
+    return (maps.mask > _CLEAR_MASK) & (np.hypot(maps.vector[0], maps.vector[1]) > _CLEAR_VECTOR)
 
-    None where hardly any phase is clear.
+
+def node_places(maps: PhaseMaps, graph: GridGraph, chosen: Bool[ndarray, "n"]) -> Bool[ndarray, "h w"]:
+    """The places of the chosen nodes of a graph."""
+    where = np.zeros(maps.mask.shape, dtype=bool)
+    column, row = np.rint(graph.place[chosen]).astype(int).T
+    where[np.clip(row, 0, where.shape[0] - 1), np.clip(column, 0, where.shape[1] - 1)] = True
+    return where
+
+
+def measure_appearance(maps: PhaseMaps, guess: GridAppearance, where: Bool[ndarray, "h w"]) -> GridAppearance | None:
+    """Period and roll of the grid in the capture by the phases at some places; `guess` is what it was rectified by.
+
+    None where there are hardly any places.
     """
-    clear = (maps.mask > _CLEAR_MASK) & (np.hypot(maps.vector[0], maps.vector[1]) > _CLEAR_VECTOR)
-    if clear.sum() < _FEWEST_CLEAR:
+    if where.sum() < _FEWEST:
         return None
-    jacobian = np.moveaxis(maps.gradient[:, :, clear], -1, 0) / STRIDE
+    jacobian = np.moveaxis(maps.gradient[:, :, where], -1, 0) / STRIDE
     area = np.median(np.abs(np.linalg.det(jacobian)))
     middle = np.median(jacobian, axis=0)
     # Directions of the lines of constant y and of constant x, each as an angle from its own axis.
@@ -68,8 +86,8 @@ def sample_pixels(maps: PhaseMaps, rectified: RectifiedImage, shape: tuple[int, 
     mask, vector = parts[0][..., 0], parts[1]
     phase = np.stack([np.arctan2(vector[..., 1], vector[..., 0]), np.arctan2(vector[..., 3], vector[..., 2])], -1)
     strength = np.minimum(np.hypot(vector[..., 0], vector[..., 1]), np.hypot(vector[..., 2], vector[..., 3]))
-    seen = mask > _LEAST_MASK
-    return PixelPhases((phase / (2 * np.pi)).astype(np.float32), seen, seen & (strength > _LEAST_VECTOR))
+    clear = (mask > LEAST_MASK) & (strength > _LEAST_VECTOR)
+    return PixelPhases((phase / (2 * np.pi)).astype(np.float32), mask, clear)
 
 
 def map_from_pixels(rectified: RectifiedImage) -> Float64[ndarray, "2 3"]:

@@ -19,7 +19,8 @@ _TILE = 128  # side of a tile, pixels
 _STEP = 64  # between two tiles
 _WEAKEST = 1e-3  # contrast of a tile, relative to the brightest pixel, below which it is ignored
 # Their polar form.
-_PERIODS = (5.5, 40.0)  # pixels: the shortest and the longest that are searched
+PERIODS = (5.5, 40.0)
+"""Pixels: the shortest and the longest period that is searched."""
 _ANGLES, _RADII = 90, 72  # samples: angles over half a turn, periods on a logarithmic scale
 # The peaks.
 _LEAST_PEAK = 0.2  # of the highest one
@@ -101,7 +102,7 @@ def _local_power(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "t t"] | No
     for top in range(0, padded.shape[0] - _TILE + 1, _STEP):
         for left in range(0, padded.shape[1] - _TILE + 1, _STEP):
             tile = padded[top : top + _TILE, left : left + _TILE]
-            slow = cv2.GaussianBlur(tile, (0, 0), _PERIODS[1] / 3)
+            slow = cv2.GaussianBlur(tile, (0, 0), PERIODS[1] / 3)
             flat = (tile - slow) * window
             power = float((flat * flat).sum())
             if power < (noise * _TILE) ** 2:
@@ -114,7 +115,7 @@ def _local_power(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "t t"] | No
 
 
 def _frequencies() -> Float64[ndarray, "radii"]:
-    return np.exp(np.linspace(np.log(1 / _PERIODS[1]), np.log(1 / _PERIODS[0]), _RADII))
+    return np.exp(np.linspace(np.log(1 / PERIODS[1]), np.log(1 / PERIODS[0]), _RADII))
 
 
 def _polar(power: Float32[ndarray, "t t"]) -> Float32[ndarray, "radii angles"]:

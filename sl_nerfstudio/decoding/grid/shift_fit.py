@@ -5,7 +5,7 @@ moments of the image, the drawn pattern and its derivatives.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, Light
@@ -20,21 +20,21 @@ _LIGHT_MOMENTS = [0, 1, 4, 10, 11]  # those that contrast and brightness follow 
 _LEAST_CONTRAST, _WELL_LIT = 0.25, 0.9  # share of the contrast at this quantile of the image
 # Shift.
 _LARGEST_STEP = 0.2  # periods
-_PRIOR = 0.02  # weight of a shift of one period, as a share of the window's contrast
+_PRIOR = 0.1  # weight of a shift of one period, as a share of the window's contrast
 _LEAST_RELATIVE_CONTRAST = 0.05  # of the contrast that the image has in the window
 
 
 def fit_shift(
     image: Float32[ndarray, "h w"],
     coords: Float32[ndarray, "h w 2"],
-    inside: Bool[ndarray, "h w"],
+    trust: Float32[ndarray, "h w"],
     grid: DrawnGrid,
     light: Light,
     pixels_a_period: float,
 ) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
     """Shift of the coordinates, in periods, that moves the drawn pattern onto the image, and their correlation."""
     step = _square_size(pixels_a_period)
-    m = _moments(image, light.on(grid.at(coords)), inside, step)
+    m = _moments(image, light.on(grid.at(coords)), trust, step)
     shift, agreement = _solve(gaussian_means(m, _SHIFT_WINDOW * pixels_a_period / step))
     fit = enlarge(np.dstack([shift, agreement]), image.shape, step)
     return fit[..., :2], fit[..., 2]
@@ -43,13 +43,13 @@ def fit_shift(
 def measure_light(
     image: Float32[ndarray, "h w"],
     coords: Float32[ndarray, "h w 2"],
-    inside: Bool[ndarray, "h w"],
+    trust: Float32[ndarray, "h w"],
     grid: DrawnGrid,
     pixels_a_period: float,
 ) -> Light:
     """The light in the image, from coordinates that are nearly right."""
     step = _square_size(pixels_a_period)
-    m = _moments(image, grid.at(coords), inside, step)
+    m = _moments(image, grid.at(coords), trust, step)
     means = gaussian_means(m[..., _LIGHT_MOMENTS], _LIGHT_WINDOW * pixels_a_period / step)
     contrast, brightness = _contrast_and_brightness(means)
     light = enlarge(np.dstack([contrast, brightness]), image.shape, step)
@@ -62,16 +62,15 @@ def _square_size(pixels_a_period: float) -> int:
 
 
 def _moments(
-    image: Float32[ndarray, "h w"], drawn: Float32[ndarray, "h w 3"], inside: Bool[ndarray, "h w"], step: int
+    image: Float32[ndarray, "h w"], drawn: Float32[ndarray, "h w 3"], trust: Float32[ndarray, "h w"], step: int
 ) -> Float32[ndarray, "a b 15"]:
     """Products of the pattern, its derivatives and the image, averaged over squares of `step` pixels."""
     h, w = image.shape
-    weight = inside.astype(np.float32)
-    p, px, py = (drawn[..., k] * weight for k in range(3))
-    i = image * weight
+    one, p, px, py, i = np.ones_like(image), *np.moveaxis(drawn, -1, 0), image
     products = np.stack(
-        [weight, p, px, py, p * p, p * px, p * py, px * px, px * py, py * py, i, i * p, i * px, i * py, i * i], -1
+        [one, p, px, py, p * p, p * px, p * py, px * px, px * py, py * py, i, i * p, i * px, i * py, i * i], -1
     )
+    products *= trust[..., None]
     size = (-(-w // step), -(-h // step))
     return np.concatenate([shrink(products[..., k : k + 4], size, step) for k in range(0, 15, 4)], -1)
 

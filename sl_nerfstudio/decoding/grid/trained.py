@@ -1,4 +1,4 @@
-"""The trained networks that come with the package."""
+"""What was trained and comes with the package."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import torch
 from safetensors.torch import load_file
 
 from sl_nerfstudio.decoding.grid.gcn import GraphNetwork
+from sl_nerfstudio.decoding.grid.reliability import Reliability
 from sl_nerfstudio.decoding.grid.unet import UNet
 
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -23,6 +24,12 @@ def load_graph_network() -> GraphNetwork:
     network = GraphNetwork()
     network.load_state_dict(_weights("gcn"))
     return network.eval()
+
+
+def load_reliability() -> Reliability:
+    """The trained model of wrong pixels."""
+    values = _weights("reliability")
+    return Reliability(values["weight"].numpy(), float(values["bias"]))
 
 
 def weight_files() -> list[Path]:
