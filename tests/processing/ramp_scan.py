@@ -1,6 +1,7 @@
 """Captures of ramps on a synthetic object: two small images per frame, decoded quickly and almost exactly."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.writing import device_fields
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.setup import Setup, make_setup
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.pattern.ramps import Ramps
 
@@ -52,7 +53,11 @@ def _rendered():
 
 def make_ramp_scan(root: Path) -> RampScan:
     """Neighbouring frames of a walk around the head."""
-    setup, coords = _rendered()
+    return make_captures(root, *_rendered())
+
+
+def make_captures(root: Path, setup: Setup, coords: Sequence[np.ndarray]) -> RampScan:
+    """The captures of the first frames of a setup, from their exact coordinates."""
     for name, uv in zip(NAMES, coords, strict=True):
         folder = root / "images" / name
         folder.mkdir(parents=True)
@@ -63,4 +68,4 @@ def make_ramp_scan(root: Path) -> RampScan:
     camera, projector = setup.devices.camera, setup.devices.projector
     document = {"camera": device_fields(camera, "model"), "projector": device_fields(projector, "model")}
     (root / "intrinsics.json").write_text(json.dumps(document))
-    return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(NAMES)], coords)
+    return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(NAMES)], tuple(coords))

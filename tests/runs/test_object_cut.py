@@ -1,0 +1,79 @@
+"""The object cut out of a mesh: a ball on a table, from noise-free captures."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from sl_nerfstudio.cli.export import ExportConfig, summary
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.runs.export import Exported
+from sl_nerfstudio.runs.object_cut import cut_object
+from sl_nerfstudio.scan import Scan
+from tests.meshing.ray_cast_scan import pairs_around, scan_of
+
+RADIUS = 25.0
+
+
+def _mesh(*parts: trimesh.Trimesh) -> Mesh:
+    vertices, faces, count = [], [], 0
+    for part in parts:
+        vertices.append(np.asarray(part.vertices))
+        faces.append(np.asarray(part.faces) + count)
+        count += len(part.vertices)
+    return Mesh(np.concatenate(vertices).astype(np.float64), np.concatenate(faces).astype(np.int64))
+
+
+def _grid(half: float, z: float) -> trimesh.Trimesh:
+    n = 60
+    x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n), indexing="ij")
+    index = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (v.ravel() for v in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return trimesh.Trimesh(np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3), faces, process=False)
+
+
+BALL = trimesh.creation.icosphere(4, RADIUS)
+TABLE = _grid(140.0, -RADIUS)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Scan:
+    return scan_of(_mesh(BALL, TABLE), pairs_around(8, 45), tmp_path_factory.mktemp("cut") / "scan")
+
+
+def test_the_table_goes_and_the_ball_stays(scan):
+    mesh = _mesh(BALL, TABLE)
+    cut = cut_object(mesh, scan, scan.poses)
+    np.testing.assert_allclose(np.linalg.norm(cut.mesh.vertices, axis=1), RADIUS, rtol=0.03)
+    assert len(cut.removed) == 1 and abs(cut.removed[0].plane.normal[2]) > 0.9999
+    assert cut.area_before == pytest.approx(mesh.face_areas().sum())
+    assert cut.area_before - cut.area_removed == pytest.approx(cut.mesh.face_areas().sum())
+    seen = BALL.vertices[:, 2] > -0.5 * RADIUS
+    assert cut.mesh.vertices[:, 2].max() > 0.99 * RADIUS and len(cut.mesh.vertices) > 0.95 * seen.sum()
+
+
+def test_the_summary_says_what_was_removed_and_why(scan):
+    cut = cut_object(_mesh(BALL, TABLE), scan, scan.poses)
+    exported = Exported(cut.mesh, None, cut, None, 1.0, 1.0)
+    text = summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported)
+    assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
+    assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
+
+
+def test_a_surface_elsewhere_leaves_nothing(scan):
+    far = Mesh(BALL.vertices + 500.0, np.asarray(BALL.faces, np.int64))
+    with pytest.raises(UserError, match=r"leaves nothing of the surface\n.*far from the scan's decoded points"):
+        cut_object(far, scan, scan.poses)
+
+
+def test_a_scan_without_coordinates_is_refused(tmp_path):
+    def nothing(_, coords):
+        return np.full_like(coords, np.nan)
+
+    empty = scan_of(_mesh(BALL, TABLE), pairs_around(2, 45), tmp_path / "scan", nothing)
+    with pytest.raises(UserError, match="no frame has decoded coordinates, so --object-only cannot find the object"):
+        cut_object(_mesh(BALL, TABLE), empty, empty.poses)
