@@ -168,9 +168,9 @@ def test_bounced_light_of_a_disc_is_the_textbook_form_factor():
     caster = RayCaster(_scene(_square(50.0, 0.0), _square(50.0, 30.0, -1)))
     eye = np.array([[0.0, 0.0, 30.0]])
     down = np.array([[0.0, 0.0, -1.0]])
-    vectors = light_vectors(caster, _lit_disc(20.0), eye, down)
+    vectors = light_vectors(caster, _lit_disc(20.0, 36), eye, down)
     assert vectors[0, 1] @ down[0] == pytest.approx(20**2 / (20**2 + 30**2), rel=0.01)
-    assert not light_vectors(caster, _lit_disc(20.0), eye, -down).any(), "nothing reaches the side that looks away"
+    assert not light_vectors(caster, _lit_disc(20.0, 36), eye, -down).any(), "nothing reaches the side that looks away"
 
 
 def test_bounced_light_does_not_pass_through_surfaces():
