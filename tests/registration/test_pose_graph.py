@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from sl_nerfstudio.registration.cycle_consistency import cycle_consistency
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.cycle_consistency import cycle_consistency
-from sl_nerfstudio.registration.pairs.edge_weights import edge_weights
 from sl_nerfstudio.registration.graph_residuals import Pivots
+from sl_nerfstudio.registration.pairs.edge_weights import edge_weights
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 

@@ -12,8 +12,8 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unprojec
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, agreement, agreement_at
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
