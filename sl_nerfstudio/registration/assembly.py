@@ -55,15 +55,22 @@ class Assembly:
     """Components of frames, grown along registered pairs."""
 
     def __init__(
-        self, sides: Sequence[Side], pivots: Pivots, edges: Sequence[PairMatch], settings: RegistrationSettings
+        self,
+        sides: Sequence[Side],
+        pivots: Pivots,
+        edges: Sequence[PairMatch],
+        settings: RegistrationSettings,
+        fitness: Sequence[float] | None = None,
     ) -> None:
+        """`fitness`: of the pairs by which a good one is judged; default: of all edges."""
         self._sides = sides
         self._pivots = pivots
         self._settings = settings
         self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
         self._weight = edge_weights(self._edges, settings.edge)
         self._rejected: set[tuple[frozenset[int], frozenset[int]]] = set()
-        usual = float(np.quantile([e.fitness for e in edges], settings.edge.good_quantile)) if edges else 1.0
+        fitness = [e.fitness for e in edges] if fitness is None else fitness
+        usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
         self._least_fitness = 1 - s.misfit_factor * max(s.least_misfit, 1 - usual)
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
