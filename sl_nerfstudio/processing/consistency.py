@@ -18,6 +18,7 @@ from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
 from sl_nerfstudio.verdict.scan_agreement import compare_frames
+from sl_nerfstudio.verdict.settings import VerdictSettings
 
 _ROUNDS = 4
 _FEWEST = 2  # frames of a scan
@@ -51,7 +52,20 @@ def adjust_consistent(
     if not names:
         return found
     log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
-    return _without_contradictions(clouds, _adjusted(clouds, more), log)
+    with_more = _adjusted(clouds, more)
+    doubtful = [k for k in np.flatnonzero(new) if not _agrees_well(with_more, int(k))]
+    if len(doubtful) == len(names):
+        return found
+    if doubtful:
+        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]))
+    return _without_contradictions(clouds, with_more, log)
+
+
+def _agrees_well(found: ConsistentFrames, k: int) -> bool:
+    """Whether a frame agrees with the others as well as frames of a good scan do."""
+    limits = VerdictSettings()
+    frame = found.cross.frames[int(found.registration.registered[:k].sum())]
+    return frame.excess <= limits.good_excess and frame.share >= limits.good_share
 
 
 def _with_left_out(clouds: Sequence[FrameCloud], found: ConsistentFrames) -> Registration:

@@ -49,7 +49,7 @@ def include_left_out(
     seed: int = 0,
     settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
-    """The registration, at the adjusted poses, with the frames that can now be placed.
+    """The registration, at the adjusted poses, with the frames that can now be placed by more than one pair.
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
@@ -67,11 +67,12 @@ def include_left_out(
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
     used = [e.fitness for e in registration.edges if e.used]
-    assembly = Assembly(graph.sides, graph.pivots, graph.edges, settings, used or None)
+    firm = [e for e in graph.edges if e.slip_deg == 0]
+    assembly = Assembly(graph.sides, graph.pivots, firm, settings, used or None)
     placed: Component = {}
     for k in left_out:
         joint = assembly.decide(main, {k: Similarity.identity()})
-        if joint is not None:
+        if joint is not None and joint.links > 1:
             placed[k] = joint.S_first_second
     return _with_frames(registration, adjusted, placed)
 

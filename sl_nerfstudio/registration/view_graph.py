@@ -92,7 +92,15 @@ class ViewGraph:
         return nearby + alike[: selection.bridges - len(nearby)]
 
     def assemble(self) -> list[Component]:
-        """Components of frames whose connection is certain, the largest first."""
+        """Components of frames whose connection is certain, the largest first.
+
+        Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
+        frames are put together all the same.
+        """
+        firm = [e for e in self.edges if e.slip_deg == 0]
+        components = Assembly(self.sides, self.pivots, firm, self.settings).grow()
+        if len(components[0]) > 1:
+            return components
         return Assembly(self.sides, self.pivots, self.edges, self.settings).grow()
 
     def solve(self, component: Component) -> PoseGraphSolution:
