@@ -68,7 +68,7 @@ class Assembly:
         self._settings = settings
         self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
         self._weight = edge_weights(self._edges, settings.edge)
-        self._rejected: set[tuple[frozenset[int], frozenset[int]]] = set()
+        self._rejected: set[frozenset[frozenset[int]]] = set()
         fitness = [e.fitness for e in edges] if fitness is None else fitness
         usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
@@ -84,11 +84,11 @@ class Assembly:
     def _join_next(self) -> bool:
         for edge in self._edges:
             first, second = self._component_of(edge.target), self._component_of(edge.source)
-            if first is second or (key := (frozenset(first), frozenset(second))) in self._rejected:
+            if first is second or (key := frozenset((frozenset(first), frozenset(second)))) in self._rejected:
                 continue
             joint = self.decide(first, second)
             if joint is None:
-                self._rejected |= {key, key[::-1]}
+                self._rejected.add(key)
                 continue
             self.components = [c for c in self.components if c is not first and c is not second]
             self.components.append(self._joined(first, second, joint.S_first_second))

@@ -19,6 +19,7 @@ from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.threads import one_library_thread
 
 
 def with_relative_pose(
@@ -42,6 +43,7 @@ def with_relative_pose(
     return frame_cloud(cloud.name, cloud.coords, cloud.camera, cloud.projector, pose)
 
 
+@one_library_thread()
 def include_left_out(
     clouds: Sequence[FrameCloud],
     registration: Registration,
