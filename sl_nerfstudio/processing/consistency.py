@@ -44,16 +44,13 @@ def adjust_consistent(
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration), log)
     more = _with_left_out(clouds, found)
-    names = [
-        name
-        for name, new in zip(registration.names, more.registered & ~found.registration.registered, strict=True)
-        if new
-    ]
+    new = np.flatnonzero(more.registered & ~found.registration.registered)
+    names = [registration.names[k] for k in new]
     if not names:
         return found
     log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
     with_more = _adjusted(clouds, more)
-    doubtful = [k for k in np.flatnonzero(new) if not _agrees_well(with_more, int(k))]
+    doubtful = [k for k in new if not _agrees_well(with_more, int(k))]
     if len(doubtful) == len(names):
         return found
     if doubtful:

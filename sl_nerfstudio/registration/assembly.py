@@ -61,8 +61,13 @@ class Assembly:
         edges: Sequence[PairMatch],
         settings: RegistrationSettings,
         fitness: Sequence[float] | None = None,
+        slipping: Sequence[PairMatch] = (),
     ) -> None:
-        """`fitness`: of the pairs by which a good one is judged; default: of all edges."""
+        """`fitness`: of the pairs by which a good one is judged; default: of all edges.
+
+        `slipping`: pairs that may slip. They say nothing, but where most pairs across do, the others are accidents.
+        """
+        self._slipping = slipping
         self._sides = sides
         self._pivots = pivots
         self._settings = settings
@@ -115,6 +120,8 @@ class Assembly:
             return None
         if len(found) > 1 and self._score(found[1]) > s.largest_rival * self._score(best):
             return None
+        if sum(self._quality(e) for e in self._between(self._slipping, first, second)) > best.votes:
+            return None
         if best.links < 2 and not self._certain_alone(first, second):
             return None
         return best
@@ -134,17 +141,23 @@ class Assembly:
         return [self._judge(first, second, one.S_first_second, links) for one in distinct[:most]]
 
     def _crossing(self, first: Component, second: Component) -> list[PairMatch]:
+        return self._between(self._edges, first, second)
+
+    @staticmethod
+    def _quality(e: PairMatch) -> float:
+        return e.overlap * e.fitness**2
+
+    @staticmethod
+    def _between(edges: Sequence[PairMatch], first: Component, second: Component) -> list[PairMatch]:
         return [
-            e
-            for e in self._edges
-            if (e.source in first and e.target in second) or (e.source in second and e.target in first)
+            e for e in edges if (e.source in first and e.target in second) or (e.source in second and e.target in first)
         ]
 
     def _links(self, e: PairMatch, first: Component, second: Component) -> list[Link]:
         """What a pair across says: its best similarity and its rivals, each with its quality."""
         forward = e.source in second
         target, source = (e.target, e.source) if forward else (e.source, e.target)
-        best = e.overlap * e.fitness**2
+        best = self._quality(e)
         results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
         return [
             Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q, e, k == 0)

@@ -140,8 +140,9 @@ class PairSettings:
     """the same of its rotation and its scale, as lengths at one radius"""
     slip_angles_deg: tuple[float, ...] = (4.0, 8.0, 12.0)
     """rotations, in degrees, by which slipping is tried"""
-    slip_loss: float = 0.12
-    """share of the score that is lost where a motion is noticed"""
+    slip_rise: float = 0.056
+    """rise of the mean robust cost from which a motion is noticed: three standard errors of about 40 independent points
+    that each have one standard deviation"""
     same_rotation_deg: float = 6.0
     """rotation between two results, in degrees, below which they are one"""
     same_shift: float = 0.12
