@@ -83,9 +83,10 @@ demo: install
 # The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.
 demo-images: install
 	rm -rf $(IMAGES)
-	$(BIN)/sl-synth --output $(IMAGES)/captures --scene head --frames 22 --images-only
+	$(BIN)/sl-synth --output $(IMAGES)/captures --scene head --frames 22 --images-only \
+	  --appearance realistic --background table
 	$(BIN)/sl-process --images $(IMAGES)/captures/images --pattern $(IMAGES)/captures/pattern.json \
-	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/scan
+	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/scan --object-only
 	$(BIN)/ns-train sl-neus --data $(IMAGES)/scan --output-dir $(IMAGES)/run \
 	  --experiment-name head --timestamp demo
 	$(BIN)/sl-export --load-config $(IMAGES_RUN)/config.yml --output $(IMAGES)/mesh.ply --poses $(IMAGES)/refined

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 
 import torch
+from threadpoolctl import threadpool_limits
 
 _ours: int | None = None  # threads of our own loops while torch has one
 
@@ -22,21 +23,28 @@ def threads() -> int:
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Torch's own operations on one thread, our loops on all, for work made of many small operations.
+def one_library_thread() -> Iterator[None]:
+    """Operations of torch and of numpy's BLAS on one thread, our loops on all, for work made of many small operations.
 
-    Those gain nothing from an OpenMP team, and its threads spin between them: beside other busy processes the work then
-    takes ten times as long and more.
+    Those gain nothing from a team of threads, which spin between them: beside other busy processes the work then takes
+    ten times as long and more.
     """
     global _ours
     before, count = _ours, torch.get_num_threads()
     _ours = threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(count)
         _ours = before
+
+
+def only_one_library_thread() -> None:
+    """The same for the rest of this process: one of several that share the cores."""
+    torch.set_num_threads(1)
+    threadpool_limits(limits=1, user_api="blas")
 
 
 @lru_cache(maxsize=1)

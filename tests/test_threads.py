@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.compiled import compiled_range
-from sl_nerfstudio.threads import one_torch_thread, parallel, split, threads
+from sl_nerfstudio.threads import one_library_thread, parallel, split, threads
 
 
 @contextmanager
@@ -67,9 +67,9 @@ def test_what_a_task_raises_comes_out() -> None:
 
 def test_torch_has_one_thread_and_our_loops_all() -> None:
     with torch_threads(3):
-        with pytest.raises(ValueError, match="inside"), one_torch_thread():
+        with pytest.raises(ValueError, match="inside"), one_library_thread():
             assert (torch.get_num_threads(), threads()) == (1, 3)
-            with one_torch_thread():
+            with one_library_thread():
                 assert (torch.get_num_threads(), threads()) == (1, 3)
             assert (torch.get_num_threads(), threads()) == (1, 3)
             raise ValueError("inside")

@@ -86,7 +86,7 @@ def _distant(rng: np.random.Generator, jacobian: Float32[ndarray, "2 2"]) -> Flo
     """The map of the first surface: as given, or with periods up to twice as short or long, and other slopes."""
     if rng.random() < 0.65:
         return jacobian
-    shortest = 1 / np.linalg.norm(jacobian, 2)  # period at its steepest, pixels
+    shortest = 1 / float(np.linalg.norm(jacobian, 2))  # period at its steepest, pixels
     scale = log_uniform(rng, max(0.5, _SHORTEST / shortest), 2.0)
     return (jacobian @ _stretch(rng.uniform(0, np.pi), rng.uniform(1, 1.2)) / scale).astype(np.float32)
 

@@ -74,7 +74,7 @@ def _text(rng: np.random.Generator, n: int, height: float) -> Float32[ndarray, "
     for line in range(int(n / (1.4 * height)) + 1):
         words = "".join(rng.choice(_LETTERS, max(4, int(1.6 * n / height))))
         at = (round(rng.uniform(-height, 0)), round((1.4 * line + 1) * height))
-        cv2.putText(page, words, at, font, height / 22, 255, bold, cv2.LINE_AA)
+        cv2.putText(page, words, at, font, height / 22, (255,), bold, cv2.LINE_AA)
     turned = cv2.warpAffine(page, _random_affine(rng, n, 1.0), (n, n), borderMode=cv2.BORDER_REFLECT_101)
     return turned.astype(np.float32) / 255
 

@@ -25,7 +25,7 @@ from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians,
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration, linearise_with_intrinsics
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.threads import one_torch_thread
+from sl_nerfstudio.threads import one_library_thread
 
 _NO_GATE = float("inf")  # pixels: no residual is too large to be used
 
@@ -138,7 +138,7 @@ def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
     return found
 
 
-@one_torch_thread()
+@one_library_thread()
 def adjust(
     start: Rig,
     maps: CoordinateMaps,

@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.threads import one_torch_thread
+from sl_nerfstudio.threads import one_library_thread
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class CrossValidation:
         return self.difference < -self.standard_errors * self.standard_error
 
 
-@one_torch_thread()
+@one_library_thread()
 def cross_validate(
     before: Rig,
     after: Rig,

@@ -18,6 +18,7 @@ from sl_nerfstudio.object_separation.settings import SeparationSettings
 
 _FEWEST = 100  # points on a plane from which a frame's own plane is found
 _STEPS = 6
+_PRESENT = 0.1  # share of the points of a cell with which something is there
 
 
 @dataclass(frozen=True)
@@ -101,16 +102,31 @@ def find_bare_places(
 ) -> BarePlaces:
     """Cells where nearly all points near the plane are part of it, in all frames together.
 
-    First with the points' own noise; the errors below the plane in all other cells then say how high points of the
-    plane may seem to be there, and the cells are judged again with that.
+    First with the points' own noise. Where something rises from the plane, what seems to be below it is error, and says
+    how high points of the plane may seem to be there; the cells are judged again with that.
     """
     p = np.concatenate([points.p_world for points, _ in frames])
     z = np.concatenate([own.in_sigmas(points) for points, own in frames])
     first = _bare(plane, p, z, size, settings.plane_sigmas, settings)
-    unsure = z[(z < 0) & (z > -settings.most_sigmas)]
-    unsure = -unsure[~first.at(p[(z < 0) & (z > -settings.most_sigmas)])]
-    measured = float(np.quantile(unsure, settings.error_share)) if len(unsure) >= _FEWEST else 0.0
+    near = np.abs(z) < settings.most_sigmas
+    errors = -z[near][_beside_what_rises(plane, p[near], z[near], size, settings) & (z[near] < 0) & ~first.at(p[near])]
+    measured = float(np.quantile(errors, settings.error_share)) if len(errors) >= _FEWEST else 0.0
     return _bare(plane, p, z, size, max(settings.plane_sigmas, measured), settings)
+
+
+def _beside_what_rises(
+    plane: Plane, p_world: Float[ndarray, "n 3"], z: Float[ndarray, "n"], size: float, settings: SeparationSettings
+) -> Bool[ndarray, "n"]:
+    """Points in cells that hold parts of the plane, and of what rises from it.
+
+    At the edge of a plate, too, there are points below the plane; but those are surface.
+    """
+    _, place = np.unique(_cells(plane, p_world, size), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    count = np.bincount(place)
+    rising = np.bincount(place, (z > settings.plane_sigmas).astype(float)) > _PRESENT * count
+    flat = np.bincount(place, (np.abs(z) < settings.plane_sigmas).astype(float)) > _PRESENT * count
+    return (rising & flat)[place]
 
 
 def _bare(

@@ -13,10 +13,12 @@ import numpy as np
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames, adjust_registered
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
 from sl_nerfstudio.verdict.scan_agreement import compare_frames
+from sl_nerfstudio.verdict.settings import VerdictSettings
 
 _ROUNDS = 4
 _FEWEST = 2  # frames of a scan
@@ -36,16 +38,62 @@ def adjust_consistent(
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
+    Frames that were left out come in if they can be placed against the adjusted ones and agree with them.
+
     Raises UserError if fewer than two frames are registered.
     """
-    found = _adjusted(clouds, registration)
+    found = _without_contradictions(clouds, _adjusted(clouds, registration), log)
+    more = _with_left_out(clouds, found)
+    names = [
+        name
+        for name, new in zip(registration.names, more.registered & ~found.registration.registered, strict=True)
+        if new
+    ]
+    if not names:
+        return found
+    log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
+    with_more = _adjusted(clouds, more)
+    doubtful = [k for k in np.flatnonzero(new) if not _agrees_well(with_more, int(k))]
+    if len(doubtful) == len(names):
+        return found
+    if doubtful:
+        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]))
+    return _without_contradictions(clouds, with_more, log)
+
+
+def _agrees_well(found: ConsistentFrames, k: int) -> bool:
+    """Whether a frame agrees with the others as well as frames of a good scan do."""
+    limits = VerdictSettings()
+    frame = found.cross.frames[int(found.registration.registered[:k].sum())]
+    return frame.excess <= limits.good_excess and frame.share >= limits.good_share
+
+
+def _with_left_out(clouds: Sequence[FrameCloud], found: ConsistentFrames) -> Registration:
+    """The registration with frames that can be placed against the adjusted ones."""
+    poses, known = found.adjusted.poses, found.registration.registered
+    if known.all():
+        return found.registration
+    sharper = []
+    for k, cloud in enumerate(clouds):
+        sigma = found.adjusted.sigma[k]
+        if known[k] and sigma is not None:
+            direction = sigma.relative_translation / float(poses.baseline[k])
+            turn = float(np.radians(sigma.relative_rotation_deg))
+            cloud = with_relative_pose(cloud, poses.T_camera_projector[k], turn, direction)
+        sharper.append(cloud)
+    return include_left_out(sharper, found.registration, poses)
+
+
+def _without_contradictions(
+    clouds: Sequence[FrameCloud], found: ConsistentFrames, log: Callable[[str], None]
+) -> ConsistentFrames:
     for _ in range(_ROUNDS):
         groups = agreeing_groups(found.cross)
         index = np.flatnonzero(found.registration.registered)
         lost = [[int(index[k]) for k in group] for group in groups[1:]]
         if not lost or len(index) - sum(map(len, lost)) < _FEWEST:
             break
-        names = ", ".join(registration.names[k] for group in lost for k in group)
+        names = ", ".join(found.registration.names[k] for group in lost for k in group)
         log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")
         found = _adjusted(clouds, without_groups(found.registration, lost))
     return found

@@ -14,6 +14,7 @@ from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.store import Manifest
 from sl_nerfstudio.progress import track
+from sl_nerfstudio.threads import only_one_library_thread
 
 
 def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
@@ -81,9 +82,7 @@ _worker: FrameWorker | None = None  # of a worker process
 
 def _start_worker(job: FrameJob) -> None:
     global _worker
-    import torch
-
-    torch.set_num_threads(1)  # the processes share the cores
+    only_one_library_thread()
     _worker = FrameWorker(job)
 
 

@@ -59,7 +59,9 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         others = [name for name in exclusion.component if name != exclusion.frame]
         group = f"it and {_listed(others)} form a group whose" if others else "its"
         remedy = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
-        return f"{group} connection to the other frames is not certain; capture views {remedy}"
+        why = "may slip along the surface (of revolution, or a plane)" if exclusion.slips else "is not certain"
+        more = ", with something beside the object in view that does not look the same from all sides"
+        return f"{group} connection to the other frames {why}; capture views {remedy}{more if exclusion.slips else ''}"
     return (
         f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "
         f"{exclusion.fitness:.0%} of what both saw agrees (needed: {exclusion.least_overlap:.0%} and "

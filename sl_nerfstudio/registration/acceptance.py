@@ -26,6 +26,8 @@ from sl_nerfstudio.registration.result import (
 )
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
+_ANY_ANGLE_DEG = 180 / 3**0.5  # standard deviation of an angle of which nothing is known
+
 
 def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
     """Poses and baselines of the largest component; every other frame with its reason."""
@@ -127,7 +129,9 @@ def _exclusion(
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
     partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
-    return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), partner)
+    joining = [e for e, _ in across if is_accepted(e, settings)]
+    slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
+    return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 
 
 def _uncertainties(
@@ -137,7 +141,10 @@ def _uncertainties(
     out: list[Uncertainty] = []
     frames: list[int] = np.flatnonzero(registered).tolist()
     for k in frames:
-        sigma_deg = min((e.rotation_sigma_deg for e in consistent if k in (e.source, e.target)), default=0.0)
-        if sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
+        mine = [e for e in consistent if k in (e.source, e.target)]
+        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
+        if mine and all(e.slip_deg > 0 for e in mine):
+            out.append(UncertainRotation(names[k], _ANY_ANGLE_DEG))
+        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
             out.append(UncertainRotation(names[k], sigma_deg))
     return out

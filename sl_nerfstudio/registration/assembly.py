@@ -55,17 +55,24 @@ class Assembly:
     """Components of frames, grown along registered pairs."""
 
     def __init__(
-        self, sides: Sequence[Side], pivots: Pivots, edges: Sequence[PairMatch], settings: RegistrationSettings
+        self,
+        sides: Sequence[Side],
+        pivots: Pivots,
+        edges: Sequence[PairMatch],
+        settings: RegistrationSettings,
+        fitness: Sequence[float] | None = None,
     ) -> None:
+        """`fitness`: of the pairs by which a good one is judged; default: of all edges."""
         self._sides = sides
         self._pivots = pivots
         self._settings = settings
         self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
         self._weight = edge_weights(self._edges, settings.edge)
-        self._rejected: set[tuple[frozenset[int], frozenset[int]]] = set()
-        usual = float(np.quantile([e.fitness for e in edges], settings.edge.good_quantile)) if edges else 1.0
+        self._rejected: set[frozenset[frozenset[int]]] = set()
+        fitness = [e.fitness for e in edges] if fitness is None else fitness
+        usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
-        self._least_fitness = 1 - s.misfit_factor * max(s.least_misfit, 1 - usual)
+        self._largest_misfit = s.misfit_factor * max(s.least_misfit, 1 - usual)
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
 
     def grow(self) -> list[Component]:
@@ -77,11 +84,11 @@ class Assembly:
     def _join_next(self) -> bool:
         for edge in self._edges:
             first, second = self._component_of(edge.target), self._component_of(edge.source)
-            if first is second or (key := (frozenset(first), frozenset(second))) in self._rejected:
+            if first is second or (key := frozenset((frozenset(first), frozenset(second)))) in self._rejected:
                 continue
             joint = self.decide(first, second)
             if joint is None:
-                self._rejected |= {key, key[::-1]}
+                self._rejected.add(key)
                 continue
             self.components = [c for c in self.components if c is not first and c is not second]
             self.components.append(self._joined(first, second, joint.S_first_second))
@@ -100,17 +107,21 @@ class Assembly:
     def decide(self, first: Component, second: Component) -> Joint | None:
         """The similarity between two components; None where it is not certain."""
         s = self._settings.assembly
-        found = sorted(self._joints(first, second), key=lambda j: -j.votes)
+        found = sorted(self._joints(first, second), key=lambda j: -self._score(j))
         if not found:
             return None
         best = found[0]
-        if best.agreeing < s.least_agreeing or best.fitness < self._least_fitness:
+        if best.agreeing < s.least_agreeing or self._score(best) <= 0:
             return None
-        if len(found) > 1 and found[1].votes > s.largest_rival * best.votes:
+        if len(found) > 1 and self._score(found[1]) > s.largest_rival * self._score(best):
             return None
         if best.links < 2 and not self._certain_alone(first, second):
             return None
         return best
+
+    def _score(self, joint: Joint) -> float:
+        """Votes, less where points contradict; nothing where more do than in good pairs."""
+        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / self._largest_misfit)
 
     def _joints(self, first: Component, second: Component) -> list[Joint]:
         """The clearly different similarities between two components that pairs across say, with their votes."""
@@ -176,7 +187,7 @@ class Assembly:
         return any(
             e.rotation_sigma_deg < s.largest_sigma_deg
             and e.second_best_ratio < s.largest_rival
-            and e.fitness > self._least_fitness
+            and 1 - e.fitness < self._largest_misfit
             for e in self._crossing(first, second)
         )
 

@@ -16,6 +16,7 @@ from sl_nerfstudio.registration.pairs.pair_registration import register_pair, se
 from sl_nerfstudio.registration.result import UndecidedProjector
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
+from sl_nerfstudio.threads import one_library_thread
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class ProjectorChoice:
     undecided: tuple[UndecidedProjector, ...]
 
 
+@one_library_thread()
 def choose_projectors(
     clouds: Sequence[FrameCloud],
     sequence: bool = True,

@@ -20,8 +20,10 @@ from sl_nerfstudio.registration.rough_poses import starting_similarities, with_c
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.threads import one_library_thread
 
 
+@one_library_thread()
 def register(
     clouds: Sequence[FrameCloud],
     sequence: bool = True,

@@ -40,6 +40,7 @@ class SeparateComponent:
 
     frame: str
     component: tuple[str, ...]  # all frames of its component
+    slips: bool  # every pair that connects it may slip along the surface
     partner: str | None  # the frame of the largest component with which it shares most; None: none
 
 

@@ -30,8 +30,8 @@ class ViewGraph:
         self.rng = rng
         self.settings = settings
         self._start = start  # S_world_camera of frames where it is known roughly
-        self._pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
-        self._sides = [Side.sampled(m, settings.pair.coarse_points, rng) for m in maps]
+        self.pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
+        self.sides = [Side.sampled(m, settings.pair.coarse_points, rng) for m in maps]
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
 
@@ -78,17 +78,35 @@ class ViewGraph:
         pairs: set[Pair] = set()
         for number, first in enumerate(components[: self.settings.selection.bridged]):
             for second in components[number + 1 :]:
-                pairs |= set(self._bridges(first, second))
+                pairs |= set(self.bridges(first, second))
         self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
 
+    def bridges(self, first: Component, second: Component) -> list[Pair]:
+        """Pairs across two components: those taken one soon after the other, and those that look most alike."""
+        selection = self.settings.selection
+        pairs = [(min(i, j), max(i, j)) for i in first for j in second]
+        nearby = sorted(pairs, key=lambda p: p[1] - p[0])[: selection.bridges_nearby]
+        others = [p for p in pairs if p not in nearby]
+        some = [others[k] for k in self.rng.permutation(len(others))[: selection.most_compared]]
+        alike = sorted(some, key=lambda p: -self._likeness(p))
+        return nearby + alike[: selection.bridges - len(nearby)]
+
     def assemble(self) -> list[Component]:
-        """Components of frames whose connection is certain, the largest first."""
-        return Assembly(self._sides, self._pivots, self.edges, self.settings).grow()
+        """Components of frames whose connection is certain, the largest first.
+
+        Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
+        frames are put together all the same.
+        """
+        firm = [e for e in self.edges if e.slip_deg == 0]
+        components = Assembly(self.sides, self.pivots, firm, self.settings).grow()
+        if len(components[0]) > 1:
+            return components
+        return Assembly(self.sides, self.pivots, self.edges, self.settings).grow()
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with all edges inside it optimised together."""
         weight = edge_weights(self.edges, self.settings.edge)
-        return optimise_pose_graph(self.edges, self._pivots, component, weight, self.settings.pose_graph)
+        return optimise_pose_graph(self.edges, self.pivots, component, weight, self.settings.pose_graph)
 
     def see_same_side(self, a: Similarity, b: Similarity) -> bool:
         """Whether the lines of sight of two cameras differ little enough to see a common surface."""
@@ -101,16 +119,6 @@ class ViewGraph:
         known = self._tried.get(pair)
         if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
             self._tried[pair] = match
-
-    def _bridges(self, first: Component, second: Component) -> list[Pair]:
-        """Pairs across two components: those taken one soon after the other, and those that look most alike."""
-        selection = self.settings.selection
-        pairs = [(min(i, j), max(i, j)) for i in first for j in second]
-        nearby = sorted(pairs, key=lambda p: p[1] - p[0])[: selection.bridges_nearby]
-        others = [p for p in pairs if p not in nearby]
-        some = [others[k] for k in self.rng.permutation(len(others))[: selection.most_compared]]
-        alike = sorted(some, key=lambda p: -self._likeness(p))
-        return nearby + alike[: selection.bridges - len(nearby)]
 
     def _likeness(self, pair: Pair) -> float:
         maps = self.maps[pair[0]], self.maps[pair[1]]

@@ -21,6 +21,7 @@ from sl_nerfstudio.relative_pose.pattern_blocks import block_count
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.sampson import sampson
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings
+from sl_nerfstudio.threads import one_library_thread
 
 
 class RelativePoseError(UserError):
@@ -57,6 +58,7 @@ class RelativePose:
         return _angle_sigma_deg(self.covariance[3:, 3:])
 
 
+@one_library_thread()
 def estimate_relative_pose(
     uv_camera: Float[ndarray, "n 2"],
     uv_projector: Float[ndarray, "n 2"],

@@ -17,13 +17,13 @@ from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import project, unproject
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.threads import one_torch_thread
+from sl_nerfstudio.threads import one_library_thread
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, LookUps, summarise
 from sl_nerfstudio.verdict.decoding_noise import frame_noise
 from sl_nerfstudio.verdict.settings import CrossFrameSettings
 
 
-@one_torch_thread()
+@one_library_thread()
 def cross_frame_agreement(
     rig: Rig,
     maps: CoordinateMaps,

@@ -88,8 +88,12 @@ def test_the_key_changes_with_everything_that_changes_results(monkeypatch, tmp_p
     assert len({first, second, third, fourth, key()}) == 5
 
 
-def test_the_network_decoder_depends_on_both_networks():
-    assert [path.name for path in DECODERS["network"](GRID).weights()] == ["gcn.safetensors", "unet.safetensors"]
+def test_the_network_decoder_depends_on_all_that_was_trained():
+    assert [path.name for path in DECODERS["network"](GRID).weights()] == [
+        "gcn.safetensors",
+        "reliability.safetensors",
+        "unet.safetensors",
+    ]
 
 
 def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_process(monkeypatch):

@@ -111,7 +111,7 @@ def test_texture_behind_the_object_is_no_reason_to_refuse(right, texture):
     both = decoded.decoded & truth.mask
     error = np.linalg.norm(decoded.coords[both] - truth.coords[both], axis=-1)
     assert both.sum() > 0.75 * truth.mask.sum() and (error > 10).mean() < 0.02
-    assert (decoded.decoded & ~truth.mask).sum() < 0.05 * both.sum()
+    assert (decoded.decoded & ~truth.mask).sum() < 0.08 * both.sum()
 
 
 def test_noise_and_contrast_are_measured():

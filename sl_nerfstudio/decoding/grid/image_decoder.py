@@ -28,7 +28,7 @@ from sl_nerfstudio.scan.images import as_grey
 
 # Which pixels are kept.
 _LEAST_TRUST = 0.02  # weight in the fit of a pixel that hardly shows the pattern
-_LEAST_LOG_RATIO = 0.3  # log-likelihood ratio of the symbols around a pixel
+_LEAST_LOG_RATIO = 0.0  # log-likelihood ratio of the symbols around a pixel: they must not contradict it
 _LEAST_AGREEMENT = 0.35  # correlation of the image with the drawn pattern
 _MOST_WRONG = 0.2  # probability that the pixel is wrong
 _SMALLEST_REGION = 2.0  # periods squared

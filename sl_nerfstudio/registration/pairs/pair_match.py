@@ -32,7 +32,8 @@ class PairMatch:
     fitness: float  # the same among the points that could be judged
     rms: float  # distance of agreeing points from the surface, in radii
     rivals: tuple[Rival, ...]  # the best first
-    rotation_sigma_deg: float  # standard deviation of the least known rotation: large on surfaces of revolution
+    rotation_sigma_deg: float  # standard deviation of the least known rotation
+    slip_deg: float  # rotation that nothing tells from none: above zero on planes and surfaces of revolution
 
     @property
     def second_best_ratio(self) -> float:
@@ -84,4 +85,5 @@ def match_from(
         rms,
         rivals,
         float(np.degrees(sigma)),
+        float(np.degrees(slip)),
     )

@@ -38,22 +38,22 @@ class Ranges:
 
 
 REALISTIC = Ranges(
-    pattern_blur=(0.5, 0.8),
-    pattern_defocus=(0.5, 1.6),
-    camera_blur=(0.45, 0.75),
-    camera_defocus=(0.2, 0.9),
+    pattern_blur=(0.5, 0.9),
+    pattern_defocus=(1.0, 2.2),
+    camera_blur=(0.5, 0.9),
+    camera_defocus=(0.3, 1.1),
     brightness=(0.45, 0.85),
-    texture_contrast=(0.15, 0.5),
+    texture_contrast=(0.2, 0.55),
     texture_layers=(1, 2),
-    gloss=(0.0, 0.12),
+    gloss=(0.02, 0.2),
     gloss_exponent=(8.0, 60.0),
-    room_light=(0.04, 0.2),
+    room_light=(0.06, 0.28),
     gamma=(1.8, 2.4),
-    noise=(0.7, 1.6),
+    noise=(0.8, 1.8),
     useless=0.04,
-    exposure=(0.75, 1.35),
-    motion=(0.0, 1.8),
-    jpeg_quality=(82.0, 96.0),
+    exposure=(0.7, 1.4),
+    motion=(0.0, 2.2),
+    jpeg_quality=(78.0, 95.0),
     shake=(14.0, 30.0),
 )
 

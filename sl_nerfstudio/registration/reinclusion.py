@@ -1,0 +1,98 @@
+"""Frames that were left out are placed against the others once those are adjusted.
+
+Before the joint adjustment every surface is bent by the errors of its own relative pose, and only as certain as that.
+Afterwards a weak frame has to agree with surfaces that are known far better.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.assembly import Assembly, Component
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
+from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.threads import one_library_thread
+
+
+def with_relative_pose(
+    cloud: FrameCloud,
+    T_camera_projector: Float64[ndarray, "4 4"],
+    sigma_rotation_rad: float,
+    sigma_direction_rad: float,
+) -> FrameCloud:
+    """The cloud with another pose of its projector (baseline of any length), known to the given sigma per axis."""
+    T = T_camera_projector.copy()
+    T[:3, 3] /= np.linalg.norm(T[:3, 3])
+    old = cloud.pose
+    pose = replace(
+        old,
+        T_camera_projector=T,
+        covariance=np.diag([sigma_rotation_rad**2] * 3 + [sigma_direction_rad**2] * 2),
+        inliers=np.ones(int(old.inliers.sum()), dtype=bool),
+        noise_px=old.noise_px[old.inliers],
+        alternatives=(),
+    )
+    return frame_cloud(cloud.name, cloud.coords, cloud.camera, cloud.projector, pose)
+
+
+@one_library_thread()
+def include_left_out(
+    clouds: Sequence[FrameCloud],
+    registration: Registration,
+    adjusted: DevicePoses,
+    seed: int = 0,
+    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
+) -> Registration:
+    """The registration, at the adjusted poses, with the frames that can now be placed by more than one pair.
+
+    `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
+    """
+    n = len(clouds)
+    graph = ViewGraph(
+        [build_surface_map(c, settings.surface_map) for c in clouds], [None] * n, np.random.default_rng(seed), settings
+    )
+    main: Component = {
+        k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
+        for k, T in enumerate(adjusted.T_world_camera)
+        if registration.registered[k]
+    }
+    left_out = [k for k in range(n) if not registration.registered[k]]
+    search = settings.pair.anywhere
+    for k in left_out:
+        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
+    used = [e.fitness for e in registration.edges if e.used]
+    firm = [e for e in graph.edges if e.slip_deg == 0]
+    assembly = Assembly(graph.sides, graph.pivots, firm, settings, used or None)
+    placed: Component = {}
+    for k in left_out:
+        joint = assembly.decide(main, {k: Similarity.identity()})
+        if joint is not None and joint.links > 1:
+            placed[k] = joint.S_first_second
+    return _with_frames(registration, adjusted, placed)
+
+
+def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Component) -> Registration:
+    registered, component = registration.registered.copy(), registration.component.copy()
+    T, baseline, fitness = adjusted.T_world_camera.copy(), adjusted.baseline.copy(), registration.fitness.copy()
+    for k, S in placed.items():
+        registered[k], component[k], baseline[k], fitness[k] = True, 0, S.scale, 1.0
+        T[k] = np.eye(4)
+        T[k, :3, :3], T[k, :3, 3] = S.R, S.t
+    names = {registration.names[k] for k in placed}
+    return replace(
+        registration,
+        registered=registered,
+        component=component,
+        T_world_camera=T,
+        baseline=baseline,
+        fitness=fitness,
+        exclusions=tuple(e for e in registration.exclusions if e.frame not in names),
+    )
