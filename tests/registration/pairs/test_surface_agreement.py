@@ -190,7 +190,7 @@ def test_the_tolerance_does_not_grow_with_what_else_is_in_view(maps):
     rng = np.random.default_rng(0)
     sides = [Side.sampled(m, 500, rng) for m in maps]
     by_noise = Tolerance(0.0, 4.0)
-    off = Similarity(1.0, np.eye(3), 0.05 * maps[1].radius * maps[1].centroid / np.linalg.norm(maps[1].centroid))
+    off = Similarity(1.0, np.eye(3), 0.2 * maps[1].radius * maps[1].centroid / np.linalg.norm(maps[1].centroid))
     both = stacked(between(0, 1), off @ between(0, 1))
     found = agreement(*sides, both, by_noise, by_noise)
     large = replace(sides[1], map=replace(maps[1], radius=10 * maps[1].radius))
