@@ -44,20 +44,17 @@ def adjust_consistent(
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration), log)
     more = _with_left_out(clouds, found)
-    names = [
-        name
-        for name, new in zip(registration.names, more.registered & ~found.registration.registered, strict=True)
-        if new
-    ]
-    if not names:
+    placed: list[int] = np.flatnonzero(more.registered & ~found.registration.registered).tolist()
+    if not placed:
         return found
-    log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
+    names = ", ".join(registration.names[k] for k in placed)
+    log(f"placed against the adjusted frames: {names}; adjusting again with them")
     with_more = _adjusted(clouds, more)
-    doubtful = [k for k in np.flatnonzero(new) if not _agrees_well(with_more, int(k))]
-    if len(doubtful) == len(names):
+    doubtful = [k for k in placed if not _agrees_well(with_more, k)]
+    if len(doubtful) == len(placed):
         return found
     if doubtful:
-        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]))
+        with_more = _adjusted(clouds, without_groups(more, [[k] for k in doubtful]))
     return _without_contradictions(clouds, with_more, log)
 
 
