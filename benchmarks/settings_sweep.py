@@ -1,6 +1,6 @@
 """Decisive settings of the stages that find poses, each over a range around its default.
 
-    python -m benchmarks.settings_sweep [--settings registration.pair.tolerance ...] [--frames 14]
+    python -m benchmarks.settings_sweep [--settings registration.pair.tolerance_sigmas ...] [--frames 14]
 
 Six scans of sl-synth with twice its default noise, wrong and missing coordinates (200 x 200 pixels); their
 coordinates are taken as decoded, so no network is needed. One setting at a time differs from its default. The table,
@@ -53,8 +53,13 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "relative_pose.five_point.samples": (10, 30, 100, 300),
     "relative_pose.fit.kernel_sigmas": (2.0, 3.0, 4.0, 6.0),
     "relative_pose.inlier_sigmas": (3.0, 4.0, 6.0),
-    "registration.pair.tolerance": (0.02, 0.03, 0.04, 0.06),
-    "registration.pair.scale_sigma": (0.05, 0.1, 0.2, 0.4),
+    "relative_pose.candidates.rival_share": (0.01, 0.03, 0.06),
+    "registration.pair.tolerance_sigmas": (3.0, 4.0, 6.0),
+    "registration.pair.common_rms": (1.5, 2.5, 4.0),
+    "registration.pair.slip_loss": (0.06, 0.12, 0.2),
+    "registration.pair.scale_sigma": (0.1, 0.25, 0.5),
+    "registration.assembly.misfit_factor": (1.5, 2.5, 4.0),
+    "registration.assembly.largest_rival": (0.7, 0.85, 0.95),
     "registration.edge.fitness_scale": (0.025, 0.035, 0.05, 0.07, 0.1),
     "registration.pose_graph.kernel_chi2": (20.0, 40.0, 80.0),
     "bundle_adjustment.adjustment.anchors_per_frame": (150, 300, 600, 1200),
@@ -79,7 +84,7 @@ class Row:
 
 
 def value_at(settings: Any, path: str) -> Any:
-    """The setting of a path such as "registration.pair.tolerance"."""
+    """The setting of a path such as "registration.pair.tolerance_sigmas"."""
     for name in path.split("."):
         settings = getattr(settings, name)
     return settings

@@ -6,14 +6,15 @@ import pytest
 
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.result import (
-    AmbiguousPose,
+    CoordinatesDisagree,
     Exclusion,
-    InconsistentPair,
     NoCommonSurface,
     PoorPair,
+    SeparateComponent,
     SurfaceDisagrees,
     UncertainRotation,
     Uncertainty,
+    UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
@@ -48,8 +49,8 @@ DEGENERACIES: dict[str, tuple[Degeneracy, str]] = {
         "projector to the side",
     ),
     "ambiguous": (
-        Degeneracy("ambiguous", (1.1,)),
-        "a second pose explains the coordinates nearly as well; show parts at other depths in this view",
+        Degeneracy("ambiguous", (0.874, 0.891)),
+        "a second pose explains 87% of the coordinates, and this one 89%; show parts at other depths in this view",
     ),
     "many outliers": (
         Degeneracy("many outliers", (0.412,)),
@@ -74,9 +75,30 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
     ),
     (NoCommonSurface("a"), "no other frame shows any of its surface; capture views in between"),
     (
-        InconsistentPair("a", "b"),
-        "its best partner, b, contradicts the pose that other frames give it, or is not connected to them either; "
-        "capture views in between",
+        SeparateComponent("a", ("a",), "b"),
+        "its connection to the other frames is not certain; capture views between it and b",
+    ),
+    (
+        SeparateComponent("a", ("a",), None),
+        "its connection to the other frames is not certain; capture views between it and the other frames",
+    ),
+    (
+        SeparateComponent("a", ("a", "c", "d"), "b"),
+        "it and c, d form a group whose connection to the other frames is not certain; capture views between it and b",
+    ),
+    (
+        SeparateComponent("a", ("a", "c", "d", "e", "f", "g"), None),
+        "it and c, d, e and 2 more form a group whose connection to the other frames is not certain; capture views "
+        "between it and the other frames",
+    ),
+    (
+        CoordinatesDisagree("a", ("a",)),
+        "its coordinates contradict those of the other frames wherever these place it; capture this view again",
+    ),
+    (
+        CoordinatesDisagree("a", ("a", "b")),
+        "its coordinates and those of b agree with each other but contradict those of the other frames wherever these "
+        "place it; capture this view again",
     ),
     (
         PoorPair("a", "b", 0.11, 0.23, 0.15, 0.6),
@@ -86,8 +108,16 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
 ]
 
 UNCERTAINTIES: list[tuple[Uncertainty, str]] = [
-    (AmbiguousPose("a"), "a: a clearly different pose fits nearly as well (symmetric surface?)"),
-    (UncertainRotation("a", 3.14), "a: its rotation is known only to 3.1 degrees (surface of revolution?)"),
+    (
+        UndecidedProjector("a", 12.3),
+        "a: two poses of the projector, 12 degrees apart, explain its coordinates, and the other frames do not decide "
+        "between them",
+    ),
+    (
+        UncertainRotation("a", 3.14),
+        "a: it may slip along the surface; its rotation is known only to 3.1 degrees (surface of revolution, or "
+        "plane?)",
+    ),
 ]
 
 

@@ -9,9 +9,10 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.intrinsics_words import contradiction
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import AmbiguousPose, NoCommonSurface, PoorPair, UncertainRotation
+from sl_nerfstudio.registration.result import NoCommonSurface, PoorPair, SeparateComponent
 from tests.bundle_adjustment.analytic import rig_of
-from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, rolled
+from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, pose_errors, rolled
+from tests.registration.shaped_clouds import rendered
 
 SIZE, FRAMES = 100, 18  # 20 degrees from frame to frame
 RIG = rig_of(FRAMES, SIZE)
@@ -33,6 +34,7 @@ def whole(clouds):
 
 def test_a_sequence_is_registered_all_around(whole):
     assert whole.registered.all()
+    assert whole.ordered
     assert not whole.exclusions
     assert not whole.uncertainties
     rotation, position, scale = errors_against(RIG, whole.T_world_camera, whole.baseline)
@@ -85,6 +87,47 @@ def test_an_unordered_set_is_registered(clouds):
     assert np.abs(scale).max() < 0.02
 
 
+def test_a_shuffled_sequence_is_recognised_and_registered_all_the_same(clouds):
+    """The frames are said to follow each other, and do not: pairs are found by themselves."""
+    order = [3, 0, 6, 1, 5, 2, 7, 4]
+    found = register([clouds[k] for k in order], sequence=True)
+    assert not found.ordered
+    assert found.registered.all()
+    rotation, position, _ = errors_against(part_of(RIG, order), found.T_world_camera, found.baseline)
+    assert rotation.max() < 1
+    assert position.max() < 0.03
+
+
+def test_a_sequence_with_a_gap_has_two_components_that_name_each_other(clouds):
+    """Frames on opposite sides of the object share next to nothing."""
+    order = [0, 1, 2, 3, 9, 10, 11]
+    found = register([clouds[k] for k in order])
+    assert found.registered.tolist() == [True] * 4 + [False] * 3
+    assert found.component.tolist() == [0] * 4 + [1] * 3
+    group = tuple(clouds[k].name for k in order[4:])
+    for why in found.exclusions:
+        assert isinstance(why, SeparateComponent) and why.component == group
+        assert why.partner is None or why.partner in found.names[:4]
+    rotation, _, _ = errors_against(part_of(RIG, order[:4]), found.T_world_camera[:4], found.baseline[:4])
+    assert rotation.max() < 1
+
+
+def test_a_thin_sheet_seen_from_its_edge_joins_nothing_wrongly():
+    """A leaf, from above and nearly from its edge: frames are right, or named."""
+    some = rendered("leaf", tuple(range(0, 20, 2)), of=24, resolution=150)
+    found = register(some.clouds)
+    assert {e.frame for e in found.exclusions} == {
+        n for n, r in zip(found.names, found.registered, strict=True) if not r
+    }
+    kept = found.registered
+    assert kept.sum() >= 2
+    rotation, position, _ = pose_errors(
+        some.T_world_camera[kept], some.baseline[kept], found.T_world_camera[kept], found.baseline[kept]
+    )
+    assert rotation.max() < 3
+    assert position.max() < 0.06
+
+
 def test_rough_camera_poses_are_a_start(clouds):
     order = [0, 1, 2, 3]
     rig = part_of(RIG, order)
@@ -134,12 +177,11 @@ def test_a_frame_of_another_object_is_named_and_left_out(clouds):
 
 
 def test_the_rotation_of_a_ball_is_uncertain(clouds):
+    """Every frame is named, whether its neighbours agree with it by chance or not."""
     found = register([on_a_ball(clouds[k], 0.8, f"ball {k}") for k in range(3)])
-    assert found.registered.any()
-    assert all(edge.rotation_sigma_deg > 3 for edge in found.edges)
-    about = {type(u) for u in found.uncertainties if u.frame == "ball 1"}
-    assert about <= {AmbiguousPose, UncertainRotation}
-    assert about
+    assert found.edges and all(edge.rotation_sigma_deg > 3 for edge in found.edges)
+    assert {e.frame for e in found.exclusions} | {u.frame for u in found.uncertainties} == set(found.names)
+    assert not {e.frame for e in found.exclusions} & {u.frame for u in found.uncertainties}
 
 
 def test_a_single_registered_frame_is_an_error_that_names_the_others(clouds, whole):

@@ -74,9 +74,9 @@ def test_all_frames_look_at_one_centre_and_keep_their_rotations(seed):
         T[k, :3, :3] = T[k, :3, :3] @ turn
     rough = starting_similarities(T, MAPS)
     found = with_common_centre(rough, MAPS)
-    centres = np.array([S.points(m.object_centre[None])[0] for S, m in zip(found, MAPS, strict=True)])
+    centres = np.array([S.points(m.views[0].centre[None])[0] for S, m in zip(found, MAPS, strict=True)])
     np.testing.assert_allclose(centres, np.tile(centres[0], (FRAMES, 1)), atol=1e-9)
-    before = np.array([S.points(m.object_centre[None])[0] for S, m in zip(rough, MAPS, strict=True)])
+    before = np.array([S.points(m.views[0].centre[None])[0] for S, m in zip(rough, MAPS, strict=True)])
     np.testing.assert_allclose(centres[0], np.median(before, axis=0), atol=1e-9)
     for S, start in zip(found, rough, strict=True):
         np.testing.assert_array_equal(S.R, start.R)

@@ -32,7 +32,7 @@ CLASSES = [
 @pytest.mark.parametrize(("module", "cls"), CLASSES, ids=lambda x: getattr(x, "__name__", ""))
 def test_every_setting_is_frozen_documented_and_used(module, cls):
     source = Path(module.__file__)
-    code = "\n".join(p.read_text() for p in source.parent.glob("*.py") if p != source)
+    code = "\n".join(p.read_text() for p in source.parent.rglob("*.py") if p != source)
     tree = ast.parse(source.read_text())
     body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__).body
     texts = {
@@ -49,7 +49,7 @@ def test_every_setting_is_frozen_documented_and_used(module, cls):
 @pytest.mark.parametrize("package", [relative_pose, registration], ids=["relative_pose", "registration"])
 def test_no_other_file_has_numbers_of_its_own(package):
     """Numbers that decide something are settings; a private constant elsewhere would hide one."""
-    for path in Path(package.__file__).parent.glob("*.py"):
+    for path in Path(package.__file__).parent.rglob("*.py"):
         if path.name == "settings.py":
             continue
         for node in ast.parse(path.read_text()).body:

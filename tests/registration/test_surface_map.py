@@ -13,6 +13,7 @@ from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 from tests.bundle_adjustment.analytic import PROJECTORS, rig_of
 from tests.registration.analytic_clouds import clouds_of
+from tests.registration.shaped_clouds import cloud_of_depth, with_wall
 
 CAMERAS = {
     "pinhole": Device(120, 90, 150.0, 152.0, 61.0, 44.0),
@@ -100,21 +101,69 @@ def test_size_and_place_of_what_is_seen(template):
     p = found.point[found.valid]
     np.testing.assert_allclose(found.centroid, p.mean(0))
     assert found.radius == pytest.approx(np.sqrt(p.var(0).sum()))
-    behind = np.linalg.norm(found.object_centre) - np.linalg.norm(found.centroid)
+    whole = found.views[0]
+    behind = np.linalg.norm(whole.centre) - np.linalg.norm(found.centroid)
     assert behind == pytest.approx(0.4 * found.radius)
-    np.testing.assert_allclose(np.cross(found.object_centre, found.centroid), 0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(whole.centre, found.centroid), 0, atol=1e-9)
+    assert whole.size == found.radius
 
 
 def test_samples_are_places_of_the_map_spread_over_it(template):
     found = build_surface_map(plane_cloud(template, CAMERAS["pinhole"]))
-    points, normals = found.sample(200, np.random.default_rng(0))
-    assert len(points) == len(normals) == 200
+    points, normals, sigma = found.sample(200, np.random.default_rng(0))
+    assert len(points) == len(normals) == len(sigma) == 200
     known = {tuple(p) for p in found.point[found.valid]}
     assert all(tuple(p) in known for p in points)
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=3)
     assert counts.min() > 8
-    everything, _ = found.sample(10**6, np.random.default_rng(0))
-    assert len(everything) == found.valid.sum()
+    count = int(found.valid.sum())
+    everything, _, _ = found.sample(count, np.random.default_rng(0))
+    assert len({tuple(p) for p in everything}) == count
+
+
+def folded(x, y):
+    """A plane square to the line of sight, and a narrow strip that is steep."""
+    return 3 + np.where(x > 0.3, 2.0 * (x - 0.3), 0.0)
+
+
+def test_orientations_that_are_rare_get_their_share_of_the_samples():
+    """One over the square root of their number each: a strip of a tenth counts as a quarter, not as a tenth."""
+    found = build_surface_map(cloud_of_depth(folded, 120))
+    steep = found.normal[found.valid][:, 2] < np.cos(np.radians(25))
+    share = steep.mean()
+    assert 0.05 < share < 0.15
+    expected = np.sqrt(share) / (np.sqrt(share) + np.sqrt(1 - share))
+    _, normals, _ = found.sample(2000, np.random.default_rng(0))
+    drawn = (normals[:, 2] < np.cos(np.radians(25))).mean()
+    assert drawn == pytest.approx(expected, abs=0.1)
+    assert drawn > 1.8 * share
+
+
+def test_the_weight_of_equal_orientations_is_the_root_of_their_number():
+    found = build_surface_map(cloud_of_depth(lambda x, y: 3 + 0 * x, 60))
+    assert len(np.unique(found.weight)) == 1
+    assert found.weight.sum() == pytest.approx(np.sqrt(found.valid.sum()))
+
+
+def test_the_uncertainty_of_a_surface_is_that_of_its_points_along_the_normal():
+    """With a part that no averaging removes: a share of a map pixel."""
+    cloud = cloud_of_depth(lambda x, y: 3 + 0.5 * x, 100, sigma=0.02)
+    found = build_surface_map(cloud)
+    p, n = found.point[found.valid], found.normal[found.valid]
+    distance = np.linalg.norm(p, axis=1)
+    lattice = SurfaceMapSettings().lattice_error * distance / found.camera.fl_x
+    np.testing.assert_allclose(
+        found.sigma[found.valid], np.hypot(0.02 * -(n * p).sum(1) / distance, lattice), rtol=1e-6
+    )
+
+
+def test_a_wall_behind_the_object_moves_all_that_is_seen_but_not_its_middle():
+    cloud = clouds_of(rig_of(18, 100), 100)[0]
+    alone, walled = (build_surface_map(c) for c in (cloud, with_wall(cloud, 8 * np.linalg.norm(cloud.centroid))))
+    assert walled.radius > 3 * alone.radius
+    assert np.linalg.norm(walled.views[0].centre - alone.views[0].centre) > alone.radius
+    assert np.linalg.norm(walled.views[1].centre - alone.views[1].centre) < 0.3 * alone.radius
+    assert walled.views[1].size == pytest.approx(alone.views[1].size, rel=0.05)
 
 
 def test_the_projector_does_not_matter(template):

@@ -25,6 +25,7 @@ def known_pose(
     T[:3, 3] /= np.linalg.norm(T[:3, 3])
     r = sampson(T[:3, :3], T[:3, 3], rays)
     fit = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r, settings.fit.noise_floor_px), 0.0)
-    inliers = np.zeros(len(uv_camera), dtype=bool)
+    inliers, noise_px = np.zeros(len(uv_camera), dtype=bool), np.full(len(uv_camera), np.nan)
     inliers[usable] = np.abs(r) < settings.inlier_sigmas * fit.noise_px
-    return RelativePose(T, covariance(fit, rays, settings.fit), inliers, fit.noise_px, ())
+    noise_px[usable] = fit.noise_px
+    return RelativePose(T, covariance(fit, rays, settings.fit), inliers, fit.noise_px, noise_px, 1.0, ())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.relative_pose.epipolar_fit import distinct
-from sl_nerfstudio.relative_pose.five_point import essential_matrices, five_point_candidates, in_front, poses_of
+from sl_nerfstudio.relative_pose.five_point import essential_matrices, five_point_starts, in_front, poses_of
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, Separation
 from tests.relative_pose.two_views import PROJECTORS, View, view
@@ -62,73 +62,45 @@ def test_five_equal_pairs_have_no_solution_or_useless_ones():
     assert all(np.isfinite(E).all() for E in essential_matrices(same))
 
 
-@settings(max_examples=12)
-@given(
-    st.integers(0, 10**6),
-    st.sampled_from(sorted(PROJECTORS)),
-    st.floats(-180, 180),
-    st.floats(0, 2 * np.pi),
-    st.floats(-0.8, 0.8),
-)
-def test_from_exact_rays_the_true_pose_is_the_best_candidate(seed, projector, roll, bearing, ahead):
-    offset = (np.cos(bearing), np.sin(bearing), ahead)
-    frame = view(projector, offset=offset, count=300, seed=seed, roll_deg=roll)
-    rays = rays_of(frame)
-    found = five_point_candidates(rays, np.random.default_rng(seed))
-    best = found[0]
-    assert max(errors_deg(best.fit.R, best.fit.t, frame)) < 1e-4
-    assert best.in_front == 1.0
-    assert best.fit.noise_px == pytest.approx(RELATIVE_POSE_DEFAULTS.fit.noise_floor_px)
-    assert [c.fit.noise_px for c in found] == sorted(c.fit.noise_px for c in found)
-    assert np.linalg.det(best.fit.R) == pytest.approx(1)
-    assert np.linalg.norm(best.fit.t) == pytest.approx(1)
+@settings(max_examples=8)
+@given(st.integers(0, 10**6), st.sampled_from(sorted(PROJECTORS)), st.floats(-180, 180), st.floats(0, 2 * np.pi))
+def test_from_exact_rays_the_best_start_is_the_true_pose(seed, projector, roll, bearing):
+    frame = view(projector, offset=(np.cos(bearing), np.sin(bearing), 0.1), count=300, seed=seed, roll_deg=roll)
+    R, t = five_point_starts(rays_of(frame), np.random.default_rng(seed))[0]
+    assert max(errors_deg(R, t, frame)) < 1e-2
+    assert np.linalg.det(R) == pytest.approx(1)
+    assert np.linalg.norm(t) == pytest.approx(1)
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(st.integers(0, 10**6), st.sampled_from(sorted(PROJECTORS)))
-def test_a_third_of_wrong_coordinates_does_not_hide_the_true_pose(seed, projector):
+def test_a_third_of_wrong_coordinates_leaves_a_start_near_the_true_pose(seed, projector):
     frame = view(projector, count=1500, seed=seed).noisy(0.3, seed=seed, wrong=0.3)
-    found = five_point_candidates(rays_of(frame), np.random.default_rng(seed))
-    rotation, direction = errors_deg(found[0].fit.R, found[0].fit.t, frame)
-    assert rotation < 1
-    assert direction < 1
-    assert found[0].in_front > 0.95
+    found = five_point_starts(rays_of(frame), np.random.default_rng(seed))
+    assert min(sum(errors_deg(R, t, frame)) for R, t in found) < 5
 
 
-def test_candidates_differ_from_each_other():
-    frame = view(relief=0.02, count=1000).noisy(0.3, seed=1)  # nearly a plane: two solutions
-    separation = RELATIVE_POSE_DEFAULTS.five_point.solution_separation
-    found = five_point_candidates(rays_of(frame), np.random.default_rng(0))
-    assert len(found) > 1
+def test_starts_differ_from_each_other():
+    rays = rays_of(view(relief=0.02, count=1000).noisy(0.3, seed=1))
+    found = five_point_starts(rays, np.random.default_rng(0))
+    assert len(found) >= RELATIVE_POSE_DEFAULTS.five_point.starts
     for i, a in enumerate(found):
-        for b in found[:i]:
-            assert distinct((a.fit.R, a.fit.t), (b.fit.R, b.fit.t), separation)
-    wide = replace(RELATIVE_POSE_DEFAULTS.five_point, solution_separation=Separation(10.0, 10.0))
-    one = five_point_candidates(
-        rays_of(frame), np.random.default_rng(0), replace(RELATIVE_POSE_DEFAULTS, five_point=wide)
-    )
-    assert len(one) == 1
+        assert all(distinct(a, b, RELATIVE_POSE_DEFAULTS.five_point.separation) for b in found[:i])
+    wide = replace(RELATIVE_POSE_DEFAULTS.five_point, separation=Separation(10.0, 10.0))
+    assert len(five_point_starts(rays, np.random.default_rng(0), replace(RELATIVE_POSE_DEFAULTS, five_point=wide))) == 1
 
 
 def test_rays_that_are_no_image_points_are_not_sampled():
     """Nine tenths of the rays run sideways, where a device has no image point."""
-    frame = view(count=300)
-    rays = rays_of(frame)
+    rays = rays_of(view(count=300))
     sideways = np.arange(len(rays)) % 10 > 0
     d = rays.d_camera.copy()
     d[sideways, 2] = 0.0
-    found = five_point_candidates(replace(rays, d_camera=d), np.random.default_rng(0))
-    assert found == [] or np.isfinite(found[0].fit.R).all()
+    for R, t in five_point_starts(replace(rays, d_camera=d), np.random.default_rng(0)):
+        assert np.isfinite(R).all() and np.isfinite(t).all()
     d[:, 2] = 0.0
-    assert five_point_candidates(replace(rays, d_camera=d), np.random.default_rng(0)) == []
-    assert five_point_candidates(rays.chosen(np.arange(4)), np.random.default_rng(0)) == []
-
-
-def test_random_coordinates_fit_badly():
-    frame = view(count=1000)
-    uv = np.random.default_rng(99).uniform(0, 800, frame.uv_projector.shape)
-    found = five_point_candidates(rays_of(replace(frame, uv_projector=uv)), np.random.default_rng(0))
-    assert all(c.fit.noise_px > 100 for c in found)
+    assert five_point_starts(replace(rays, d_camera=d), np.random.default_rng(0)) == []
+    assert five_point_starts(rays.chosen(np.arange(4)), np.random.default_rng(0)) == []
 
 
 @settings(max_examples=30)

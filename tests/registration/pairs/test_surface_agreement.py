@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
@@ -12,16 +14,17 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unprojec
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, agreement, agreement_at
+from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement, agreement_at
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
+from sl_nerfstudio.registration.surface_map import SurfaceMap, View, build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
 
 SIZE = 100
 RIG = rig_of(18, SIZE)
 TRUE = similarities_of(RIG.T_world_camera.numpy(), RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy())
-PENALTY = REGISTRATION_DEFAULTS.pair.agreement.behind_penalty
+LIMITS = REGISTRATION_DEFAULTS.pair.agreement
+NEAR = Tolerance(0.04, 0.0)
 CAMERAS = {
     "pinhole": Device(40, 30, 50.0, 52.0, 19.0, 16.0),
     "lens": Device(40, 30, 50.0, 52.0, 19.0, 16.0, k1=-0.3, k2=0.1, p1=5e-3, p2=-8e-3),
@@ -39,7 +42,7 @@ def between(i: int, j: int) -> Similarity:
 
 
 def stacked(*similarities: Similarity) -> Hypotheses:
-    return Hypotheses(*(np.stack([getattr(S, key) for S in similarities]) for key in ("scale", "R", "t")))
+    return Hypotheses.joined([Hypotheses.of(S) for S in similarities])
 
 
 # ------------------------------------------------------------------ against a plain formula
@@ -55,13 +58,14 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     valid = rng.random(ray.shape[:2]) < 0.8
     centroid = point[valid].mean(0)
     radius = float(np.sqrt(((point[valid] - centroid) ** 2).sum(-1).mean()))
-    return SurfaceMap(camera, point, normal, valid, centroid, centroid, radius)
+    sigma = rng.uniform(0.005, 0.03, valid.shape)
+    even = np.ones(int(valid.sum()))
+    return SurfaceMap(camera, point, normal, sigma, valid, even, centroid, radius, (View(centroid, radius),))
 
 
-def plain_sums(source: Side, target: Side, S: Similarity, tolerance: float, width: float, facing_least: float):
+def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
     """H, g and the shares and mean square of one similarity, point by point as the module's text says."""
-    limits = REGISTRATION_DEFAULTS.pair.agreement
-    tau, kernel, hidden = (x * target.map.radius for x in (tolerance, width, limits.hidden_depth))
+    radius = target.map.radius
     H, g, shares, squares = np.zeros((7, 7)), np.zeros(7), [], []
     for mover, seen, reverse in ((source, target, False), (target, source, True)):
         own = S.inverse() if reverse else S
@@ -74,14 +78,17 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: float, widt
         inside[inside] &= seen.map.valid[row[inside], column[inside]]
         P, N = seen.map.point[row[inside], column[inside]], seen.map.normal[row[inside], column[inside]]
         r = (N * (p[inside] - P)).sum(-1) * (S.scale if reverse else 1)
+        sigma_seen = seen.map.sigma[row[inside], column[inside]] * (S.scale if reverse else 1)
+        spread = np.hypot(mover.sigma[inside] * (1 if reverse else S.scale), sigma_seen)
+        tau, kernel = (np.maximum(x.radii * radius, x.sigmas * spread) for x in (tolerance, width))
         facing = (N * n[inside]).sum(-1)
         on = (np.abs(r) < tau) & (facing > facing_least)
         before = ~on & (r > tau)
-        behind = ~on & ~before & (r > -hidden)
+        behind = ~on & ~before & (r > -LIMITS.hidden_depth * radius)
         shares.append([x.sum() / len(mover.points) for x in (on, before, behind)])
-        squares += (r[on] ** 2).tolist()
-        used = (facing >= facing_least) & (np.abs(r) <= limits.kernel_cutoff * kernel)
-        w = facing[used] / (1 + (r[used] / kernel) ** 2) ** 2
+        squares += ((r / spread)[on] ** 2).tolist()
+        used = (facing >= facing_least) & (np.abs(r) <= LIMITS.kernel_cutoff * kernel)
+        w = facing[used] / (1 + (r / kernel)[used] ** 2) ** 2
         m = -N[used] @ S.R.T if reverse else N[used]
         x = (mover.points if reverse else p)[inside][used] - target.map.centroid
         J = np.concatenate([m, np.cross(x, m), (x * m).sum(-1, keepdims=True)], 1)
@@ -104,10 +111,11 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
         )
         for _ in range(4)
     ]
-    limits = replace(REGISTRATION_DEFAULTS.pair.agreement, least_facing_cosine=0.5)
-    found = agreement(*sides, stacked(*similarities), 0.05, 0.08, limits)
+    limits = replace(LIMITS, least_facing_cosine=0.5)
+    tolerance, width = Tolerance(0.03, 3.0), Tolerance(0.05, 4.0)  # each decides at some points
+    found = agreement(*sides, stacked(*similarities), tolerance, width, limits)
     for k, S in enumerate(similarities):
-        H, g, shares, squares = plain_sums(*sides, S, 0.05, 0.08, 0.5)
+        H, g, shares, squares = plain_sums(*sides, S, tolerance, width, 0.5)
         assert shares.min() > 0.02  # every case is present
         np.testing.assert_allclose(found.H[k], H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
         np.testing.assert_allclose(found.g[k], g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
@@ -115,7 +123,7 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
         assert found.squares[k] == pytest.approx(squares, rel=1e-9)
         assert found.judged[k] == pytest.approx(shares.sum())
         assert found.fitness[k] == pytest.approx(shares[0] / shares.sum())
-        assert found.score(0.25)[k] == pytest.approx(shares[0] - shares[1] - 0.25 * shares[2])
+        assert found.score(3.0, 0.25)[k] == pytest.approx(shares[0] - 3 * (shares[1] + 0.25 * shares[2]))
 
 
 # ------------------------------------------------------------------ on surfaces
@@ -126,18 +134,18 @@ def test_derivatives_of_the_agreement_are_those_of_differences(maps):
     rng = np.random.default_rng(0)
     sides = [Side.sampled(m, 300, rng) for m in maps]
     S = between(0, 1)
-    c, wide = maps[1].centroid, 1e3
+    c, near, wide = maps[1].centroid, Tolerance(0.5, 0.0), Tolerance(1e3, 0.0)
 
     def moved(x: ndarray) -> Similarity:
         turn = Rotation.from_rotvec(x[3:6]).as_matrix()
         return Similarity(float(np.exp(x[6])), turn, c - np.exp(x[6]) * turn @ c + x[:3]) @ S
 
     # sums of r itself along each unknown: H[:, k] = sum w J J_k is the change of g with a step along k
-    at_S = agreement(*sides, Hypotheses.of(S), 0.5, wide)
+    at_S = agreement(*sides, Hypotheses.of(S), near, wide)
     H, h = at_S.H[0], 1e-5
     for k in range(7):
         ahead, behind = (moved(s * h * np.eye(7)[k]) for s in (1, -1))
-        g_a, g_b = agreement(*sides, stacked(ahead, behind), 0.5, wide).g
+        g_a, g_b = agreement(*sides, stacked(ahead, behind), near, wide).g
         # points that change their pixel make single jumps, so only the whole vectors are compared
         assert (g_a - g_b) @ H[:, k] / (2 * h) == pytest.approx(H[:, k] @ H[:, k], rel=0.25)
     assert np.isfinite(at_S.g).all()
@@ -148,10 +156,10 @@ def test_the_truth_agrees_and_a_displaced_surface_is_seen_in_front(maps):
     sides = [Side.sampled(m, 500, rng) for m in maps]
     S = between(0, 1)
     nearer = Similarity(S.scale, S.R, S.t + np.array([0.0, 0.0, 0.6 * maps[1].radius]))
-    found = agreement(*sides, stacked(S, nearer), 0.04, 0.04)
+    found = agreement(*sides, stacked(S, nearer), NEAR, NEAR)
     assert found.fitness[0] > 0.9
     assert found.agreeing[0] > 0.4
-    score = found.score(PENALTY)
+    score = found.score(LIMITS.search_penalty, LIMITS.behind)
     assert score[0] > 3 * max(score[1], 0.1)
     assert found.in_front[1] > 0.2
 
@@ -162,12 +170,55 @@ def test_a_surface_moved_back_is_behind_until_it_is_hidden(maps):
     sides = [Side.sampled(m, 500, rng) for m in maps]
     S, radius = between(0, 1), maps[1].radius
     a_little, far = (Similarity(S.scale, S.R, S.t - np.array([0, 0, d * radius])) for d in (0.15, 3.0))
-    found = agreement(*sides, stacked(S, a_little, far), 0.04, 0.04)
+    found = agreement(*sides, stacked(S, a_little, far), NEAR, NEAR)
     assert found.behind[1] > found.behind[0] + 0.1
     assert found.agreeing[2] < 0.02
 
 
 def test_agreement_of_one_similarity(maps):
-    found = agreement_at((maps[0], maps[1]), between(0, 1), np.random.default_rng(0), 0.04, REGISTRATION_DEFAULTS.pair)
+    pair = maps[0], maps[1]
+    found = agreement_at(pair, between(0, 1), np.random.default_rng(0), NEAR, REGISTRATION_DEFAULTS.pair)
     assert len(found.agreeing) == 1
     assert found.fitness[0] > 0.9
+
+
+# ------------------------------------------------------------------ the tolerance
+
+
+def test_the_tolerance_does_not_grow_with_what_else_is_in_view(maps):
+    """A wall behind the object makes everything in view ten times as large; the noise is the same."""
+    rng = np.random.default_rng(0)
+    sides = [Side.sampled(m, 500, rng) for m in maps]
+    by_noise = Tolerance(0.0, 4.0)
+    off = Similarity(1.0, np.eye(3), 0.2 * maps[1].radius * maps[1].centroid / np.linalg.norm(maps[1].centroid))
+    both = stacked(between(0, 1), off @ between(0, 1))
+    found = agreement(*sides, both, by_noise, by_noise)
+    large = replace(sides[1], map=replace(maps[1], radius=10 * maps[1].radius))
+    again = agreement(sides[0], large, both, by_noise, by_noise)
+    np.testing.assert_array_equal(again.agreeing, found.agreeing)
+    np.testing.assert_array_equal(again.in_front, found.in_front)
+    np.testing.assert_array_equal(again.H, found.H)
+    assert found.agreeing[1] < 0.2 < 0.4 < found.agreeing[0]
+
+
+@settings(max_examples=15)
+@given(st.integers(-6, 6), st.integers(-6, 6), st.booleans())
+def test_agreement_does_not_depend_on_the_unit_of_either_frame(maps, a, b, by_length):
+    """Each frame's unit is its baseline, which may be short or long: powers of two, so that rounding is the same."""
+    tolerance = Tolerance(0.04, 0.0) if by_length else Tolerance(0.0, 3.0)
+    factors = 2.0**a, 2.0**b
+    sides = [Side.sampled(m, 300, np.random.default_rng(0)) for m in maps]
+    scaled = [Side.sampled(in_unit(m, f), 300, np.random.default_rng(0)) for m, f in zip(maps, factors, strict=True)]
+    S = Similarity.scaling(factors[1]) @ between(0, 1) @ Similarity.scaling(1 / factors[0])
+    found, again = (
+        agreement(*pair, Hypotheses.of(T), tolerance, tolerance) for pair, T in ((sides, between(0, 1)), (scaled, S))
+    )
+    for key in ("agreeing", "in_front", "behind", "squares"):
+        np.testing.assert_allclose(getattr(again, key), getattr(found, key), rtol=1e-9)
+    D = np.array([1.0] * 3 + [factors[1]] * 4)
+    np.testing.assert_allclose(again.H[0], found.H[0] * D[:, None] * D, rtol=1e-7, atol=1e-9)
+
+
+def in_unit(m: SurfaceMap, factor: float) -> SurfaceMap:
+    lengths = {key: getattr(m, key) * factor for key in ("point", "sigma", "centroid", "radius")}
+    return replace(m, **lengths)

@@ -1,0 +1,98 @@
+"""Clouds of chosen surfaces, and of rendered scenes, with true poses."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from tests.bundle_adjustment.analytic import rig_of
+from tests.registration.analytic_clouds import clouds_of
+from tests.relative_pose.known_pose import known_pose
+
+
+@cache
+def _template() -> FrameCloud:
+    return clouds_of(rig_of(2, 40), 40)[0]
+
+
+def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100, sigma: float = 1e-3) -> FrameCloud:
+    """A surface that fills the image: distance along the line of sight by the normalised pixel (x, y), up is +y."""
+    camera = Device(size, size, 1.35 * size, 1.35 * size, size / 2, size / 2)
+    uv = np.stack(np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), -1).reshape(-1, 2)
+    ray = directions(camera, uv)
+    x, y = ray[:, 0] / -ray[:, 2], ray[:, 1] / -ray[:, 2]
+    points = ray / -ray[:, 2:] * depth(x, y)[:, None]
+    even = np.full(len(uv), sigma / np.sqrt(2))
+    return replace(_template(), camera=camera, uv_camera=uv, points=points, sigma_noise=even, sigma_pose=even)
+
+
+def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:
+    """The frame as if it had also seen a wall, square to its line of sight, wherever it saw nothing."""
+    size = cloud.camera.w
+    seen = np.zeros((cloud.camera.h, size), dtype=bool)
+    column, row = np.floor(cloud.uv_camera).astype(int).T
+    seen[row, column] = True
+    uv = np.argwhere(~seen)[:, ::-1] + 0.5
+    ray = directions(cloud.camera, uv)
+    parts = {
+        "uv_camera": uv,
+        "points": ray / -ray[:, 2:] * distance,
+        "sigma_noise": np.full(len(uv), np.median(cloud.sigma_noise)),
+        "sigma_pose": np.full(len(uv), np.median(cloud.sigma_pose)),
+    }
+    return replace(cloud, **{key: np.concatenate([getattr(cloud, key), more]) for key, more in parts.items()})
+
+
+@dataclass(frozen=True)
+class RenderedClouds:
+    """Frames of a rendered scene with their true relative poses; lengths of the truth in millimetres."""
+
+    clouds: tuple[FrameCloud, ...]
+    setup: Setup
+    frames: tuple[int, ...]
+
+    @property
+    def S_world_camera(self) -> list[Similarity]:
+        """From camera axes in baselines to the world."""
+        truth = self.setup.truth
+        T = truth.T_world_camera[list(self.frames)]
+        return [Similarity(float(b), P[:3, :3], P[:3, 3]) for b, P in zip(self.baseline, T, strict=True)]
+
+    @property
+    def T_world_camera(self) -> ndarray:
+        """True camera poses."""
+        return self.setup.truth.T_world_camera[list(self.frames)]
+
+    @property
+    def baseline(self) -> ndarray:
+        """True distances of camera and projector."""
+        return self.setup.truth.baseline[list(self.frames)]
+
+
+@cache
+def _setup(scene: str, resolution: int, frames: int, seed: int) -> Setup:
+    return make_setup(SynthConfig(scene=scene, frames=frames, resolution=resolution, seed=seed))
+
+
+@cache
+def rendered(
+    scene: str, frames: Sequence[int], of: int = 24, resolution: int = 150, noise: float = 0.15, seed: int = 3
+) -> RenderedClouds:
+    """Some frames of a walk of `of` frames around a scene, with noise in pattern pixels."""
+    setup, rng, out = _setup(scene, resolution, of, seed), np.random.default_rng(seed), []
+    camera, projector = setup.devices.camera, setup.devices.projector
+    for k in frames:
+        coords = setup.render(k, 1).coords
+        coords = coords + noise * rng.standard_normal(coords.shape).astype(np.float32)
+        T = np.linalg.inv(setup.truth.T_world_camera[k]) @ setup.truth.T_world_projector[k]
+        pose = known_pose(T, *correspondences_of(coords), camera, projector)
+        out.append(frame_cloud(f"{scene} {k}", coords, camera, projector, pose))
+    return RenderedClouds(tuple(out), setup, tuple(frames))
