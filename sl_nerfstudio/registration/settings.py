@@ -207,6 +207,10 @@ class AssemblySettings:
     """standard deviation of the least known rotation, in degrees, of a pair that joins two components on its own"""
     largest_rival: float = 0.85
     """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
+    slip_deg: float = 8.0
+    """rotation, in degrees, along which two components must notice that they slip"""
+    slip_sigmas: float = 0.4
+    """width of the kernel of that test, in standard deviations of the surfaces"""
     same_chi2: float = 30.0
     """chi square (7 degrees of freedom) of the difference between two similarities, by the uncertainty of a pair, up
     to which they are one: a pair that may slip does not contradict another that slipped"""

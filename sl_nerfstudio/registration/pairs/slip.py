@@ -43,14 +43,15 @@ def slip_deg(
     least = np.full(len(angles), np.inf)
     for sense in (1.0, -1.0):
         moved = [
-            Hypotheses.of(_motion(sense * angle * direction, surface) @ S_target_source) for angle in np.radians(angles)
+            Hypotheses.of(screw_motion(sense * angle * direction, surface) @ S_target_source)
+            for angle in np.radians(angles)
         ]
         least = np.minimum(least, agreement(*sides, Hypotheses.joined(moved), unit, unit, settings.agreement).cost)
     noticed = np.flatnonzero(least > least[0] + settings.slip_rise)
     return float(angles[noticed[0] - 1] if len(noticed) else angles[-1])
 
 
-def _motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
+def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
     """A screw motion with growth: a point follows the velocity `l (p - c) + w x (p - c) + radius v` for a unit of time.
 
     To first order it is the increment x; unlike that it stays on a surface of revolution.
