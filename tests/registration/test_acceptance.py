@@ -42,6 +42,7 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(clouds):
     for why, name in zip(found.exclusions, ("frame_00003", "frame_00004"), strict=True):
         assert (why.frame, why.component) == (name, ("frame_00003", "frame_00004"))
         assert why.partner in (None, *found.names[:3])
+        assert not why.slips
     assert found.component.tolist() == [0, 0, 0, 1, 1]
     assert np.isnan(found.fitness[3:]).all()
     assert (found.fitness[:3] > 0.9).all()
