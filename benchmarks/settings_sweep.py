@@ -56,7 +56,6 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "relative_pose.candidates.rival_share": (0.01, 0.03, 0.06),
     "registration.pair.tolerance_sigmas": (3.0, 4.0, 6.0),
     "registration.pair.common_rms": (1.5, 2.5, 4.0),
-    "registration.pair.slip_loss": (0.06, 0.12, 0.2),
     "registration.pair.scale_sigma": (0.1, 0.25, 0.5),
     "registration.assembly.misfit_factor": (1.5, 2.5, 4.0),
     "registration.assembly.largest_rival": (0.7, 0.85, 0.95),

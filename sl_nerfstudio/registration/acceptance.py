@@ -26,8 +26,6 @@ from sl_nerfstudio.registration.result import (
 )
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
-_ANY_ANGLE_DEG = 180 / 3**0.5  # standard deviation of an angle of which nothing is known
-
 
 def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
     """Poses and baselines of the largest component; every other frame with its reason."""
@@ -144,7 +142,7 @@ def _uncertainties(
         mine = [e for e in consistent if k in (e.source, e.target)]
         sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
         if mine and all(e.slip_deg > 0 for e in mine):
-            out.append(UncertainRotation(names[k], _ANY_ANGLE_DEG))
+            out.append(UncertainRotation(names[k], graph.settings.acceptance.unknown_sigma_rotation_deg))
         elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
             out.append(UncertainRotation(names[k], sigma_deg))
     return out

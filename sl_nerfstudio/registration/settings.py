@@ -280,6 +280,8 @@ class AcceptanceSettings:
     """share of a frame's points, of those that other frames can judge, which must agree"""
     largest_sigma_rotation_deg: float = 3.0
     """standard deviation of the least known rotation, in degrees, beyond which it is uncertain"""
+    unknown_sigma_rotation_deg: float = 104.0
+    """the same where nothing tells the angle: that of all angles from -180 to 180"""
 
 
 @dataclass(frozen=True)

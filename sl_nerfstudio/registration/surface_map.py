@@ -56,6 +56,8 @@ class SurfaceMap:
         more (normal-space sampling, Rusinkiewicz and Levoy, 3DIM 2001).
         """
         index = np.flatnonzero(self.valid)
+        if not len(index):
+            return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         place = (np.arange(count) + rng.uniform(0, 1)) / count
         chosen = index[np.searchsorted(np.cumsum(self.weight), place * self.weight.sum()).clip(0, len(index) - 1)]
         return self.point.reshape(-1, 3)[chosen], self.normal.reshape(-1, 3)[chosen], self.sigma.reshape(-1)[chosen]

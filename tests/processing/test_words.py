@@ -75,21 +75,26 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
     ),
     (NoCommonSurface("a"), "no other frame shows any of its surface; capture views in between"),
     (
-        SeparateComponent("a", ("a",), "b"),
+        SeparateComponent("a", ("a",), False, "b"),
         "its connection to the other frames is not certain; capture views between it and b",
     ),
     (
-        SeparateComponent("a", ("a",), None),
+        SeparateComponent("a", ("a",), False, None),
         "its connection to the other frames is not certain; capture views between it and the other frames",
     ),
     (
-        SeparateComponent("a", ("a", "c", "d"), "b"),
+        SeparateComponent("a", ("a", "c", "d"), False, "b"),
         "it and c, d form a group whose connection to the other frames is not certain; capture views between it and b",
     ),
     (
-        SeparateComponent("a", ("a", "c", "d", "e", "f", "g"), None),
+        SeparateComponent("a", ("a", "c", "d", "e", "f", "g"), False, None),
         "it and c, d, e and 2 more form a group whose connection to the other frames is not certain; capture views "
         "between it and the other frames",
+    ),
+    (
+        SeparateComponent("a", ("a",), True, "b"),
+        "its connection to the other frames may slip along the surface (of revolution, or a plane); capture views "
+        "between it and b, with something beside the object in view that does not look the same from all sides",
     ),
     (
         CoordinatesDisagree("a", ("a",)),

@@ -17,6 +17,7 @@ def edge(
     fitness: float = 0.98,
     rivals: tuple[Rival, ...] = (),
     sigma_deg: float = 0.5,
+    slip_deg: float = 0.0,
 ) -> PairMatch:
     """What an exact registration of i onto j would say, or one that is off by `noise` radian about the object."""
     S = nodes[j].inverse() @ nodes[i]
@@ -24,7 +25,7 @@ def edge(
         turn = Rotation.from_rotvec(noise * rng.standard_normal(3)).as_matrix()
         c = np.array([0.0, 0.0, -4 / nodes[j].scale])
         S = Similarity(float(np.exp(noise * rng.standard_normal())), turn, c - turn @ c) @ S
-    return PairMatch(i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, fitness, 0.02, rivals, sigma_deg)
+    return PairMatch(i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, fitness, 0.02, rivals, sigma_deg, slip_deg)
 
 
 def pivots_of(nodes: list[Similarity]) -> Pivots:

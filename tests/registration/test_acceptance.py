@@ -16,7 +16,8 @@ from sl_nerfstudio.registration.result import (
 )
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AcceptanceSettings, EdgeSettings
 from tests.bundle_adjustment.analytic import rig_of
-from tests.registration.analytic_clouds import clouds_of, on_a_ball, part_of
+from tests.registration.analytic_clouds import clouds_of, part_of
+from tests.registration.shaped_clouds import rendered
 
 SIZE = 70
 RIG = rig_of(18, SIZE)
@@ -32,17 +33,16 @@ def clouds():
 
 
 def test_frames_of_a_separate_group_name_it_and_where_to_capture(clouds):
-    """The last two show another object, a ball, and match each other alone."""
-    balls = [on_a_ball(c, 0.7, c.name) for c in clouds[3:]]
-    # A ball may turn as it likes: here that is no reason to keep the two apart.
-    loose = replace(REGISTRATION_DEFAULTS.assembly, largest_sigma_deg=90.0)
-    found = register([*clouds[:3], *balls], settings=replace(REGISTRATION_DEFAULTS, assembly=loose))
+    """The last two show another object, a head, and match each other alone."""
+    heads = rendered("head", (4, 5)).clouds
+    found = register([*clouds[:3], *heads])
     assert found.registered.tolist() == [True, True, True, False, False]
-    assert [type(e) for e in found.exclusions] == [SeparateComponent] * 2
-    for why, name in zip(found.exclusions, ("frame_00003", "frame_00004"), strict=True):
-        assert (why.frame, why.component) == (name, ("frame_00003", "frame_00004"))
-        assert why.partner in (None, *found.names[:3])
     assert found.component.tolist() == [0, 0, 0, 1, 1]
+    group = tuple(c.name for c in heads)
+    for why, name in zip(found.exclusions, group, strict=True):
+        assert isinstance(why, SeparateComponent)
+        assert (why.frame, why.component) == (name, group)
+        assert why.partner in (None, *found.names[:3])
     assert np.isnan(found.fitness[3:]).all()
     assert (found.fitness[:3] > 0.9).all()
 

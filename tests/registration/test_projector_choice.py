@@ -78,12 +78,18 @@ def test_the_true_pose_is_chosen_by_what_the_neighbours_saw(true_first):
         assert found.clouds[k].points is CLOUDS[k].points
 
 
-def test_where_only_a_plane_is_seen_nothing_tells_and_the_frame_is_named():
-    flat = [two_poses(k, coords_of_disk(k), True) for k in range(4)]
-    found = choose_projectors([flat[0], flat[1], *flat[2:]])
-    assert {u.frame for u in found.undecided} == {c.name for c in flat}
-    for k, doubt in enumerate(found.undecided):
+def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
+    """Its rim may still tell; the face of the disk does not."""
+    flat = [two_poses(k, coords_of_disk(k), False) for k in range(4)]
+    found = choose_projectors(flat)
+    named = {u.frame for u in found.undecided}
+    assert named
+    for k, cloud in enumerate(found.clouds):
+        error = max(errors_deg(cloud.pose.T_camera_projector, RIG.T_camera_projector[k].numpy()))
+        assert cloud.name in named or error < 1e-6
+    for doubt in found.undecided:
         assert isinstance(doubt, UndecidedProjector)
+        k = [c.name for c in flat].index(doubt.frame)
         R = [T[:3, :3] for T in (RIG.T_camera_projector[k].numpy(), twin_of(k, coords_of_disk(k)))]
         expected = np.degrees(Rotation.from_matrix(R[0] @ R[1].T).magnitude())
         assert doubt.angle_deg == pytest.approx(expected, abs=0.1)

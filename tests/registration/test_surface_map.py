@@ -166,6 +166,12 @@ def test_a_wall_behind_the_object_moves_all_that_is_seen_but_not_its_middle():
     assert walled.views[1].size == pytest.approx(alone.views[1].size, rel=0.05)
 
 
+def test_a_map_without_surface_has_no_samples(template):
+    found = build_surface_map(plane_cloud(template, CAMERAS["pinhole"]))
+    empty = replace(found, valid=np.zeros_like(found.valid), weight=np.zeros(0))
+    assert [len(part) for part in empty.sample(10, np.random.default_rng(0))] == [0, 0, 0]
+
+
 def test_the_projector_does_not_matter(template):
     assert template.projector == PROJECTORS["pinhole"]
     other = replace(template, projector=PROJECTORS["DOE"])
