@@ -198,7 +198,12 @@ class Assembly:
     def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
         """Whether all frames across together do not notice the motion along which one pair of them slips."""
         s = self._settings.assembly
-        still = self._misfit_cost(first, second, joint.S_first_second)
+        if not self._same(self._links(e, first, second)[0], joint.S_first_second, first, second):
+            return False  # the pair says something else
+        for sigmas in s.slip_sigmas:
+            still = self._misfit_cost(first, second, joint.S_first_second, sigmas)
+            if still < s.saturated:
+                break
         own = first if e.target in first else second
         surface, to_camera = self._sides[e.target].map, own[e.target].inverse()
         moved = []
@@ -206,13 +211,12 @@ class Assembly:
             M = screw_motion(sense * np.radians(s.slip_deg) * e.slip_direction, surface)
             M = own[e.target] @ M @ to_camera
             S = M @ joint.S_first_second if own is first else joint.S_first_second @ M
-            moved.append(self._misfit_cost(first, second, S))
+            moved.append(self._misfit_cost(first, second, S, sigmas))
         return min(moved) < still + self._settings.pair.slip_rise
 
-    def _misfit_cost(self, first: Component, second: Component, S: Similarity) -> float:
+    def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
         """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""
-        s, a = self._settings.assembly, self._settings.pair.agreement
-        unit = Tolerance(0.0, s.slip_sigmas)
+        a, unit = self._settings.pair.agreement, Tolerance(0.0, sigmas)
         costs, weights = [1.0], [1e-9]
         for i, j in self._facing(first, second, S):
             S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])

@@ -209,8 +209,10 @@ class AssemblySettings:
     """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
     slip_deg: float = 8.0
     """rotation, in degrees, along which two components must notice that they slip"""
-    slip_sigmas: float = 0.4
-    """width of the kernel of that test, in standard deviations of the surfaces"""
+    slip_sigmas: tuple[float, ...] = (0.4, 0.8, 1.6, 3.2)
+    """widths of the kernel of that test, in standard deviations of the surfaces: the first that is wide enough"""
+    saturated: float = 0.4
+    """mean cost from which a kernel is too narrow for the errors that components have of their own"""
     same_chi2: float = 30.0
     """chi square (7 degrees of freedom) of the difference between two similarities, by the uncertainty of a pair, up
     to which they are one: a pair that may slip does not contradict another that slipped"""
