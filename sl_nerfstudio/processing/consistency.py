@@ -44,17 +44,17 @@ def adjust_consistent(
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration), log)
     more = _with_left_out(clouds, found)
-    placed: list[int] = np.flatnonzero(more.registered & ~found.registration.registered).tolist()
-    if not placed:
+    new = np.flatnonzero(more.registered & ~found.registration.registered)
+    names = [registration.names[k] for k in new]
+    if not names:
         return found
-    names = ", ".join(registration.names[k] for k in placed)
-    log(f"placed against the adjusted frames: {names}; adjusting again with them")
+    log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
     with_more = _adjusted(clouds, more)
-    doubtful = [k for k in placed if not _agrees_well(with_more, k)]
-    if len(doubtful) == len(placed):
+    doubtful = [k for k in new if not _agrees_well(with_more, int(k))]
+    if len(doubtful) == len(names):
         return found
     if doubtful:
-        with_more = _adjusted(clouds, without_groups(more, [[k] for k in doubtful]))
+        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]))
     return _without_contradictions(clouds, with_more, log)
 
 

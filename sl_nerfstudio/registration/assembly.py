@@ -18,6 +18,7 @@ from sl_nerfstudio.registration.increments import log_at
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.slip import screw_motion
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings
@@ -61,8 +62,13 @@ class Assembly:
         edges: Sequence[PairMatch],
         settings: RegistrationSettings,
         fitness: Sequence[float] | None = None,
+        slipping: Sequence[PairMatch] = (),
     ) -> None:
-        """`fitness`: of the pairs by which a good one is judged; default: of all edges."""
+        """`fitness`: of the pairs by which a good one is judged; default: of all edges.
+
+        `slipping`: pairs that may slip. They only say along which motions two components must be held in place.
+        """
+        self._slipping = slipping
         self._sides = sides
         self._pivots = pivots
         self._settings = settings
@@ -115,6 +121,8 @@ class Assembly:
             return None
         if len(found) > 1 and self._score(found[1]) > s.largest_rival * self._score(best):
             return None
+        if any(self._slips(best, e, first, second) for e in self._between(self._slipping, first, second)):
+            return None
         if best.links < 2 and not self._certain_alone(first, second):
             return None
         return best
@@ -134,17 +142,23 @@ class Assembly:
         return [self._judge(first, second, one.S_first_second, links) for one in distinct[:most]]
 
     def _crossing(self, first: Component, second: Component) -> list[PairMatch]:
+        return self._between(self._edges, first, second)
+
+    @staticmethod
+    def _quality(e: PairMatch) -> float:
+        return e.overlap * e.fitness**2
+
+    @staticmethod
+    def _between(edges: Sequence[PairMatch], first: Component, second: Component) -> list[PairMatch]:
         return [
-            e
-            for e in self._edges
-            if (e.source in first and e.target in second) or (e.source in second and e.target in first)
+            e for e in edges if (e.source in first and e.target in second) or (e.source in second and e.target in first)
         ]
 
     def _links(self, e: PairMatch, first: Component, second: Component) -> list[Link]:
         """What a pair across says: its best similarity and its rivals, each with its quality."""
         forward = e.source in second
         target, source = (e.target, e.source) if forward else (e.source, e.target)
-        best = e.overlap * e.fitness**2
+        best = self._quality(e)
         results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
         return [
             Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q, e, k == 0)
@@ -180,6 +194,32 @@ class Assembly:
             agreeing += float(sums.agreeing[0])
             contradicting += float(sums.in_front[0] + a.behind * sums.behind[0])
         return Joint(S, votes, same, agreeing, contradicting)
+
+    def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
+        """Whether all frames across together do not notice the motion along which one pair of them slips."""
+        s = self._settings.assembly
+        still = self._misfit_cost(first, second, joint.S_first_second)
+        own = first if e.target in first else second
+        surface, to_camera = self._sides[e.target].map, own[e.target].inverse()
+        moved = []
+        for sense in (1.0, -1.0):
+            M = screw_motion(sense * np.radians(s.slip_deg) * e.slip_direction, surface)
+            M = own[e.target] @ M @ to_camera
+            S = M @ joint.S_first_second if own is first else joint.S_first_second @ M
+            moved.append(self._misfit_cost(first, second, S))
+        return min(moved) < still + self._settings.pair.slip_rise
+
+    def _misfit_cost(self, first: Component, second: Component, S: Similarity) -> float:
+        """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""
+        s, a = self._settings.assembly, self._settings.pair.agreement
+        unit = Tolerance(0.0, s.slip_sigmas)
+        costs, weights = [1.0], [1e-9]
+        for i, j in self._facing(first, second, S):
+            S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])
+            sums = agreement(self._sides[j], self._sides[i], S_i_j, unit, unit, a)
+            costs.append(float(sums.cost[0]))
+            weights.append(float(sums.judged[0]))
+        return float(np.average(costs, weights=weights))
 
     def _certain_alone(self, first: Component, second: Component) -> bool:
         """Whether one of the pairs across determines the similarity by itself."""

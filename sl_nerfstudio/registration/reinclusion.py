@@ -18,7 +18,7 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.registration.view_graph import ViewGraph, split_by_slip
 from sl_nerfstudio.threads import one_library_thread
 
 
@@ -69,8 +69,8 @@ def include_left_out(
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
     used = [e.fitness for e in registration.edges if e.used]
-    firm = [e for e in graph.edges if e.slip_deg == 0]
-    assembly = Assembly(graph.sides, graph.pivots, firm, settings, used or None)
+    firm, slipping = split_by_slip(graph.edges)
+    assembly = Assembly(graph.sides, graph.pivots, firm, settings, used or None, slipping)
     placed: Component = {}
     for k in left_out:
         joint = assembly.decide(main, {k: Similarity.identity()})

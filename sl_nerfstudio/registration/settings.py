@@ -140,8 +140,9 @@ class PairSettings:
     """the same of its rotation and its scale, as lengths at one radius"""
     slip_angles_deg: tuple[float, ...] = (4.0, 8.0, 12.0)
     """rotations, in degrees, by which slipping is tried"""
-    slip_loss: float = 0.12
-    """share of the score that is lost where a motion is noticed"""
+    slip_rise: float = 0.056
+    """rise of the mean robust cost from which a motion is noticed: three standard errors of about 40 independent points
+    that each have one standard deviation"""
     same_rotation_deg: float = 6.0
     """rotation between two results, in degrees, below which they are one"""
     same_shift: float = 0.12
@@ -206,6 +207,10 @@ class AssemblySettings:
     """standard deviation of the least known rotation, in degrees, of a pair that joins two components on its own"""
     largest_rival: float = 0.85
     """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
+    slip_deg: float = 8.0
+    """rotation, in degrees, along which two components must notice that they slip"""
+    slip_sigmas: float = 0.4
+    """width of the kernel of that test, in standard deviations of the surfaces"""
     same_chi2: float = 30.0
     """chi square (7 degrees of freedom) of the difference between two similarities, by the uncertainty of a pair, up
     to which they are one: a pair that may slip does not contradict another that slipped"""

@@ -97,8 +97,8 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        firm = [e for e in self.edges if e.slip_deg == 0]
-        components = Assembly(self.sides, self.pivots, firm, self.settings).grow()
+        firm, slipping = split_by_slip(self.edges)
+        components = Assembly(self.sides, self.pivots, firm, self.settings, None, slipping).grow()
         if len(components[0]) > 1:
             return components
         return Assembly(self.sides, self.pivots, self.edges, self.settings).grow()
@@ -145,6 +145,11 @@ class ViewGraph:
     def _is_edge(self, pair: Pair) -> bool:
         match = self._tried.get(pair)
         return match is not None and is_accepted(match, self.settings.edge)
+
+
+def split_by_slip(edges: Sequence[PairMatch]) -> tuple[list[PairMatch], list[PairMatch]]:
+    """Pairs that hold their frames in place, and pairs that may slip."""
+    return [e for e in edges if e.slip_deg == 0], [e for e in edges if e.slip_deg > 0]
 
 
 def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:

@@ -34,6 +34,7 @@ class PairMatch:
     rivals: tuple[Rival, ...]  # the best first
     rotation_sigma_deg: float  # standard deviation of the least known rotation
     slip_deg: float  # rotation that nothing tells from none: above zero on planes and surfaces of revolution
+    slip_direction: Float64[ndarray, "7"]  # the motion (v, w, l) in the target's axes, about its centroid, |w| = 1
 
     @property
     def second_best_ratio(self) -> float:
@@ -86,4 +87,5 @@ def match_from(
         rivals,
         float(np.degrees(sigma)),
         float(np.degrees(slip)),
+        direction,
     )

@@ -34,21 +34,24 @@ def slip_deg(
     common: Tolerance,
     settings: PairSettings,
 ) -> float:
-    """The largest of some angles, in degrees, up to which nothing is lost in either sense; 0 where any is noticed."""
-    surface, a = sides[1].map, settings.agreement
+    """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
+
+    A motion is noticed where the mean robust cost of the points rises, with a kernel as narrow as the surfaces agree.
+    """
+    surface, unit = sides[1].map, Tolerance(0.0, common.sigmas / settings.common_rms)
     angles = np.array([0.0, *settings.slip_angles_deg])
-    worst = np.full(len(angles), np.inf)
+    least = np.full(len(angles), np.inf)
     for sense in (1.0, -1.0):
         moved = [
-            Hypotheses.of(_motion(sense * angle * direction, surface) @ S_target_source) for angle in np.radians(angles)
+            Hypotheses.of(screw_motion(sense * angle * direction, surface) @ S_target_source)
+            for angle in np.radians(angles)
         ]
-        score = agreement(*sides, Hypotheses.joined(moved), common, common, a).score(a.penalty, a.behind)
-        worst = np.minimum(worst, score)
-    lost = np.flatnonzero(worst < (1 - settings.slip_loss) * worst[0])
-    return float(angles[lost[0] - 1] if len(lost) else angles[-1])
+        least = np.minimum(least, agreement(*sides, Hypotheses.joined(moved), unit, unit, settings.agreement).cost)
+    noticed = np.flatnonzero(least > least[0] + settings.slip_rise)
+    return float(angles[noticed[0] - 1] if len(noticed) else angles[-1])
 
 
-def _motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
+def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
     """A screw motion with growth: a point follows the velocity `l (p - c) + w x (p - c) + radius v` for a unit of time.
 
     To first order it is the increment x; unlike that it stays on a surface of revolution.

@@ -16,13 +16,14 @@ from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.models import pixel_of
-from sl_nerfstudio.geometry.robust import geman_mcclure_weight
+from sl_nerfstudio.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
 _kernel_weight = compiled(geman_mcclure_weight)
+_kernel_cost = compiled(geman_mcclure_cost)
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Agreement:
     in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
     behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
     squares: Float64[ndarray, "k"]  # mean squared distance of those that agree, in units of its variance
+    cost: Float64[ndarray, "k"]  # mean robust cost of the points that could be judged: 0 exact, 1 far beyond the kernel
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
@@ -87,7 +89,7 @@ def agreement(
     `tolerance` is the distance within which points agree, `width` that of the robust kernel.
     """
     k, radius = len(hypotheses), target.map.radius
-    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 4))
+    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 5))
     tolerances = np.array([tolerance.radii * radius, width.radii * radius, settings.hidden_depth * radius,
                            tolerance.sigmas, width.sigmas])  # fmt: skip
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
@@ -100,7 +102,8 @@ def agreement(
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
     squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
-    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares)
+    cost = counts[..., 4].sum(0) / np.maximum(counts[..., :3].sum((0, 2)), 1)
+    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares, cost)
 
 
 def agreement_at(
@@ -120,7 +123,7 @@ def _sums(
     first, last, points, normals, sigma, scale, R, t, reverse, map_point, map_normal, map_sigma, valid, code, camera, c,
     tolerances, least_facing, cutoff, H, g, counts
 ):  # fmt: skip
-    """Adds to H, g and counts (agreeing, in front, behind, squares); `reverse`: points are the target's."""
+    """Adds to H, g and counts (agreeing, in front, behind, squares, cost); `reverse`: points are the target's."""
     h, w = valid.shape
     hidden = tolerances[2]
     for k in range(first, last):
@@ -168,6 +171,8 @@ def _sums(
                 counts[k, 1] += 1
             elif r > -hidden:
                 counts[k, 2] += 1
+            if r > -hidden:
+                counts[k, 4] += _kernel_cost((r / width) ** 2)
             if facing < least_facing or abs(r) > cutoff * width:
                 continue
             weight = _kernel_weight((r / width) ** 2) * facing

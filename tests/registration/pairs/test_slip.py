@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.registration.increments import exp_at
 from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.slip import _motion, weakest_rotation
+from sl_nerfstudio.registration.pairs.slip import screw_motion, weakest_rotation
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.registration.analytic_clouds import difference
@@ -24,7 +24,7 @@ increments = arrays(np.float64, 7, elements=st.floats(-0.6, 0.6))
 @given(increments)
 def test_a_motion_is_the_integral_of_its_velocity(x):
     """p(1) = c + e^l R(w) (p - c) + radius * integral of e^(l s) R(s w) v ds, by quadrature."""
-    found = _motion(x, SURFACE)
+    found = screw_motion(x, SURFACE)
     v, w, growth = SURFACE.radius * x[:3], x[3:6], x[6]
     s, weight = np.polynomial.legendre.leggauss(12)
     s, weight = (s + 1) / 2, weight / 2
@@ -39,7 +39,7 @@ def test_a_motion_is_the_integral_of_its_velocity(x):
 def test_a_motion_is_its_increment_to_first_order(x):
     errors = []
     for h in (1e-2, 1e-3):
-        a, b = _motion(h * x, SURFACE), exp_at(h * x, SURFACE.centroid, SURFACE.radius, 1.0)
+        a, b = screw_motion(h * x, SURFACE), exp_at(h * x, SURFACE.centroid, SURFACE.radius, 1.0)
         errors.append(np.abs(a.matrix() - b.matrix()).max())
     assert errors[1] <= errors[0] / 80 + 1e-12  # of second order: a hundredth
 
@@ -51,7 +51,7 @@ def test_a_turn_about_an_axis_elsewhere_keeps_points_at_their_distance_from_it(a
     rng = np.random.default_rng(seed)
     axis, foot = rng.normal(size=3), SURFACE.centroid + rng.normal(size=3)
     w = angle * axis / np.linalg.norm(axis)
-    found = _motion(np.concatenate([np.cross(w, SURFACE.centroid - foot) / SURFACE.radius, w, [0.0]]), SURFACE)
+    found = screw_motion(np.concatenate([np.cross(w, SURFACE.centroid - foot) / SURFACE.radius, w, [0.0]]), SURFACE)
     p = rng.normal(size=(20, 3))
     expected = foot + (p - foot) @ Rotation.from_rotvec(w).as_matrix().T
     np.testing.assert_allclose(found.points(p), expected, atol=1e-9)
