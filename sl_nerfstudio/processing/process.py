@@ -19,7 +19,7 @@ from sl_nerfstudio.processing.inputs import Inputs, read_inputs
 from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.refined_focal import refine_focal
 from sl_nerfstudio.processing.result import ProcessResult, with_object_only
-from sl_nerfstudio.processing.scan_poses import find_scan_poses
+from sl_nerfstudio.processing.scan_poses import find_scan_poses, require_known_frames
 from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
 from sl_nerfstudio.processing.selection.object_words import object_sentences
 from sl_nerfstudio.processing.summary import summarise
@@ -51,6 +51,8 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
         _require_clouds(config, inputs, results, make_report)
 
     clouds = clouds_of(results)
+    if inputs.known is not None:
+        require_known_frames(inputs.known, clouds)
     given = _given_for_clouds(inputs.given, results)
     start = None if given is None else given.T_world_camera
     choice, registration = _register(clouds, not config.unordered, config.seed, start, log)

@@ -30,10 +30,8 @@ def find_scan_poses(
 ) -> ScanPoses:
     """The adjusted poses in the axes and the unit that are known.
 
-    A known length overrules the unit of given poses. Raises UserError if it is in a frame that cannot be used.
+    A known length overrules the unit of given poses. Raises UserError if it is in a frame that was not registered.
     """
-    if known is not None:
-        _require_frames(known, clouds)
     poses = ScanPoses(adjusted, "arbitrary", Scale(False))
     if given is not None:
         poses = _in_given_axes(poses, registration, given)
@@ -57,7 +55,8 @@ def _with_known_length(poses: ScanPoses, clouds: Sequence[FrameCloud], known: Kn
     return ScanPoses(adjusted.scaled(factor), known.unit, stated_scale(known))
 
 
-def _require_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
+def require_known_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
+    """Raise UserError if a frame of the known length has no cloud."""
     lost = set(known.frames) - {cloud.name for cloud in clouds}
     if lost:
         raise UserError(

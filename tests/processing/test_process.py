@@ -100,7 +100,7 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
 ):
     """One pose gave a scale of NaN and none a ValueError, both after the whole adjustment."""
     lose(NAMES[0], NAMES[1])
-    monkeypatch.setattr(stages, "find_scan_poses", lambda *_: pytest.fail("adjusted before the poses were checked"))
+    monkeypatch.setattr(stages, "adjust_consistent", lambda *_: pytest.fail("adjusted before the poses were checked"))
     rough = _poses(tmp_path / "r.json", {NAMES[k]: ramp_scan.T_world_camera[k] for k in given})
     config = ramp_scan.config(tmp_path / "s", poses=rough)
     with pytest.raises(UserError) as caught:
@@ -154,11 +154,11 @@ def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     assert baseline == pytest.approx(5, rel=1e-5)
 
 
-def test_a_known_length_in_a_frame_that_failed_is_an_error_before_the_adjustment(monkeypatch, ramp_scan, tmp_path):
+def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(monkeypatch, ramp_scan, tmp_path):
     shutil.copytree(ramp_scan.root, tmp_path / "c")
     (tmp_path / "c" / "images" / NAMES[1] / "0.png").write_bytes(b"broken")
     copy = replace(ramp_scan, root=tmp_path / "c")
-    monkeypatch.setattr("sl_nerfstudio.processing.scan_poses.adjust_registered", lambda *_: pytest.fail("adjusted"))
+    monkeypatch.setattr(stages, "register", lambda *_: pytest.fail("registered"))
     with pytest.raises(UserError, match=f"--known-length: {NAMES[1]} could not be used.*\n.*cause:.*\n.*remedy:"):
         _run(copy.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm"))
 

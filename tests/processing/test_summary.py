@@ -6,10 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.consistency import compare_registered
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.processing.summary import compare_registered, left_out, summarise
+from sl_nerfstudio.processing.summary import left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import NoCommonSurface, UncertainRotation, UndecidedProjector
@@ -29,7 +31,8 @@ def registration(results):
 
 @pytest.fixture(scope="module")
 def poses(results, registration):
-    return find_scan_poses(clouds_of(results), registration, None, None)
+    clouds = clouds_of(results)
+    return find_scan_poses(clouds, registration, adjust_registered(clouds, registration), None, None)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
@@ -25,7 +26,7 @@ def made(ramp_scan, tmp_path_factory):
     results = [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
     clouds = clouds_of(results)
     registration = register(clouds)
-    poses = find_scan_poses(clouds, registration, None, None)
+    poses = find_scan_poses(clouds, registration, adjust_registered(clouds, registration), None, None)
     config = ramp_scan.config(tmp_path_factory.mktemp("s"))
     return job, results, poses, summarise(config, "ramps", results, registration, poses)
 

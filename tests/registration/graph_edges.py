@@ -7,6 +7,8 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import Pivots
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
 
+NO_SLIP = np.array([0.0, 0, 0, 0, 0, 1, 0])  # the direction of a slip: about the line of sight
+
 
 def edge(
     nodes: list[Similarity],
@@ -25,7 +27,9 @@ def edge(
         turn = Rotation.from_rotvec(noise * rng.standard_normal(3)).as_matrix()
         c = np.array([0.0, 0.0, -4 / nodes[j].scale])
         S = Similarity(float(np.exp(noise * rng.standard_normal())), turn, c - turn @ c) @ S
-    return PairMatch(i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, fitness, 0.02, rivals, sigma_deg, slip_deg)
+    return PairMatch(
+        i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, fitness, 0.02, rivals, sigma_deg, slip_deg, NO_SLIP
+    )
 
 
 def pivots_of(nodes: list[Similarity]) -> Pivots:

@@ -112,6 +112,18 @@ def test_a_pair_whose_rotation_is_open_joins_nothing_alone_and_something_togethe
     assert len(assembled(sides, [*right([*FIRST, *SECOND]), *right([(3, 4), (2, 4), (3, 5)], sigma_deg=8.0)])) == 1
 
 
+def test_a_pair_that_may_slip_keeps_apart_only_what_would_not_notice_it(sides):
+    """The balls on the disk show a turn about the line of sight, whatever one pair says of itself."""
+    edges = right([*FIRST, *SECOND, (3, 4), (2, 4)])
+    slipping = right([(3, 5)], slip_deg=8.0)
+    pivots = Pivots(np.stack([s.map.centroid for s in sides]), np.array([s.map.radius for s in sides]))
+    held = Assembly(sides, pivots, edges, REGISTRATION_DEFAULTS, None, slipping).grow()
+    assert frames_of(held) == [list(range(FRAMES))]
+    blind = replace(REGISTRATION_DEFAULTS, pair=replace(REGISTRATION_DEFAULTS.pair, slip_rise=1.0))
+    apart = Assembly(sides, pivots, edges, blind, None, slipping).grow()
+    assert frames_of(apart) == [[0, 1, 2, 3], [4, 5, 6, 7]]
+
+
 def test_without_pairs_every_frame_stands_alone(sides):
     assert frames_of(assembled(sides, [])) == [[k] for k in range(FRAMES)]
 

@@ -11,7 +11,7 @@ from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
 
 def match(i: int, j: int, fitness: float = 0.9, overlap: float = 0.5, ratio: float = 0.2) -> PairMatch:
     S = Similarity.identity()
-    return PairMatch(i, j, S, np.eye(7), overlap, fitness, 0.02, (Rival(S, ratio),), 0.5, 0.0)
+    return PairMatch(i, j, S, np.eye(7), overlap, fitness, 0.02, (Rival(S, ratio),), 0.5, 0.0, np.zeros(7))
 
 
 def test_a_pair_needs_overlap_and_fitness():

@@ -49,7 +49,7 @@ def test_half_a_turn_of_a_symmetric_surface_is_a_rival_as_good_as_the_best(odd, 
 @given(st.lists(st.floats(0, 1), max_size=4))
 def test_the_second_best_ratio_is_that_of_the_best_rival(ratios):
     rivals = tuple(Rival(Similarity.identity(), r) for r in sorted(ratios, reverse=True))
-    match = PairMatch(0, 1, Similarity.identity(), np.eye(7), 0.5, 0.9, 0.02, rivals, 0.5, 0.0)
+    match = PairMatch(0, 1, Similarity.identity(), np.eye(7), 0.5, 0.9, 0.02, rivals, 0.5, 0.0, np.zeros(7))
     assert match.second_best_ratio == max(ratios, default=0.0)
     assert replace(match, rivals=()).second_best_ratio == 0.0
     assert match.other(0) == 1 and match.other(1) == 0

@@ -66,7 +66,7 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
     """H, g and the shares and mean square of one similarity, point by point as the module's text says."""
     radius = target.map.radius
-    H, g, shares, squares = np.zeros((7, 7)), np.zeros(7), [], []
+    H, g, shares, squares, costs = np.zeros((7, 7)), np.zeros(7), [], [], []
     for mover, seen, reverse in ((source, target, False), (target, source, True)):
         own = S.inverse() if reverse else S
         p, n = own.points(mover.points), mover.normals @ own.R.T
@@ -87,6 +87,8 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, 
         behind = ~on & ~before & (r > -LIMITS.hidden_depth * radius)
         shares.append([x.sum() / len(mover.points) for x in (on, before, behind)])
         squares += ((r / spread)[on] ** 2).tolist()
+        x2 = ((r / kernel)[on | before | behind]) ** 2
+        costs += (x2 / (1 + x2)).tolist()
         used = (facing >= facing_least) & (np.abs(r) <= LIMITS.kernel_cutoff * kernel)
         w = facing[used] / (1 + (r / kernel)[used] ** 2) ** 2
         m = -N[used] @ S.R.T if reverse else N[used]
@@ -94,7 +96,7 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, 
         J = np.concatenate([m, np.cross(x, m), (x * m).sum(-1, keepdims=True)], 1)
         H += (J * w[:, None]).T @ J
         g += J.T @ (w * r[used])
-    return H, g, np.mean(shares, 0), float(np.mean(squares))
+    return H, g, np.mean(shares, 0), float(np.mean(squares)), float(np.mean(costs))
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
@@ -115,12 +117,13 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
     tolerance, width = Tolerance(0.03, 3.0), Tolerance(0.05, 4.0)  # each decides at some points
     found = agreement(*sides, stacked(*similarities), tolerance, width, limits)
     for k, S in enumerate(similarities):
-        H, g, shares, squares = plain_sums(*sides, S, tolerance, width, 0.5)
+        H, g, shares, squares, cost = plain_sums(*sides, S, tolerance, width, 0.5)
         assert shares.min() > 0.02  # every case is present
         np.testing.assert_allclose(found.H[k], H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
         np.testing.assert_allclose(found.g[k], g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
         np.testing.assert_allclose([found.agreeing[k], found.in_front[k], found.behind[k]], shares, rtol=1e-12)
         assert found.squares[k] == pytest.approx(squares, rel=1e-9)
+        assert found.cost[k] == pytest.approx(cost, rel=1e-9)
         assert found.judged[k] == pytest.approx(shares.sum())
         assert found.fitness[k] == pytest.approx(shares[0] / shares.sum())
         assert found.score(3.0, 0.25)[k] == pytest.approx(shares[0] - 3 * (shares[1] + 0.25 * shares[2]))
