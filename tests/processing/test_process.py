@@ -9,6 +9,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.inputs import frames_by_name, read_inputs
 from sl_nerfstudio.processing.process import process
@@ -48,10 +49,12 @@ def _without(registration, names):
 
 @pytest.fixture
 def lose(monkeypatch):
-    """Makes registration leave out frames."""
+    """Makes registration leave out frames, for good unless they may come `back` after the adjustment."""
 
-    def lose(*names):
+    def lose(*names, back=False):
         real = stages.register
+        if not back:
+            monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, poses: registration)
         monkeypatch.setattr(stages, "register", lambda *args: _without(real(*args), names))
 
     return lose
@@ -82,6 +85,19 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     assert result.frames[3].reason == ALONE
     assert f"{NAMES[3]}: capture it again; it was left out ({result.frames[3].reason})" in result.recapture
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
+
+
+def test_a_frame_that_registration_left_out_is_placed_after_the_adjustment(lose, ramp_scan, tmp_path):
+    lose(NAMES[3], back=True)
+    result, log = _run(ramp_scan.config(tmp_path / "s"))
+    assert "registered 3 of 4 frames" in log
+    assert f"placed against the adjusted frames: {NAMES[3]}; adjusting again with them" in log
+    assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES)
+    assert all(frame.in_scan for frame in result.frames) and result.recapture == ()
+    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
+    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
+    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
+    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 2e-3 * distance
 
 
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
