@@ -41,4 +41,5 @@ def refine_focal(
 def _all_inliers(cloud: FrameCloud) -> RelativePose:
     """The frame's pose for the coordinates of its cloud, which are all inliers."""
     count = int(np.isfinite(cloud.coords).all(-1).sum())
-    return replace(cloud.pose, inliers=np.ones(count, dtype=bool))
+    noise_px = np.full(count, cloud.pose.residual_px)
+    return replace(cloud.pose, inliers=np.ones(count, dtype=bool), noise_px=noise_px, alternatives=())

@@ -203,7 +203,7 @@ class AssemblySettings:
     """share of the points that may contradict, of those that can be judged, relative to good pairs of the scan"""
     least_misfit: float = 0.015
     """share that may contradict in good pairs: points at edges do in every pair"""
-    largest_sigma_deg: float = 3.0
+    largest_sigma_deg: float = 6.0
     """standard deviation of the least known rotation, in degrees, of a pair that joins two components on its own"""
     largest_rival: float = 0.85
     """votes for a clearly different similarity, relative to the best one, from which the connection is undecided"""
