@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, centred_on
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import PoseSigma
@@ -136,10 +136,7 @@ def _scene(clouds: Sequence[FrameCloud], registration: Registration, index: Sequ
     for k in index:
         T, some = registration.T_world_camera[k], clouds[k].points[:: max(1, len(clouds[k].points) // 500)]
         parts.append(registration.baseline[k] * some @ T[:3, :3].T + T[:3, 3])
-    p = np.concatenate(parts)
-    low, high = np.percentile(p, [2, 98], axis=0)
-    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
-    return Similarity(1 / radius, np.eye(3), -centre / radius)
+    return centred_on(np.concatenate(parts), 2.0)
 
 
 def _prior(

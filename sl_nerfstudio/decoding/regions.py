@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+
+from sl_nerfstudio.geometry.connectivity import component_labels
 
 
 def drop_small_regions(
@@ -26,7 +26,7 @@ def drop_small_regions(
         pairs.append(np.stack([index[here][near], index[there][near]]))
     a, b = np.concatenate(pairs, 1)
     n = int(known.sum())
-    _, label = connected_components(coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n)), directed=False)
+    label = component_labels(a, b, n)
     small = np.bincount(label, minlength=1)[label] < least_pixels
     out = coords.copy()
     out[known] = np.where(small[:, None], np.float32(np.nan), coords[known])

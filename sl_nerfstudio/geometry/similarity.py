@@ -52,6 +52,16 @@ class Similarity:
         return out
 
 
+def centred_on(points: Float[ndarray, "n 3"], edge_percent: float) -> Similarity:
+    """The scaling and shift that put the box around points about the origin, with half its diagonal one.
+
+    `edge_percent` of the points may lie outside the box on each of its sides. Points in one place keep their scale.
+    """
+    low, high = np.percentile(points, [edge_percent, 100 - edge_percent], axis=0)
+    radius = float(np.linalg.norm(high - low) / 2) or 1.0
+    return Similarity(1 / radius, np.eye(3), -(low + high) / 2 / radius)
+
+
 def fit_similarity(
     source: Float[ndarray, "n 3"],
     target: Float[ndarray, "n 3"],

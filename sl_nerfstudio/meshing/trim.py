@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int64
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.visibility import FrameCounts, Occluder, count_frames
@@ -106,9 +105,8 @@ def _edges(mesh: Mesh) -> Int64[ndarray, "e 2"]:
 
 
 def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarray, "n"]]:
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
-    return int(count), label.astype(np.int64)
+    label = component_labels(edges[:, 0], edges[:, 1], n)
+    return int(label.max(initial=-1)) + 1, label
 
 
 def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], counts: FrameCounts) -> Bool[ndarray, "v"]:

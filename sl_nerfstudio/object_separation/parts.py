@@ -7,10 +7,9 @@ from itertools import product
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, KDTree
 
+from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.object_separation.plane import Plane
 from sl_nerfstudio.object_separation.settings import SeparationSettings
 from sl_nerfstudio.object_separation.viewed_region import ViewedRegion
@@ -92,9 +91,8 @@ def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]
         found = keys[place] == there
         pairs.append(np.stack([np.flatnonzero(found), order[place[found]]]))
     a, b = np.concatenate(pairs, 1)
-    n = len(voxels)
-    count, label = connected_components(coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n)), directed=False)
-    return int(count), label.astype(np.int64)
+    label = component_labels(a, b, len(voxels))
+    return int(label.max(initial=-1)) + 1, label
 
 
 def _candidates(
@@ -106,7 +104,7 @@ def _candidates(
     settings: SeparationSettings,
 ) -> Bool[ndarray, "parts"]:
     """Parts that are large enough, and do not stand on a plane beside the main part."""
-    count = int(label.max()) + 1
+    count = int(label.max(initial=-1)) + 1
     members = np.bincount(label, minlength=count)
     fits = members >= settings.least_voxels
     for plane in planes:

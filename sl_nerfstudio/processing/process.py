@@ -58,7 +58,8 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     choice, registration = _register(clouds, not config.unordered, config.seed, start, log)
     if not (config.unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
-        choice, registration = _register(clouds, False, config.seed, start, log)
+        if any(cloud.alternatives for cloud in clouds):  # they were compared with the wrong neighbours
+            choice, registration = _register(clouds, False, config.seed, start, log)
     clouds, results = list(choice.clouds), with_clouds(results, choice.clouds)
     log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
     _require_registered(config, inputs, results, registration, make_report)

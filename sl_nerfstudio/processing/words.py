@@ -1,7 +1,5 @@
 """Sentences for what relative pose estimation and registration found out about frames."""
 
-from collections.abc import Sequence
-
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
@@ -12,7 +10,9 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
+from sl_nerfstudio.verdict.verdict import listed
 
+_LISTED = 3  # other frames of a group in a sentence
 _DEGENERACIES: dict[DegeneracyKind, str] = {
     "few points": "only {:.0f} decoded pixels agree with each other; capture the object larger in the image, or with "
     "more light",
@@ -51,13 +51,12 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         return "no other frame shows any of its surface; capture views in between"
     if isinstance(exclusion, CoordinatesDisagree):
         others = [name for name in exclusion.group if name != exclusion.frame]
-        who = (
-            f"its coordinates and those of {_listed(others)} agree with each other but" if others else "its coordinates"
-        )
+        with_others = f" and those of {listed(others, _LISTED)} agree with each other but" if others else ""
+        who = f"its coordinates{with_others}"
         return f"{who} contradict those of the other frames wherever these place it; capture this view again"
     if isinstance(exclusion, SeparateComponent):
         others = [name for name in exclusion.component if name != exclusion.frame]
-        group = f"it and {_listed(others)} form a group whose" if others else "its"
+        group = f"it and {listed(others, _LISTED)} form a group whose" if others else "its"
         remedy = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
         why = "may slip along the surface (of revolution, or a plane)" if exclusion.slips else "is not certain"
         more = ", with something beside the object in view that does not look the same from all sides"
@@ -80,9 +79,3 @@ def uncertainty_sentence(uncertainty: Uncertainty) -> str:
         f"{uncertainty.frame}: it may slip along the surface; its rotation is known only to "
         f"{uncertainty.sigma_deg:.1f} degrees (surface of revolution, or plane?)"
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Some names in a sentence."""
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

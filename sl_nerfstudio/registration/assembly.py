@@ -6,7 +6,7 @@ its own once components have grown, and a weak cut between two blocks is judged 
 stays undecided remain apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import Pivots, node_at
 from sl_nerfstudio.registration.increments import log_at
-from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality
+from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality, support
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.pairs.slip import screw_motion
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
+from sl_nerfstudio.registration.pairs.surface_agreement import Agreement, Side, Tolerance, agreement
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings
 
@@ -145,10 +145,6 @@ class Assembly:
         return self._between(self._edges, first, second)
 
     @staticmethod
-    def _quality(e: PairMatch) -> float:
-        return e.overlap * e.fitness**2
-
-    @staticmethod
     def _between(edges: Sequence[PairMatch], first: Component, second: Component) -> list[PairMatch]:
         return [
             e for e in edges if (e.source in first and e.target in second) or (e.source in second and e.target in first)
@@ -158,7 +154,7 @@ class Assembly:
         """What a pair across says: its best similarity and its rivals, each with its quality."""
         forward = e.source in second
         target, source = (e.target, e.source) if forward else (e.source, e.target)
-        best = self._quality(e)
+        best = support(e)
         results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
         return [
             Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q, e, k == 0)
@@ -180,20 +176,24 @@ class Assembly:
 
     def _judge(self, first: Component, second: Component, S: Similarity, links: Sequence[Sequence[Link]]) -> Joint:
         """Votes of the pairs across, and the points of all frames across that see the same side."""
-        s, a = self._settings.assembly, self._settings.pair.agreement
         votes, same = 0.0, 0
         for of_pair in links:
             near = [link for link in of_pair if self._same(link, S, first, second)]
             votes += max((link.quality for link in near), default=0.0)
             same += any(link.best for link in near)
-        tolerance = Tolerance(0.0, s.tolerance_sigmas)
+        behind = self._settings.pair.agreement.behind
         agreeing = contradicting = 0.0
+        for sums in self._agreements(first, second, S, self._settings.assembly.tolerance_sigmas):
+            agreeing += float(sums.agreeing[0])
+            contradicting += float(sums.in_front[0] + behind * sums.behind[0])
+        return Joint(S, votes, same, agreeing, contradicting)
+
+    def _agreements(self, first: Component, second: Component, S: Similarity, sigmas: float) -> Iterator[Agreement]:
+        """Each pair of frames across that see the same side, within some standard deviations of their surfaces."""
+        width = Tolerance(0.0, sigmas)
         for i, j in self._facing(first, second, S):
             S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])
-            sums = agreement(self._sides[j], self._sides[i], S_i_j, tolerance, tolerance, a)
-            agreeing += float(sums.agreeing[0])
-            contradicting += float(sums.in_front[0] + a.behind * sums.behind[0])
-        return Joint(S, votes, same, agreeing, contradicting)
+            yield agreement(self._sides[j], self._sides[i], S_i_j, width, width, self._settings.pair.agreement)
 
     def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
         """Whether all frames across together do not notice the motion along which one pair of them slips."""
@@ -216,11 +216,8 @@ class Assembly:
 
     def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
         """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""
-        a, unit = self._settings.pair.agreement, Tolerance(0.0, sigmas)
         costs, weights = [1.0], [1e-9]
-        for i, j in self._facing(first, second, S):
-            S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])
-            sums = agreement(self._sides[j], self._sides[i], S_i_j, unit, unit, a)
+        for sums in self._agreements(first, second, S, sigmas):
             costs.append(float(sums.cost[0]))
             weights.append(float(sums.judged[0]))
         return float(np.average(costs, weights=weights))

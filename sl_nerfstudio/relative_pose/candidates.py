@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_cost
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, distinct, fit_epipolar
+from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, distinct_fits, fit_epipolar
 from sl_nerfstudio.relative_pose.five_point import five_point_starts, in_front
 from sl_nerfstudio.relative_pose.plane_starts import plane_starts
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
@@ -38,15 +38,16 @@ def relative_pose_candidates(
     starts = five_point_starts(rays, rng, settings) + plane_starts(rays, settings.plane)
     polishing_rays = rays.chosen(subsample(np.arange(len(rays)), s.polishing_rays, rng))
     polishing = replace(settings.fit, iterations=s.polishing_iterations)
-    found: list[EpipolarFit] = []
-    for R, t in starts:
-        fit = fit_epipolar(R, t, polishing_rays, polishing)
-        fitting = np.abs(fit.residual) <= s.inlier_sigmas * fit.noise_px
-        if in_front(fit.R, fit.t, polishing_rays)[fitting].mean() < s.least_in_front:
-            continue  # the same essential matrix with the surface behind the devices
-        if all(distinct((fit.R, fit.t), (other.R, other.t), s.separation) for other in found):
-            found.append(fit)
+    fits = [fit_epipolar(R, t, polishing_rays, polishing) for R, t in starts]
+    found = distinct_fits((fit for fit in fits if _mostly_in_front(fit, polishing_rays, settings)), s.separation)
     return ranked(found, rays.chosen(subsample(np.arange(len(rays)), s.ranking_rays, rng)), settings)
+
+
+def _mostly_in_front(fit: EpipolarFit, rays: RayPairs, settings: RelativePoseSettings) -> bool:
+    """False for the same essential matrix with the surface behind the devices."""
+    s = settings.candidates
+    fitting = np.abs(fit.residual) <= s.inlier_sigmas * fit.noise_px
+    return not in_front(fit.R, fit.t, rays)[fitting].mean() < s.least_in_front
 
 
 def ranked(fits: Sequence[EpipolarFit], rays: RayPairs, settings: RelativePoseSettings) -> list[Candidate]:

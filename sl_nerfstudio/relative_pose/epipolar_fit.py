@@ -3,6 +3,7 @@
 The length of the baseline is one. Residuals and unknowns are those of `sampson`.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,15 @@ def distinct(
     """Whether two poses (R, t) are two solutions rather than one."""
     rotation_rad = np.linalg.norm(a[0] - b[0]) / np.sqrt(2)  # for small angles
     return bool(rotation_rad > separation.rotation_rad or np.linalg.norm(a[1] - b[1]) > separation.direction)
+
+
+def distinct_fits(fits: Iterable[EpipolarFit], separation: Separation) -> list[EpipolarFit]:
+    """Without those that are close to an earlier one: unfinished refinements may have the same end."""
+    kept: list[EpipolarFit] = []
+    for fit in fits:
+        if all(distinct((fit.R, fit.t), (other.R, other.t), separation) for other in kept):
+            kept.append(fit)
+    return kept
 
 
 def fit_epipolar(

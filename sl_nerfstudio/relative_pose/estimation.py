@@ -3,7 +3,6 @@
 Five degrees of freedom; the length of the baseline cannot be seen in one frame and is set to one.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.relative_pose.candidates import Candidate, ranked, relative_pose_candidates
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, find_degeneracies
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, distinct, fit_epipolar
+from sl_nerfstudio.relative_pose.epipolar_fit import covariance, distinct_fits, fit_epipolar
 from sl_nerfstudio.relative_pose.five_point import in_front
 from sl_nerfstudio.relative_pose.pattern_blocks import block_count
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
@@ -85,7 +84,7 @@ def estimate_relative_pose(
     if not candidates:
         raise _no_pose("no relative pose puts most points in front of both devices")
     rivals = [c for c in candidates if c.rivals_best][: settings.candidates.most]
-    solutions = _distinct_solutions([fit_epipolar(c.fit.R, c.fit.t, some, settings.fit) for c in rivals], settings)
+    solutions = distinct_fits((fit_epipolar(c.fit.R, c.fit.t, some, settings.fit) for c in rivals), settings.solutions)
     solutions = ranked(solutions, some, settings)
     frame = _Frame(len(uv_camera), usable, rays, some, block_count(projector, settings.blocks), settings)
     second_best = solutions[1].explained if len(solutions) > 1 else None
@@ -109,15 +108,6 @@ class _Frame:
     some: RayPairs  # to which solutions were fitted
     blocks: int  # squares of the whole pattern
     settings: RelativePoseSettings
-
-
-def _distinct_solutions(fits: Sequence[EpipolarFit], settings: RelativePoseSettings) -> list[EpipolarFit]:
-    """Without those that are close to an earlier one: unfinished refinements may have the same end."""
-    kept: list[EpipolarFit] = []
-    for fit in fits:
-        if all(distinct((fit.R, fit.t), (other.R, other.t), settings.solutions) for other in kept):
-            kept.append(fit)
-    return kept
 
 
 def _relative_pose(

@@ -5,9 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
+from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.settings import CrossFrameSettings
 
@@ -49,8 +48,7 @@ def components(edges: Sequence[Pair], nodes: Iterable[int]) -> list[list[int]]:
     names = list(nodes)
     index = {k: n for n, k in enumerate(names)}
     ends = np.array([(index[a], index[b]) for a, b in edges], dtype=np.int64).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(names), len(names)))
-    label = connected_components(graph, directed=False)[1]
+    label = component_labels(ends[:, 0], ends[:, 1], len(names))
     groups = [[names[n] for n in np.flatnonzero(label == c)] for c in np.unique(label)]
     return sorted(groups, key=lambda group: (-len(group), group[0]))
 

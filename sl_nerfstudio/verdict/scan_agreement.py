@@ -11,7 +11,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, centred_on
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma, Scan
@@ -84,6 +84,4 @@ def _scene(
     points: Float[ndarray, "n 3"] = np.concatenate(parts)
     if len(points) < 2:
         return Similarity.identity()
-    low, high = np.percentile(points, [_EDGE, 100 - _EDGE], axis=0)
-    radius = float(np.linalg.norm(high - low) / 2) or 1.0
-    return Similarity(1 / radius, np.eye(3), -(low + high) / 2 / radius)
+    return centred_on(points, _EDGE)

@@ -31,7 +31,7 @@ def worst(reasons: Iterable[Reason]) -> Verdict:
     return Verdict(ordered[0].band if ordered else "good", tuple(r.sentence for r in ordered))
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], most: int = _LISTED) -> str:
     """Names for a sentence: the first few, and how many more there are."""
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.decoding.grid.graph import STEPS, GridGraph
 from sl_nerfstudio.decoding.grid.likelihood import symbol_log_likelihood
+from sl_nerfstudio.geometry.connectivity import component_labels
 
 # Passing beliefs along edges.
 _ROUNDS = 4
@@ -153,7 +152,7 @@ def _pieces(place: Int32[ndarray, "n 2"], neighbour: Int32[ndarray, "n 4"]) -> I
         holds = (place[b] == place[a] + np.array(STEPS[direction])).all(-1) & (place[a, 0] >= 0)
         pairs.append(np.stack([a[holds], b[holds]]))
     a, b = np.concatenate(pairs, 1)
-    _, label = connected_components(coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n)), directed=False)
+    label = component_labels(a, b, n)
     return np.where(place[:, 0] >= 0, label, -1).astype(np.int32)
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 from scipy.ndimage import maximum_filter, uniform_filter1d
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+
+from sl_nerfstudio.geometry.connectivity import component_labels
 
 RIGHT, DOWN, LEFT, UP = range(4)
 STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -87,10 +87,8 @@ def build_graph(maps: PhaseMaps) -> GridGraph:
 
 def component_of(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n"]:
     """Number of the connected component that each node lies in."""
-    n = len(neighbour)
     node, direction = np.nonzero(neighbour >= 0)
-    ends = (node, neighbour[node, direction])
-    return connected_components(coo_matrix((np.ones(len(node), dtype=bool), ends), shape=(n, n)), directed=False)[1]
+    return component_labels(node, neighbour[node, direction], len(neighbour)).astype(np.int32)
 
 
 def without_fragments(graph: GridGraph, least: int) -> GridGraph:

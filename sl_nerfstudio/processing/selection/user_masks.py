@@ -16,6 +16,7 @@ from sl_nerfstudio.processing.captures import ENDINGS
 from sl_nerfstudio.processing.selection.mask_file import read_mask
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.verdict.verdict import listed
 
 _LISTED = 20  # frames in a message
 
@@ -74,14 +75,17 @@ def find_masks(folder: Path, frames: Sequence[str], size: tuple[int, int]) -> Us
     missing = [name for name in frames if name not in files]
     if missing:
         raise FileError(
-            folder, f"has no mask for {_count(len(missing), len(frames))}: {_listed(missing)}",
+            folder, f"has no mask for {_count(len(missing), len(frames))}: {listed(missing, _LISTED)}",
             "masks are found by the name of the frame, without its ending",
             "add these masks (all white to use a whole capture), or take the captures out",
         )  # fmt: skip
     twice = [name for name, number in Counter(p.stem for p in found).items() if number > 1 and name in frames]
     if twice:
         raise FileError(
-            folder, f"holds several masks for {_listed(twice)}", "the same mask in two formats", "keep one of them"
+            folder,
+            f"holds several masks for {listed(twice, _LISTED)}",
+            "the same mask in two formats",
+            "keep one of them",
         )
     used = {name: files[name] for name in frames}
     return UserMasks(folder, size, used, _checked(used, size))
@@ -96,7 +100,7 @@ def _checked(files: dict[str, Path], size: tuple[int, int]) -> dict[str, str]:
             faults.append(error)
     if faults:
         first, others = faults[0], [fault.path.name for fault in faults[1:]]
-        more = f" (and {len(others)} more cannot be used: {_listed(others)})" if others else ""
+        more = f" (and {len(others)} more cannot be used: {listed(others, _LISTED)})" if others else ""
         raise FileError(first.path, first.problem + more, first.cause, first.remedy)
     return digests
 
@@ -107,8 +111,3 @@ def _digest(mask: Bool[ndarray, "h w"]) -> str:
 
 def _count(some: int, total: int) -> str:
     return f"{some} of {total} frames"
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more

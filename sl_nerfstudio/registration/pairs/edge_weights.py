@@ -15,10 +15,15 @@ def is_accepted(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS
     return match.fitness > settings.least_fitness and match.overlap > settings.least_overlap
 
 
+def support(match: PairMatch) -> float:
+    """Between 0 and 1: how much two surfaces agree, and how little contradicts."""
+    return match.overlap * match.fitness**2
+
+
 def quality(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> float:
     """Between 0 and 1: which of two results for a pair is better, and which pair of a frame."""
     clear = match.second_best_ratio < settings.ambiguous_ratio
-    return match.overlap * match.fitness**2 * (1.0 if clear else settings.ambiguous_weight)
+    return support(match) * (1.0 if clear else settings.ambiguous_weight)
 
 
 def is_ambiguous(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> bool:
