@@ -1,8 +1,10 @@
 """What a synthetic scan is made of; the docstrings of the fields are the help text of `sl-synth`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from sl_nerfstudio.errors import UserError
 
@@ -91,6 +93,11 @@ class SynthConfig:
             (self.seed >= 0, "--seed", self.seed, "seeds are at least 0"),
             ((self.world_turn or 0) >= 0, "--world-turn", self.world_turn, "seeds are at least 0"),
         )  # fmt: skip
-        for holds, flag, value, why in rules:
+        finite = [
+            (bool(np.isfinite(value).all()), f"--{field.name.replace('_', '-')}", value, "not a finite number")
+            for field in fields(self)
+            if isinstance(value := getattr(self, field.name), float | tuple)
+        ]
+        for holds, flag, value, why in (*finite, *rules):
             if not holds:
                 raise UserError(f"{flag} {value}: {why}")
