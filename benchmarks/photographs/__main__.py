@@ -9,8 +9,6 @@ is turned by more than 3 degrees, or if it puts the object off by more than 6 % 
 
 import json
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +18,11 @@ import numpy as np
 import tyro
 
 from benchmarks.machine import write_rows
+from benchmarks.photographs.command import process
 from benchmarks.photographs.scoring import NOTHING_DECODED, DecodingFigures, PoseError, decoding_figures, pose_errors
-from benchmarks.photographs.sets import SETS, CaptureSet, captures_of
+from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets
 from benchmarks.photographs.truth import Truth, read_truth
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import read_scan
 
 
@@ -86,7 +84,7 @@ def measure(one: CaptureSet, config: Config) -> Row:
     if not config.resume:
         shutil.rmtree(work, ignore_errors=True)
     start = time.monotonic()
-    message = process(captures, output, work, one.unordered, config.jobs)
+    message = process(captures, output, work, config.jobs, ["--unordered"] if one.unordered else [])
     seconds = time.monotonic() - start
     found = read_scan(output) if message == "" else None
     errors = [] if found is None else pose_errors(found, truth)
@@ -94,17 +92,6 @@ def measure(one: CaptureSet, config: Config) -> Row:
     document = json.loads((output / "processing.json").read_text()) if message == "" else {}
     decoding = decoding_figures(work, truth) if (work / "manifest.json").exists() else None
     return row_of(one, truth, kept, errors, decoding, document.get("verdict", "-"), seconds, message)
-
-
-def process(captures: Path, output: Path, work: Path, unordered: bool, jobs: int) -> str:
-    """Run sl-process; return what it says if it makes no scan."""
-    files = {"images": "images", "pattern": "pattern.json", "intrinsics": "intrinsics.json"}
-    flags = [word for flag, name in files.items() for word in (f"--{flag}", str(captures / name))]
-    flags += ["--output", str(output), "--work", str(work), "--jobs", str(jobs)]
-    flags += ["--unordered"] if unordered else []
-    command = [sys.executable, "-m", "sl_nerfstudio.cli.process", *flags]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return "" if done.returncode == 0 else done.stderr.strip() or f"exit status {done.returncode}"
 
 
 def row_of(
@@ -182,14 +169,6 @@ def _median(values: Sequence[float]) -> float:
     """Of those that exist."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.median(known)) if known else float("nan")
-
-
-def chosen_sets(parts: tuple[str, ...]) -> list[CaptureSet]:
-    """The sets whose names contain one of the parts. Raises UserError if a part fits none."""
-    for part in parts:
-        if not any(part in one.name for one in SETS):
-            raise UserError(f"--sets {part}: no set is named so; there are {', '.join(one.name for one in SETS)}")
-    return [one for one in SETS if not parts or any(part in one.name for part in parts)]
 
 
 def main() -> None:

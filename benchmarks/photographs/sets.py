@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
@@ -51,6 +52,14 @@ SETS = (
     CaptureSet("chair", "walls", "hard", 513),
     CaptureSet("cone-and-cylinder", "none", "hard", 514),
 )
+
+
+def chosen_sets(parts: tuple[str, ...]) -> list[CaptureSet]:
+    """The sets whose names contain one of the parts. Raises UserError if a part fits none."""
+    for part in parts:
+        if not any(part in one.name for one in SETS):
+            raise UserError(f"--sets {part}: no set is named so; there are {', '.join(one.name for one in SETS)}")
+    return [one for one in SETS if not parts or any(part in one.name for part in parts)]
 
 
 def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> Path:
