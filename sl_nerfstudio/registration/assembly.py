@@ -8,6 +8,7 @@ stays undecided remain apart.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -74,11 +75,12 @@ class Assembly:
         self._settings = settings
         self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
         self._weight = edge_weights(self._edges, settings.edge)
+        self._least_cosine = np.cos(np.radians(settings.selection.largest_view_angle_deg))
         self._rejected: set[frozenset[frozenset[int]]] = set()
         fitness = [e.fitness for e in edges] if fitness is None else fitness
         usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
-        self._largest_misfit = s.misfit_factor * max(s.least_misfit, 1 - usual)
+        self._usual_misfit = max(s.least_misfit, 1 - usual)
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
 
     def grow(self) -> list[Component]:
@@ -113,13 +115,13 @@ class Assembly:
     def decide(self, first: Component, second: Component) -> Joint | None:
         """The similarity between two components; None where it is not certain."""
         s = self._settings.assembly
-        found = sorted(self._joints(first, second), key=lambda j: -self._score(j))
+        found = [(self._score(j, first, second), j) for j in self._joints(first, second)]
         if not found:
             return None
-        best = found[0]
-        if best.agreeing < s.least_agreeing or self._score(best) <= 0:
+        (score, best), *others = sorted(found, key=lambda scored: -scored[0])
+        if best.agreeing < s.least_agreeing or score <= 0:
             return None
-        if len(found) > 1 and self._score(found[1]) > s.largest_rival * self._score(best):
+        if others and others[0][0] > s.largest_rival * score:
             return None
         if any(self._slips(best, e, first, second) for e in self._between(self._slipping, first, second)):
             return None
@@ -127,9 +129,32 @@ class Assembly:
             return None
         return best
 
-    def _score(self, joint: Joint) -> float:
-        """Votes, less where points contradict; nothing where more do than in good pairs."""
-        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / self._largest_misfit)
+    def _score(self, joint: Joint, first: Component, second: Component) -> float:
+        """Votes, less where points contradict; nothing where more do than in good pairs and inside the components."""
+        S = joint.S_first_second
+        cosines = [_cosine(first[i], S @ second[j]) for i, j in self._facing(first, second, S)]
+        usual = max(self._usual_misfit, *(self._inner_misfit(one, cosines) for one in (first, second)))
+        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / (self._settings.assembly.misfit_factor * usual))
+
+    def _inner_misfit(self, component: Component, cosines: Sequence[float]) -> float:
+        """Share of the points that contradict between frames of one component; 0 if there is no such pair.
+
+        For each pair of frames across two components, of which `cosines` has the cosine between the lines of sight,
+        one pair inside is judged that looks about as much alike: frames that are farther apart share less surface, and
+        more of it lies at edges.
+        """
+        pairs = list(combinations(sorted(component), 2))
+        inside = np.array([_cosine(component[i], component[j]) for i, j in pairs])
+        if not len(cosines) or not (inside > self._least_cosine).any():
+            return 0.0
+        agreeing = contradicting = 0.0
+        for k in {int(np.abs(inside - cosine).argmin()) for cosine in cosines}:
+            i, j = pairs[k]
+            S_i_j = component[i].inverse() @ component[j]
+            sums = self._agreement(i, j, S_i_j, self._settings.assembly.tolerance_sigmas)
+            agreeing += float(sums.agreeing[0])
+            contradicting += self._contradicting(sums)
+        return contradicting / max(agreeing + contradicting, 1e-9)
 
     def _joints(self, first: Component, second: Component) -> list[Joint]:
         """The clearly different similarities between two components that pairs across say, with their votes."""
@@ -181,19 +206,24 @@ class Assembly:
             near = [link for link in of_pair if self._same(link, S, first, second)]
             votes += max((link.quality for link in near), default=0.0)
             same += any(link.best for link in near)
-        behind = self._settings.pair.agreement.behind
         agreeing = contradicting = 0.0
         for sums in self._agreements(first, second, S, self._settings.assembly.tolerance_sigmas):
             agreeing += float(sums.agreeing[0])
-            contradicting += float(sums.in_front[0] + behind * sums.behind[0])
+            contradicting += self._contradicting(sums)
         return Joint(S, votes, same, agreeing, contradicting)
 
     def _agreements(self, first: Component, second: Component, S: Similarity, sigmas: float) -> Iterator[Agreement]:
         """Each pair of frames across that see the same side, within some standard deviations of their surfaces."""
-        width = Tolerance(0.0, sigmas)
         for i, j in self._facing(first, second, S):
-            S_i_j = Hypotheses.of(first[i].inverse() @ S @ second[j])
-            yield agreement(self._sides[j], self._sides[i], S_i_j, width, width, self._settings.pair.agreement)
+            yield self._agreement(i, j, first[i].inverse() @ S @ second[j], sigmas)
+
+    def _agreement(self, i: int, j: int, S_i_j: Similarity, sigmas: float) -> Agreement:
+        width = Tolerance(0.0, sigmas)
+        sides = self._sides[j], self._sides[i]
+        return agreement(*sides, Hypotheses.of(S_i_j), width, width, self._settings.pair.agreement)
+
+    def _contradicting(self, sums: Agreement) -> float:
+        return float(sums.in_front[0] + self._settings.pair.agreement.behind * sums.behind[0])
 
     def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
         """Whether all frames across together do not notice the motion along which one pair of them slips."""
@@ -228,7 +258,7 @@ class Assembly:
         return any(
             e.rotation_sigma_deg < s.largest_sigma_deg
             and e.second_best_ratio < s.largest_rival
-            and 1 - e.fitness < self._largest_misfit
+            and 1 - e.fitness < s.misfit_factor * self._usual_misfit
             for e in self._crossing(first, second)
         )
 
@@ -236,10 +266,9 @@ class Assembly:
         """The pairs across whose cameras look most nearly the same way."""
         s = self._settings.assembly
         pairs = [(i, j) for i in first for j in second]
-        cosine = np.array([first[i].R[:, 2] @ S.R @ second[j].R[:, 2] for i, j in pairs])
+        cosine = np.array([_cosine(first[i], S @ second[j]) for i, j in pairs])
         near = np.argsort(-cosine, kind="stable")[: s.most_pairs]
-        least = np.cos(np.radians(self._settings.selection.largest_view_angle_deg))
-        return [pairs[k] for k in near if cosine[k] > least]
+        return [pairs[k] for k in near if cosine[k] > self._least_cosine]
 
     def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""
@@ -252,3 +281,8 @@ class Assembly:
             p, radius = S.points(surface.centroid[None]), a.scale * S.scale * surface.radius
             shifts.append(float(np.linalg.norm(a.points(p) - b.points(p))) / radius)
         return min(shifts) > s.same_shift
+
+
+def _cosine(a: Similarity, b: Similarity) -> float:
+    """Of the angle between the lines of sight of two cameras."""
+    return float(a.R[:, 2] @ b.R[:, 2])
