@@ -19,7 +19,7 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity, centred_on
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, motion_by_pose_errors
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import PoseSigma
 
@@ -146,17 +146,24 @@ def _prior(
     scale: float,
     settings: RegisteredFramesSettings,
 ) -> PosePrior:
-    """Uncertainty of each frame after registration and relative pose estimation; scene units."""
+    """Uncertainty of each frame after registration and relative pose estimation; scene units.
+
+    Registration moves the surface into its place; where the pose's error has moved, turned and scaled the surface as a
+    whole, that puts the camera off.
+    """
     rows = []
     for k in index:
         pose, length = clouds[k].pose, registration.baseline[k] * scale
         direction = np.sqrt(np.trace(pose.covariance[3:, 3:]) / 2)
         turn = float(np.sqrt(np.trace(pose.covariance[:3, :3]) / 3))
+        motion = motion_by_pose_errors(clouds[k])
+        camera_shift = motion[:3] - np.outer(clouds[k].centroid, motion[6])
+        growth = float(np.linalg.norm(motion[6]))
         rows.append(
             (
-                settings.frame_translation,
-                np.radians(settings.frame_rotation_deg),
-                length * float(np.hypot(settings.baseline_length, direction)),
+                float(np.hypot(settings.frame_translation, length * np.linalg.norm(camera_shift) / 3**0.5)),
+                float(np.hypot(np.radians(settings.frame_rotation_deg), np.linalg.norm(motion[3:6]) / 3**0.5)),
+                length * float(np.linalg.norm([settings.baseline_length, growth, direction])),
                 max(turn, np.radians(settings.least_relative_rotation_deg)),
             )
         )

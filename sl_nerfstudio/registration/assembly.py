@@ -80,7 +80,7 @@ class Assembly:
         fitness = [e.fitness for e in edges] if fitness is None else fitness
         usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
-        self._usual_misfit = max(s.least_misfit, 1 - usual)
+        self._largest_misfit = s.misfit_factor * max(s.least_misfit, 1 - usual)
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
 
     def grow(self) -> list[Component]:
@@ -133,8 +133,9 @@ class Assembly:
         """Votes, less where points contradict; nothing where more do than in good pairs and inside the components."""
         S = joint.S_first_second
         cosines = [_cosine(first[i], S @ second[j]) for i, j in self._facing(first, second, S)]
-        usual = max(self._usual_misfit, *(self._inner_misfit(one, cosines) for one in (first, second)))
-        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / (self._settings.assembly.misfit_factor * usual))
+        inner = max(self._inner_misfit(one, cosines) for one in (first, second))
+        largest = max(self._largest_misfit, self._settings.assembly.inner_misfit_factor * inner)
+        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / largest)
 
     def _inner_misfit(self, component: Component, cosines: Sequence[float]) -> float:
         """Share of the points that contradict between frames of one component; 0 if there is no such pair.
@@ -256,9 +257,10 @@ class Assembly:
         """Whether one of the pairs across determines the similarity by itself."""
         s = self._settings.assembly
         return any(
-            e.rotation_sigma_deg < s.largest_sigma_deg
+            e.slip_deg == 0
+            and e.rotation_sigma_deg < s.largest_sigma_deg
             and e.second_best_ratio < s.largest_rival
-            and 1 - e.fitness < s.misfit_factor * self._usual_misfit
+            and 1 - e.fitness < self._largest_misfit
             for e in self._crossing(first, second)
         )
 

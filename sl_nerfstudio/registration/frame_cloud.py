@@ -27,13 +27,18 @@ class FrameCloud:
     uv_camera: Float64[ndarray, "n 2"]
     points: Float64[ndarray, "n 3"]
     sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
-    sigma_pose: Float64[ndarray, "n"]  # along the camera ray, from the pose's covariance: points err together
+    pose_errors: Float64[ndarray, "n 5"]  # along the camera ray, by one sigma of each principal error of the pose
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     @property
     def sigma(self) -> Float64[ndarray, "n"]:
         """One standard deviation along the camera ray, without that of the unknown length of the baseline."""
         return np.hypot(self.sigma_noise, self.sigma_pose)
+
+    @property
+    def sigma_pose(self) -> Float64[ndarray, "n"]:
+        """Along the camera ray, from the pose's covariance: points err together."""
+        return np.linalg.norm(self.pose_errors, axis=1)
 
     @property
     def centroid(self) -> Float64[ndarray, "3"]:
@@ -89,7 +94,7 @@ def frame_cloud(
         uv_camera[keep],
         points,
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
-        sigma_pose=_sigma_of_pose(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
+        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
         alternatives=tuple(
             frame_cloud(name, coords, camera, projector, other, settings)
             for other in pose.alternatives
@@ -98,15 +103,18 @@ def frame_cloud(
     )
 
 
-def _sigma_of_pose(
+def _pose_errors(
     uv_camera: Float[ndarray, "n 2"],
     uv_projector: Float[ndarray, "n 2"],
     camera: Device,
     projector: Device,
     pose: RelativePose,
     settings: FrameCloudSettings,
-) -> Float64[ndarray, "n"]:
-    """Standard deviation of depth from the pose's covariance, by differences of the rays' closest approach."""
+) -> Float64[ndarray, "n 5"]:
+    """Changes of depth by one sigma of the pose along each principal axis of its covariance.
+
+    From differences of the rays' closest approach.
+    """
     rays, _ = ray_pairs(uv_camera, uv_projector, camera, projector)
     R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
     slopes = []
@@ -115,8 +123,23 @@ def _sigma_of_pose(
         step = h * np.eye(5)[k]
         ahead, behind = (camera_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
         slopes.append((ahead - behind) / (2 * h))
-    J = np.stack(slopes, 1)
-    return np.sqrt(np.einsum("ni,ij,nj->n", J, pose.covariance, J).clip(0))
+    variance, axes = np.linalg.eigh(pose.covariance)
+    return np.stack(slopes, 1) @ (axes * np.sqrt(variance.clip(0)))
+
+
+def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
+    """What one sigma of each principal error of the pose mostly amounts to: a similarity of the whole surface.
+
+    Increments (v, w, l) about the centroid: `p <- c + exp(l) exp(w) (p - c) + v`, lengths in baselines.
+    """
+    some = slice(None, None, max(1, len(cloud.points) // 500))
+    points = cloud.points[some]
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    moved = ray[:, :, None] * cloud.pose_errors[some, None, :]
+    p = points - cloud.centroid
+    turns = np.cross(np.eye(3), p[:, None, :]).transpose(0, 2, 1)  # columns e_k x p
+    similarity = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns, p[:, :, None]], 2)
+    return np.linalg.lstsq(similarity.reshape(-1, 7), moved.reshape(-1, 5), rcond=None)[0]
 
 
 def camera_depth(

@@ -69,8 +69,10 @@ def include_left_out(
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
     used = [e.fitness for e in registration.edges if e.used]
-    firm, slipping = split_by_slip(graph.edges)
-    assembly = Assembly(graph.sides, graph.pivots, firm, settings, used or None, slipping)
+    firm, slipping = split_by_slip(graph.edges, settings.pair.bounded_slip_deg)
+    # after the adjustment right frames fit as well as the others do
+    strict = replace(settings.assembly, misfit_factor=settings.assembly.inner_misfit_factor)
+    assembly = Assembly(graph.sides, graph.pivots, firm, replace(settings, assembly=strict), used or None, slipping)
     placed: Component = {}
     for k in left_out:
         joint = assembly.decide(main, {k: Similarity.identity()})

@@ -118,7 +118,7 @@ class PairSettings:
     """share of the largest overlap that a result must have to say how closely surfaces agree"""
     common_rms: float = 2.5
     """width at which results are compared, in root mean square distances of the closest one"""
-    least_width: float = 0.3
+    least_width: float = 1.25
     """least such width, in standard deviations of the surfaces"""
     common_steps: int = 4
     """steps of refinement with a kernel of that width"""
@@ -140,6 +140,10 @@ class PairSettings:
     """the same of its rotation and its scale, as lengths at one radius"""
     slip_angles_deg: tuple[float, ...] = (4.0, 8.0, 12.0)
     """rotations, in degrees, by which slipping is tried"""
+    bounded_slip_deg: float = 4.0
+    """slip, in degrees, up to which several pairs together connect frames: an uncertainty like any other"""
+    slip_steps: int = 5
+    """steps by which the rest of the motion follows each of these rotations"""
     slip_rise: float = 0.056
     """rise of the mean robust cost from which a motion is noticed: three standard errors of about 40 independent points
     that each have one standard deviation"""
@@ -201,6 +205,8 @@ class AssemblySettings:
     """points that must agree across two components, in frames: 1 is all points of one frame"""
     misfit_factor: float = 2.5
     """share of the points that may contradict, of those that can be judged, relative to good pairs of the scan"""
+    inner_misfit_factor: float = 1.6
+    """the same relative to frames of one component that look as much alike as those across"""
     least_misfit: float = 0.015
     """share that may contradict in good pairs: points at edges do in every pair"""
     largest_sigma_deg: float = 6.0

@@ -80,7 +80,10 @@ def build_surface_map(
     shape = (camera.h, camera.w)
     mean = np.bincount(index, -1 / cloud.points[keep, 2], size) / np.maximum(weight, 1)
     inverse_depth = np.where(weight > 0, mean, np.nan).reshape(shape)
-    sigma_ray = (np.bincount(index, cloud.sigma[keep], size) / np.maximum(weight, 1)).reshape(shape)
+    sigma_noise, *pose_errors = (
+        (np.bincount(index, values, size) / np.maximum(weight, 1)).reshape(shape)
+        for values in (cloud.sigma_noise[keep], *cloud.pose_errors[keep].T)
+    )
     fitted = np.full((camera.h, camera.w, 3), np.nan)
     _fit_inverse_depth(
         camera.h,
@@ -99,9 +102,14 @@ def build_surface_map(
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > settings.least_cosine)
     depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
-    sigma = np.hypot(sigma_ray * np.abs(np.nan_to_num(cosine)), settings.lattice_error * depth / camera.fl_x)
     points, place = (point[valid], uv.reshape(*shape, 2)[valid]) if valid.any() else (cloud.points, None)
     centroid, radius = _centre_and_radius(points)
+    along_normal = np.nan_to_num(np.abs(cosine))
+    sigma = np.hypot(sigma_noise * along_normal, settings.lattice_error * depth / camera.fl_x)
+    if valid.any():
+        errors = np.stack(pose_errors, -1)[valid] * along_normal[valid][:, None]
+        shape_errors = _beyond_similarity(errors, (point[valid] - centroid) / radius, normal[valid])
+        sigma[valid] = np.hypot(sigma[valid], np.linalg.norm(shape_errors, axis=-1))
     return SurfaceMap(
         camera,
         np.ascontiguousarray(np.nan_to_num(point)),
@@ -113,6 +121,18 @@ def build_surface_map(
         radius,
         _views(points, place, camera, settings),
     )
+
+
+def _beyond_similarity(
+    errors: Float64[ndarray, "m k"], p: Float64[ndarray, "m 3"], normal: Float64[ndarray, "m 3"]
+) -> Float64[ndarray, "m k"]:
+    """What remains of displacements along the normals after the similarity that takes up most of each.
+
+    An error of the projector's pose mostly moves, turns and scales the surface as a whole. Registration finds that
+    similarity anyway; only the rest keeps two surfaces apart.
+    """
+    moves = np.concatenate([normal, np.cross(p, normal), (p * normal).sum(-1, keepdims=True)], 1)
+    return errors - moves @ np.linalg.lstsq(moves, errors, rcond=None)[0]
 
 
 def _orientation_weights(normal: Float64[ndarray, "m 3"], count: int) -> Float64[ndarray, "m"]:

@@ -97,7 +97,7 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        firm, slipping = split_by_slip(self.edges)
+        firm, slipping = split_by_slip(self.edges, self.settings.pair.bounded_slip_deg)
         components = Assembly(self.sides, self.pivots, firm, self.settings, None, slipping).grow()
         if len(components[0]) > 1:
             return components
@@ -147,9 +147,9 @@ class ViewGraph:
         return match is not None and is_accepted(match, self.settings.edge)
 
 
-def split_by_slip(edges: Sequence[PairMatch]) -> tuple[list[PairMatch], list[PairMatch]]:
-    """Pairs that hold their frames in place, and pairs that may slip."""
-    return [e for e in edges if e.slip_deg == 0], [e for e in edges if e.slip_deg > 0]
+def split_by_slip(edges: Sequence[PairMatch], bounded_deg: float) -> tuple[list[PairMatch], list[PairMatch]]:
+    """Pairs that hold their frames in place to within an angle, and pairs that may slip by more."""
+    return [e for e in edges if e.slip_deg <= bounded_deg], [e for e in edges if e.slip_deg > bounded_deg]
 
 
 def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:

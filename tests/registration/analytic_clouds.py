@@ -82,5 +82,5 @@ def on_a_ball(cloud: FrameCloud, radius: float, name: str) -> FrameCloud:
     root = b * b - centre @ centre + (radius * cloud.radius) ** 2
     hit = root > 0
     points = ray[hit] * (b[hit] - np.sqrt(root[hit]))[:, None]
-    parts = {k: getattr(cloud, k)[hit] for k in ("uv_camera", "sigma_noise", "sigma_pose")}
+    parts = {k: getattr(cloud, k)[hit] for k in ("uv_camera", "sigma_noise", "pose_errors")}
     return replace(cloud, name=name, points=points, **parts)

@@ -31,7 +31,15 @@ def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100
     x, y = ray[:, 0] / -ray[:, 2], ray[:, 1] / -ray[:, 2]
     points = ray / -ray[:, 2:] * depth(x, y)[:, None]
     even = np.full(len(uv), sigma / np.sqrt(2))
-    return replace(_template(), camera=camera, uv_camera=uv, points=points, sigma_noise=even, sigma_pose=even)
+    errors = np.outer(even, np.eye(5)[0])
+    return replace(
+        _template(),
+        camera=camera,
+        uv_camera=uv,
+        points=points,
+        sigma_noise=even,
+        pose_errors=errors,
+    )
 
 
 def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:
@@ -46,7 +54,7 @@ def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:
         "uv_camera": uv,
         "points": ray / -ray[:, 2:] * distance,
         "sigma_noise": np.full(len(uv), np.median(cloud.sigma_noise)),
-        "sigma_pose": np.full(len(uv), np.median(cloud.sigma_pose)),
+        "pose_errors": np.tile(np.median(cloud.sigma_pose) * np.eye(5)[0], (len(uv), 1)),
     }
     return replace(cloud, **{key: np.concatenate([getattr(cloud, key), more]) for key, more in parts.items()})
 

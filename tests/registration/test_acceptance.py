@@ -48,7 +48,7 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(clouds):
 
 
 def test_a_frame_without_surface_shares_none(clouds):
-    few = {k: getattr(clouds[2], k)[::50] for k in ("uv_camera", "points", "sigma_noise", "sigma_pose")}
+    few = {k: getattr(clouds[2], k)[::50] for k in ("uv_camera", "points", "sigma_noise", "pose_errors")}
     found = register([*clouds[:2], replace(clouds[2], **few)])
     assert found.exclusions == (NoCommonSurface("frame_00002"),)
     assert found.registered.tolist() == [True, True, False]

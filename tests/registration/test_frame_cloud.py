@@ -6,7 +6,7 @@ import torch
 
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.registration.frame_cloud import frame_cloud, reliable_points
+from sl_nerfstudio.registration.frame_cloud import frame_cloud, motion_by_pose_errors, reliable_points
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
@@ -63,6 +63,20 @@ def test_the_pose_s_uncertainty_makes_points_uncertain():
         depths.append(depth.numpy())
     measured = np.std(depths, axis=0)
     assert np.median(measured / cloud.sigma_pose) == pytest.approx(1, abs=0.25)
+
+
+def test_an_error_of_the_pose_that_scales_the_surface_is_found_as_that_similarity():
+    cloud = clouds_of(rig_of(2, 60), 60)[0]
+    errors = np.zeros((len(cloud.points), 5))
+    errors[:, 3] = 0.1 * np.linalg.norm(cloud.points, axis=1)  # about the camera
+    some = slice(None, None, max(1, len(cloud.points) // 500))
+    p = cloud.points[some]
+    found = motion_by_pose_errors(replace(cloud, pose_errors=errors))
+    np.testing.assert_allclose(np.delete(found, 3, 1), 0, atol=1e-12)
+    v, w, growth = found[:3, 3], found[3:6, 3], found[6, 3]
+    centred = p - cloud.centroid
+    np.testing.assert_allclose(v + np.cross(w, centred) + growth * centred, 0.1 * p, atol=1e-9)
+    assert growth == pytest.approx(0.1)
 
 
 def test_what_contradicts_the_pose_is_left_out_of_points_and_coordinates():

@@ -36,8 +36,14 @@ def plane_cloud(template: FrameCloud, camera: Device, noise: float = 0.0, step: 
     depth = -DISTANCE / (ray @ NORMAL) * (1 + np.where(uv[:, 0] > camera.w / 2, step, 0.0))
     depth = depth * (1 + noise * np.random.default_rng(0).standard_normal(len(depth)))
     even = np.full(len(uv), 1e-3)
+    errors = np.outer(even, np.eye(5)[0])
     return replace(
-        template, camera=camera, uv_camera=uv, points=ray * depth[:, None], sigma_noise=even, sigma_pose=even
+        template,
+        camera=camera,
+        uv_camera=uv,
+        points=ray * depth[:, None],
+        sigma_noise=even,
+        pose_errors=errors,
     )
 
 
@@ -81,7 +87,7 @@ def test_an_edge_is_left_out_and_a_small_step_is_not(template):
 def test_sparse_places_are_left_out(template):
     cloud = plane_cloud(template, CAMERAS["pinhole"])
     keep = (np.floor(cloud.uv_camera).astype(int) % 4 == 0).all(1)  # one in sixteen: two in a window at most
-    parts = {k: getattr(cloud, k)[keep] for k in ("uv_camera", "points", "sigma_noise", "sigma_pose")}
+    parts = {k: getattr(cloud, k)[keep] for k in ("uv_camera", "points", "sigma_noise", "pose_errors")}
     assert not build_surface_map(replace(cloud, **parts)).valid.any()
     settings = SurfaceMapSettings(fewest_pixels=3, half_window=4)
     assert build_surface_map(replace(cloud, **parts), settings).valid.any()
@@ -148,13 +154,28 @@ def test_the_weight_of_equal_orientations_is_the_root_of_their_number():
 def test_the_uncertainty_of_a_surface_is_that_of_its_points_along_the_normal():
     """With a part that no averaging removes: a share of a map pixel."""
     cloud = cloud_of_depth(lambda x, y: 3 + 0.5 * x, 100, sigma=0.02)
-    found = build_surface_map(cloud)
+    found = build_surface_map(replace(cloud, pose_errors=np.zeros_like(cloud.pose_errors)))
+    np.testing.assert_allclose(found.sigma[found.valid], _sigma_along_normal(found, cloud.sigma_noise[0]), rtol=1e-6)
+
+
+def _sigma_along_normal(found, sigma_ray):
     p, n = found.point[found.valid], found.normal[found.valid]
     distance = np.linalg.norm(p, axis=1)
     lattice = SurfaceMapSettings().lattice_error * distance / found.camera.fl_x
-    np.testing.assert_allclose(
-        found.sigma[found.valid], np.hypot(0.02 * -(n * p).sum(1) / distance, lattice), rtol=1e-6
-    )
+    return np.hypot(sigma_ray * -(n * p).sum(1) / distance, lattice)
+
+
+def test_errors_that_move_turn_or_scale_the_whole_surface_do_not_make_it_uncertain():
+    """Registration finds that similarity; what bends the surface remains."""
+    cloud = cloud_of_depth(lambda x, y: 3 + 0.2 * np.sin(4 * x) * np.cos(5 * y), 100, sigma=0.01)
+    distance = np.linalg.norm(cloud.points, axis=1)
+    x = cloud.points[:, 0] / distance
+    errors = np.zeros((5, len(distance), 5))
+    errors[1, :, 2] = 0.1 * distance  # the scale, about the camera
+    errors[2, :, 3] = 0.1 * np.sign(np.sin(40 * x))
+    alone, scaled, bent = (build_surface_map(replace(cloud, pose_errors=e)) for e in errors[:3])
+    np.testing.assert_allclose(scaled.sigma[alone.valid], alone.sigma[alone.valid], rtol=0.05)
+    assert np.median((bent.sigma / alone.sigma)[bent.valid]) > 10
 
 
 def test_a_wall_behind_the_object_moves_all_that_is_seen_but_not_its_middle():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
 
@@ -36,6 +37,15 @@ class Hypotheses:
     def __getitem__(self, index: list[int]) -> "Hypotheses":
         """Some of them."""
         return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
+
+    def incremented(
+        self, v: Float64[ndarray, "k 3"], w: Float64[ndarray, "k 3"], growth: Float64[ndarray, "k"],
+        centre: Float64[ndarray, "3"],
+    ) -> "Hypotheses":  # fmt: skip
+        """Each followed by `p <- centre + growth exp(w) (p - centre) + v`."""
+        turn = Rotation.from_rotvec(w).as_matrix()
+        t = centre + growth[:, None] * np.einsum("kij,kj->ki", turn, self.t - centre) + v
+        return Hypotheses(self.scale * growth, turn @ self.R, t, self.log_scale_prior)
 
     def similarity(self, k: int) -> Similarity:
         """One of them."""

@@ -5,7 +5,6 @@ prior and a bound: each frame's baseline has an unknown length, but a free scale
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
@@ -120,10 +119,7 @@ def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance, settings: Pair
     step = step / np.maximum(size / (settings.largest_step * radius), 1)
     bound = settings.largest_log_scale
     bounded = found.log_scale_prior + np.clip(log_scale + step[:, 6] - found.log_scale_prior, -bound, bound)
-    growth = np.exp(bounded) / found.scale
-    turn = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
-    t = c + growth[:, None] * np.einsum("kij,kj->ki", turn, found.t - c) + step[:, :3]
-    return Hypotheses(np.exp(bounded), turn @ found.R, t, found.log_scale_prior)
+    return found.incremented(step[:, :3], step[:, 3:6], np.exp(bounded) / found.scale, c)
 
 
 def _common_width(sides: Sides, found: Hypotheses, settings: PairSettings) -> float:

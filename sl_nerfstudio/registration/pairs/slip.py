@@ -36,19 +36,43 @@ def slip_deg(
 ) -> float:
     """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
 
-    A motion is noticed where the mean robust cost of the points rises, with a kernel as narrow as the surfaces agree.
+    A motion is noticed where the mean robust cost of the points rises, with a kernel as narrow as the surfaces agree,
+    though everything but its rotation may follow: the axis of a surface of revolution is never known exactly.
     """
     surface, unit = sides[1].map, Tolerance(0.0, common.sigmas / settings.common_rms)
     angles = np.array([0.0, *settings.slip_angles_deg])
     least = np.full(len(angles), np.inf)
     for sense in (1.0, -1.0):
-        moved = [
-            Hypotheses.of(screw_motion(sense * angle * direction, surface) @ S_target_source)
-            for angle in np.radians(angles)
-        ]
-        least = np.minimum(least, agreement(*sides, Hypotheses.joined(moved), unit, unit, settings.agreement).cost)
+        moved = Hypotheses.joined(
+            [
+                Hypotheses.of(screw_motion(sense * angle * direction, surface) @ S_target_source)
+                for angle in np.radians(angles)
+            ]
+        )
+        for _ in range(settings.slip_steps):
+            moved = _followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas), settings)
+        least = np.minimum(least, agreement(*sides, moved, unit, unit, settings.agreement).cost)
     noticed = np.flatnonzero(least > least[0] + settings.slip_rise)
     return float(angles[noticed[0] - 1] if len(noticed) else angles[-1])
+
+
+def _followed(
+    sides: tuple[Side, Side],
+    moved: Hypotheses,
+    held: Float64[ndarray, "3"],
+    kernel: Tolerance,
+    settings: PairSettings,
+) -> Hypotheses:
+    """After a Gauss-Newton step of each that does not rotate about the axis `held`."""
+    target = sides[1].map
+    sums = agreement(*sides, moved, kernel, kernel, settings.agreement)
+    D = np.array([1.0] * 3 + [target.radius] * 4)
+    H, g = sums.H / D[:, None] / D, sums.g / D
+    free = np.eye(7) - np.outer(np.r_[0, 0, 0, held, 0], np.r_[0, 0, 0, held, 0])
+    damping = settings.damping * np.trace(H, axis1=1, axis2=2).clip(1e-12)
+    H = free @ H @ free + damping[:, None, None] * np.eye(7)
+    step = -np.linalg.solve(H, (g @ free)[..., None])[..., 0] / D
+    return moved.incremented(step[:, :3], step[:, 3:6], np.exp(step[:, 6]), target.centroid)
 
 
 def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:

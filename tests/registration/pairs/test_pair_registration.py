@@ -148,7 +148,7 @@ def test_the_result_does_not_depend_on_the_lengths_of_the_baselines(clouds):
 
 
 def in_unit(cloud, factor: float):
-    return replace(cloud, **{key: factor * getattr(cloud, key) for key in ("points", "sigma_noise", "sigma_pose")})
+    return replace(cloud, **{key: factor * getattr(cloud, key) for key in ("points", "sigma_noise", "pose_errors")})
 
 
 # ------------------------------------------------------------------ starts
