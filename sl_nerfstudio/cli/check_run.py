@@ -33,7 +33,7 @@ def summary(found: "RunCheck") -> str:
     there = "is there and unchanged" if found.has_scan else "is not there, so it was not compared"
     return "\n".join(
         [
-            f"{found.folder}: no faults, and nothing but settings and weights in it",
+            f"{found.folder}: no faults",
             f"  method              {config.method_name}",
             f"  state               {state}",
             f"  checkpoints         {found.checkpoints}, the last is {found.last.path.name}",

@@ -177,8 +177,8 @@ def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
         raise UserError(
             f"{path}: the scan has another place in the scene than in the training "
             f"(off by {np.abs(moved).max():.2g} of the scene's radius)\n"
-            "    cause:  its poses, unit or coordinates were changed, or another version of this package made the run\n"
-            "    remedy: give the unchanged scan with --data FOLDER, use the version that trained it, or train again"
+            "    cause:  the file was edited, or another version of this package made the run\n"
+            "    remedy: put back the file, use the version that trained it, or train again"
         )
 
 

@@ -45,8 +45,8 @@ class SLTrainer(Trainer):
         try:
             with self._ending():
                 super().train()
+            INTERRUPTION.remove()  # if interrupted they stay: a second signal ends the process at once
         finally:
-            INTERRUPTION.remove()
             self._leave_folder()
 
     def begin_step(self, step: int) -> None:
