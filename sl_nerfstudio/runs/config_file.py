@@ -89,7 +89,7 @@ def _expected() -> _Expected:
     """Everything that occurs in a configuration with every kind of setting."""
     groups = (FusedAdamOptimizerConfig(), RowAdamOptimizerConfig(), DecaySchedulerConfig())
     pipeline = SLPipelineConfig(datamanager=SLDataManagerConfig(), model=SLModelConfig())
-    whole = SLTrainerConfig(pipeline=pipeline, optimizers=dict(enumerate(groups)))
+    whole = SLTrainerConfig(pipeline=pipeline, optimizers={str(i): group for i, group in enumerate(groups)})
     found = list(_parts(whole))
     return _Expected(
         {_name(type(part)): part for part in found if is_dataclass(part) and not isinstance(part, type)},

@@ -81,7 +81,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
         from sl_nerfstudio.runs.config_file import read_config
 
     path = config_file(config_path)
-    config = read_config(path)
+    config: Any = read_config(path)
     checkpoint = read_checkpoint(last_checkpoint(config, path))
     if checkpoint.step < 0:
         raise UserError(
@@ -95,7 +95,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
-    pipeline = SLPipeline(config.pipeline, device, test_mode="inference")
+    pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
     _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
     try:
         pipeline.load_pipeline(checkpoint.weights, checkpoint.step)

@@ -85,7 +85,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()  # torch itself does not look at the checksums
-        state = None if damaged else torch.load(path, map_location="cpu", mmap=True, weights_only=True)
+        state: Any = None if damaged else torch.load(path, map_location="cpu", mmap=True, weights_only=True)
     except Exception as error:  # a damaged file makes torch raise nearly anything
         raise _unreadable(path, f"({type(error).__name__})") from error
     if damaged:

@@ -109,7 +109,8 @@ def own_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def status(action: Callable[..., Any], *arguments: Any) -> int:
+def status(action: Callable[..., Any], *arguments: Any) -> object:
+    """The exit status of what the action ends with."""
     with pytest.raises(SystemExit) as end:
         action(*arguments)
     return end.value.code

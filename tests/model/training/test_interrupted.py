@@ -151,6 +151,23 @@ def test_an_ignored_signal_stays_ignored():
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
+def test_two_trainings_are_equal_whatever_else_the_machine_does(scan_root, tmp_path):
+    """Bit for bit, with several threads and other processes that take the processor away."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    busy: list[int] = []
+    try:
+        train(settings(scan_root, tmp_path, "alone", steps=6))
+        busy = [child(lambda: [sum(range(1000)) for _ in iter(int, 1)]) for _ in range(os.cpu_count() or 1)]
+        train(settings(scan_root, tmp_path, "beside others", steps=6))
+    finally:
+        torch.set_num_threads(before)
+        for pid in busy:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+    require_equal(last_state(folder_of(tmp_path, "beside others")), last_state(folder_of(tmp_path, "alone")))
+
+
 def test_a_killed_training_goes_on_or_starts_again(scan_root, finished, tmp_path):
     """SIGKILL at seeded moments, one after the other, until the training is through: the result is the same."""
     folder, moments = folder_of(tmp_path), random.Random(7)
