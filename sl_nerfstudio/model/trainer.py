@@ -68,8 +68,7 @@ class SLTrainerConfig(TrainerConfig):
         Returns the checkpoint that is resumed. Raises UserError.
         """
         root = self._scan_root()
-        if self.max_num_iterations < 1:
-            raise UserError(f"--max-num-iterations {self.max_num_iterations}: at least 1 is needed")
+        self._require_flags()
         _require_device(self.machine.device_type)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
@@ -97,6 +96,22 @@ class SLTrainerConfig(TrainerConfig):
         }
         pipeline.settings_fingerprint = settings_fingerprint(self)
         return begun
+
+    def _require_flags(self) -> None:
+        """Raise UserError for numbers and names that no training can have."""
+        rays, seed = self.pipeline.datamanager.train_num_rays_per_batch, self.machine.seed  # type: ignore[attr-defined]
+        for flag, value in (
+            ("--max-num-iterations", self.max_num_iterations),
+            ("--schedule-iterations", self.schedule_iterations),
+            ("--pipeline.datamanager.train-num-rays-per-batch", rays),
+        ):
+            if value is not None and value < 1:
+                raise UserError(f"{flag} {value}: at least 1 is needed")
+        if not 0 <= seed < 2**32:
+            raise UserError(f"--machine.seed {seed}: give a number from 0 to {2**32 - 1}")
+        for flag, name in (("--timestamp", self.timestamp), ("--experiment-name", self.experiment_name)):
+            if name is not None and (not name.strip() or Path(name).is_absolute() or ".." in Path(name).parts):
+                raise UserError(f"{flag} {name!r}: is not the name of a folder inside --output-dir")
 
     def save_config(self) -> None:
         """Write config.yml, complete or not at all."""

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -74,7 +73,8 @@ class Interruption:
         if self._received is not None:
             os._exit(128 + number)
         self._received = number
-        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, b"interrupted\n")  # print is not allowed here
+        said = b"terminated\n" if number == signal.SIGTERM else b"interrupted\n"
+        os.write(2, said)  # print is not allowed here
         if not self._held:
             self._raise_received()
 

@@ -141,4 +141,4 @@ def test_ns_viewer_ends_without_a_traceback(finished, monkeypatch, capfd, number
     monkeypatch.setattr(run_viewer, "_start_viewer", lambda *_: send(number))
     viewer = run_viewer.RunViewer(load_config=finished / "config.yml")
     assert status(viewer.main) == code
-    assert capfd.readouterr().err.strip().endswith("interrupted")
+    assert capfd.readouterr().err.strip().endswith(("interrupted", "terminated"))

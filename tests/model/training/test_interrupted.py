@@ -36,6 +36,7 @@ from tests.model.training.small_runs import (
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143}
+SAID = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 @pytest.mark.parametrize("number, step", [(signal.SIGINT, 0), (signal.SIGTERM, 3), (signal.SIGINT, 7)])
@@ -50,7 +51,7 @@ def test_a_signal_saves_the_step_and_the_run_goes_on_as_if_nothing_had_happened(
     said = capfd.readouterr()
     assert "Traceback" not in said.out + said.err
     line = f"to go on: ns-train sl-neus --load-config {folder}/config.yml"
-    assert said.err.splitlines()[-2:] == ["interrupted", line]
+    assert said.err.splitlines()[-2:] == [SAID[number], line]
     assert [path.name for path in checkpoints_in(folder / "nerfstudio_models")] == [f"step-{step:09d}.ckpt"]
     monkeypatch.setattr("sl_nerfstudio.model.model.adjust_scan", lambda *_: pytest.fail("adjusted again"))
     go_on(folder / "config.yml")
