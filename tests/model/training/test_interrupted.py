@@ -6,12 +6,18 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+
+with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
+    warnings.simplefilter("ignore")
+    from nerfstudio.engine.trainer import Trainer
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel
@@ -122,6 +128,18 @@ def test_checkpoints_are_written_when_time_and_steps_have_passed(scan_root, tmp_
     saved.clear()
     train(settings(scan_root, tmp_path, "seldom", seconds_per_save=1000.0))
     assert saved == [-1, 11]
+
+
+def test_a_signal_ends_a_training_that_is_paused_in_the_viewer(scan_root, tmp_path):
+    timer = threading.Timer(1.0, send, [signal.SIGTERM])
+    timer.start()
+    assert status(train, settings(scan_root, tmp_path, start_paused=True)) == 143
+
+
+def test_control_c_in_the_viewer_of_a_finished_training_is_its_normal_end(scan_root, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: send(signal.SIGINT))
+    train(settings(scan_root, tmp_path, steps=1))
+    assert last_state(folder_of(tmp_path))["step"] == 0
 
 
 @pytest.mark.parametrize("first, second", [(signal.SIGINT, signal.SIGINT), (signal.SIGINT, signal.SIGTERM)])
