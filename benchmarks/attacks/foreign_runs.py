@@ -4,6 +4,7 @@ import json
 import random
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -289,8 +290,8 @@ def _mixed_up() -> list[Case]:
     ):
         for name, command in (("sl-export", EXPORT), ("sl-check", CHECK)):
             title = f"{name}: config.yml with {new.split(':')[0]} changed"
-            attack = lambda folder, old=old, new=new, command=command: edited(folder, old, new, command)  # noqa: E731
-            found.append(Case(group, title, ("run",), attack))
+            again = partial(edited, old=old, new=new, command=command)
+            found.append(Case(group, title, ("run",), again))
 
     def beside(folder: Path) -> str:
         for name in ("step-xyz.ckpt", "step-1.ckpt", "best.ckpt", ".partial", "notes.txt"):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.attacks.case import Case
+from benchmarks.attacks.case import Case, Fixture
 from benchmarks.attacks.commands import Done, call, start
 from benchmarks.attacks.expect import accepted, refused
 from benchmarks.attacks.foreign_runs import CHECKPOINT, RUN
@@ -77,7 +77,8 @@ def _folders() -> list[Case]:
         done = train(folder, *_replaced(_FURTHER, "--timestamp", "second"), "--pipeline.model.losses.eikonal", "0.2")
         return accepted(done) or ("" if content(folder / RUN) == before else "changed the first run")
 
-    both, other_loss = ("run", "scan"), ("--pipeline.model.losses.eikonal", "0.2")
+    both: tuple[Fixture, ...] = ("run", "scan")
+    other_loss = ("--pipeline.model.losses.eikonal", "0.2")
     into = kept(*_INTO_RUN, words=("holds another run", "--load-dir", "--timestamp"))
     another = kept(*_FURTHER, *other_loss, words=("other settings", "--timestamp"))
     seed = kept(*_FURTHER, "--machine.seed", "7", words=("other settings",))
@@ -151,10 +152,9 @@ def _viewer() -> list[Case]:
         port = str(20000 + os.getpid() % 20000)
         flags = ("--load-config", own_config(folder), "--viewer.websocket-host", "127.0.0.1")
         process = start(folder, "ns-viewer", *flags, "--viewer.websocket-port", port)
-        end = time.monotonic() + 90
+        end = time.monotonic() + 300
         while not _listening(int(port)) and process.poll() is None and time.monotonic() < end:
             time.sleep(0.1)
-        time.sleep(1)
         address = _listening(int(port))
         process.send_signal(number)
         try:

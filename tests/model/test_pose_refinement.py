@@ -292,9 +292,8 @@ def checkpoint_of(folder: Path, scan: Scan, change: IntrinsicsChange) -> Path:
         "_model.intrinsics_change": torch.tensor(change.values, dtype=torch.float64),
         "scan_fingerprint": as_tensor(scan_fingerprint(scan)),
     }
-    rate = {"shape": "cosine", "final": 0.1, "warm_up": 0, "max_steps": 700}
-    schedulers = {"mlp": {"lr_lambdas": [rate]}}
-    state = {"step": 9, "pipeline": weights, "optimizers": {}, "schedulers": schedulers, "scalers": {}}
+    state = {"step": 9, "pipeline": weights, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    state["schedule_iterations"] = 700
     torch.save(state, folder / "step-000000009.ckpt")
     return folder
 

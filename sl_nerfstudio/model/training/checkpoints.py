@@ -16,7 +16,9 @@ from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.training.fingerprints import as_text
 
 _NAME = re.compile(r"step-(\d{9,18})\.ckpt")
-SCAN_KEY, SETTINGS_KEY = "scan_fingerprint", "settings_fingerprint"
+SCAN_KEY, SETTINGS_KEY = "scan_fingerprint", "settings_fingerprint"  # among the weights
+SCHEDULE_KEY = "schedule_iterations"  # beside nerfstudio's own parts
+_PARTS = ("step", "pipeline", "optimizers", "schedulers", "scalers", SCHEDULE_KEY)
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Checkpoint:
     path: Path
     step: int  # the last step that is in it; -1: poses are adjusted, training has not begun
     weights: dict[str, Tensor]  # of the pipeline
-    schedule_iterations: int | None  # None where no learning rate states it
+    schedule_iterations: int  # steps over which learning rates decay and annealing takes place
 
     @property
     def intrinsics_change(self) -> IntrinsicsChange | None:
@@ -93,8 +95,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     problem = _problem(state)
     if problem:
         raise _unreadable(path, f"({problem})")
-    lengths = [rate["max_steps"] for rates in state["schedulers"].values() for rate in rates["lr_lambdas"] if rate]
-    return Checkpoint(path, state["step"], state["pipeline"], max(lengths, default=None))
+    return Checkpoint(path, state["step"], state["pipeline"], state[SCHEDULE_KEY])
 
 
 def _unreadable(path: Path, why: str) -> UserError:
@@ -109,11 +110,13 @@ def _problem(state: Any) -> str:
     """What a checkpoint of ns-train has and this does not; "" if it has all."""
     if not isinstance(state, dict):
         return f"it holds a {type(state).__name__}, not the state of a training"
-    missing = [key for key in ("step", "pipeline", "optimizers", "schedulers", "scalers") if key not in state]
+    missing = [key for key in _PARTS if key not in state]
     if missing:
         return f"it lacks {missing[0]}"
     if type(state["step"]) is not int or not -1 <= state["step"] < 10**9:
         return "its step is no number"
+    if type(state[SCHEDULE_KEY]) is not int or state[SCHEDULE_KEY] < 1:
+        return "the length of its schedule is no number"
     weights = state["pipeline"]
     if not _is_mapping_of(weights, Tensor) or not all(isinstance(key, str) for key in weights):
         return "its pipeline is not made of weights"

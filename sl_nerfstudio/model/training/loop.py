@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.training.checkpoints import checkpoint_name, checkpoints_in, write_checkpoint
+from sl_nerfstudio.model.training.checkpoints import SCHEDULE_KEY, checkpoint_name, checkpoints_in, write_checkpoint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
 
@@ -81,6 +81,7 @@ class SLTrainer(Trainer):
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
+            SCHEDULE_KEY: self.config.schedule_iterations,  # type: ignore[attr-defined]
         }
         path = self.checkpoint_dir / checkpoint_name(step)
         with INTERRUPTION.held():

@@ -27,6 +27,7 @@ GOOD = {
     "optimizers": {"mlp": {"state": {0: {"step": torch.tensor(3.0)}}, "param_groups": [{"lr": 0.1, "params": [0]}]}},
     "schedulers": {"mlp": {"lr_lambdas": [RATE]}},
     "scalers": {},
+    "schedule_iterations": 700,
 }
 WRONG: dict[str, tuple[Any, str]] = {
     "list": ([1, 2], "it holds a list"),
@@ -39,6 +40,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "step as boolean": ({**GOOD, "step": True}, "its step is no number"),
     "step too small": ({**GOOD, "step": -2}, "its step is no number"),
     "step too large": ({**GOOD, "step": 10**12}, "its step is no number"),
+    "schedule as text": ({**GOOD, "schedule_iterations": "long"}, "the length of its schedule is no number"),
     "weights as list": ({**GOOD, "pipeline": [torch.zeros(1)]}, "not made of weights"),
     "weights as numbers": ({**GOOD, "pipeline": {"a": 1.0}}, "not made of weights"),
     "weights without names": ({**GOOD, "pipeline": {1: torch.zeros(1)}}, "not made of weights"),

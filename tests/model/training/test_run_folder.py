@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from copy import deepcopy as copy_of
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,18 @@ def test_a_run_is_trained_further_in_its_own_folder(scan_root, tmp_path):
     further = settings(scan_root, tmp_path, "split", steps=4, load_dir=folder / "nerfstudio_models")
     train(further)
     require_equal(last_state(folder), last_state(folder_of(tmp_path, "whole")))
+
+
+def test_the_papers_method_is_trained_further(scan_root, tmp_path):
+    """Its learning rates end before its annealing does."""
+    for more in ({}, {"load_dir": tmp_path / "sphere/sl-neus-paper/first/nerfstudio_models"}):
+        config = copy_of(sl_neus_paper.config)
+        config.data, config.output_dir, config.timestamp, config.max_num_iterations = scan_root, tmp_path, "first", 2
+        config.pipeline.model.sdf.log2_table_size = 10
+        config.schedule_iterations = None if more else 9000
+        config.load_dir = more.get("load_dir")
+        train(config)
+    assert last_state(tmp_path / "sphere/sl-neus-paper/first")["schedule_iterations"] == 9000
 
 
 def test_it_is_not_trained_further_with_other_settings(scan_root, finished, capfd):
