@@ -64,8 +64,7 @@ def sending(moment: str, number: int) -> Iterator[None]:
     module_name, name, wanted = _MOMENTS[moment]
     module, parent, calls = import_module(module_name), os.getpid(), iter(range(10**9))
     before = getattr(module, name)
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a job that a script started in the background
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    heed_interrupts()
 
     @functools.wraps(before)
     def watched(*arguments: Any, **named: Any) -> Any:
@@ -78,6 +77,12 @@ def sending(moment: str, number: int) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
+
+
+def heed_interrupts() -> None:
+    """Commands started from now on heed SIGINT, even if a script started this benchmark in the background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _stopped(moment: str, number: signal.Signals) -> Callable[[Path], str]:

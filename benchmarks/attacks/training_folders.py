@@ -10,7 +10,15 @@ from benchmarks.attacks.case import Case, Fixture
 from benchmarks.attacks.commands import Done, call, start
 from benchmarks.attacks.expect import accepted, refused
 from benchmarks.attacks.foreign_runs import CHECKPOINT, RUN
-from benchmarks.attacks.interrupted_trainings import FIRST, STATUS, TRAIN, differs, lay_out_small, train
+from benchmarks.attacks.interrupted_trainings import (
+    FIRST,
+    STATUS,
+    TRAIN,
+    differs,
+    heed_interrupts,
+    lay_out_small,
+    train,
+)
 
 
 def cases() -> list[Case]:
@@ -149,6 +157,7 @@ def _two_at_once() -> list[Case]:
 
 def _viewer() -> list[Case]:
     def stopped(folder: Path, number: signal.Signals) -> str:
+        heed_interrupts()
         port = str(20000 + os.getpid() % 20000)
         flags = ("--load-config", own_config(folder), "--viewer.websocket-host", "127.0.0.1")
         process = start(folder, "ns-viewer", *flags, "--viewer.websocket-port", port)
