@@ -3,7 +3,7 @@
 import warnings
 from typing import Any
 
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
@@ -25,6 +25,7 @@ def _trainer(
         max_num_iterations=iterations,
         machine=MachineConfig(device_type=default_device()),
         logging=LoggingConfig(profiler="none"),
+        viewer=ViewerConfig(websocket_host="127.0.0.1"),  # nerfstudio listens on all networks
         vis="tensorboard",
         steps_per_save=1000,
         steps_per_eval_batch=100,

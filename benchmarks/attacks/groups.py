@@ -2,7 +2,12 @@
 
 from collections.abc import Callable
 
-from benchmarks.attacks import command_lines
+from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, training_folders
 from benchmarks.attacks.case import Case
 
-GROUPS: tuple[Callable[[], list[Case]], ...] = (command_lines.cases,)
+GROUPS: tuple[Callable[[], list[Case]], ...] = (
+    command_lines.cases,
+    foreign_runs.cases,
+    interrupted_trainings.cases,
+    training_folders.cases,
+)

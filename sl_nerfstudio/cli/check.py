@@ -1,4 +1,4 @@
-"""`sl-check DIR`: every fault of a scan folder at once."""
+"""`sl-check DIR`: every fault of a scan folder at once, or those of a training run."""
 
 import sys
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sl_nerfstudio.cli.check_run import check_run_folder, is_run
 from sl_nerfstudio.cli.run import run
 
 if TYPE_CHECKING:
@@ -25,9 +26,15 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     prints a short summary, a verdict on the starting poses and what is doubtful, and exits with status 0; otherwise it
     prints all faults and exits with status 1.
 
+    For a training run, checks without running anything from it: config.yml, the checkpoints, and whether they and the
+    scan belong together.
+
     Args:
-        folder: The scan folder, which holds transforms.json.
+        folder: The scan folder, which holds transforms.json; or a run's folder or its config.yml.
     """
+    if is_run(folder):
+        sys.stdout.write(check_run_folder(folder))
+        return
     from sl_nerfstudio.errors import ScanError
     from sl_nerfstudio.scan.check.folder import check_folder
 

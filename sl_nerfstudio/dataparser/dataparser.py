@@ -1,6 +1,7 @@
 """`sl-data`: a scan folder as nerfstudio's dataparser. Must not import datamanagers, trainer or methods."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -9,6 +10,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
+from sl_nerfstudio.dataparser.fingerprint import scan_fingerprint
 from sl_nerfstudio.dataparser.normalise import normalisation
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
@@ -38,6 +40,11 @@ class LoadedScan:
     scan: Scan
     samples: PixelSamples
     S_scene_world: Similarity
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Which scan it is, wherever its folder lies; see fingerprint.py."""
+        return scan_fingerprint(self.scan)
 
 
 @dataclass

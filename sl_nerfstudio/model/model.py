@@ -136,19 +136,16 @@ class SLModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Bundle adjustment before the first step, annealing before every step."""
-        pipeline = training_callback_attributes.pipeline
-        assert pipeline is not None
-        before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-
-        def prepare(step: int) -> None:
-            if step == 0:
-                self.start(pipeline.datamanager.samples)
-
-        return [TrainingCallback(before, prepare), TrainingCallback(before, self.anneal)]
+        """Annealing before every step; the trainer itself calls `start` before the first one."""
+        return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.anneal)]
 
     def start(self, samples: Any) -> None:
         """Before the first step: refine the poses, and measure the noise of the decoding."""
+        self.adjust_poses(samples)
+        self.measure_noise(samples)
+
+    def adjust_poses(self, samples: Any) -> None:
+        """The first half of `start`, which takes longest: all poses together, if the settings say so."""
         c, rig = self.config, scene_rig(self.scan, self.S_scene_world)
         if c.adjusts_poses and len(self.scan.frames) > 1:
             found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
@@ -162,6 +159,9 @@ class SLModel(Model):
         if c.renders_poses:
             rig = constrained(c.refine_poses, rig)
         self.device_poses.rebase(rig.T_world_camera, rig.T_world_projector)
+
+    def measure_noise(self, samples: Any) -> None:
+        """The other half of `start`: how well the coordinates agree at the adjusted poses."""
         camera, projector = self.poses_scene()
         noise = measure_decoding(self.scan, samples, camera.cpu(), projector.cpu())
         self.noise_px.fill_(noise.px)
@@ -180,7 +180,7 @@ class SLModel(Model):
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: sets the levels to those of the checkpoint's step."""
-        self.anneal(step)
+        self.anneal(max(step, 0))  # -1: the poses are adjusted, no step has been taken
         self._cache_is_old = True
 
     def _renders(self, step: int) -> bool:

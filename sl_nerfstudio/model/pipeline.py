@@ -2,12 +2,15 @@
 
 import math
 import shlex
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
 import torch
+import tyro
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -16,7 +19,13 @@ from torch import Tensor
 from torchvision.utils import save_image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager
+from sl_nerfstudio.dataparser.fingerprint import require_same_scan
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.model.training.checkpoints import SCAN_KEY, SETTINGS_KEY
+from sl_nerfstudio.model.training.fingerprints import as_tensor, as_text
+from sl_nerfstudio.model.training.interruption import INTERRUPTION
+from sl_nerfstudio.model.training.loop import SLTrainer
 from sl_nerfstudio.model.viewer import SceneView
 from sl_nerfstudio.progress import track
 
@@ -28,6 +37,17 @@ class SLPipelineConfig(VanillaPipelineConfig):
     """The pixels of a scan, and the model that is fitted to them."""
 
     _target: type = field(default_factory=lambda: SLPipeline)
+    scan_fingerprint: tyro.conf.Suppress[str | None] = None
+    """Which scan the run was trained on, set when the run begins; see training/fingerprints.py."""
+    settings_fingerprint: tyro.conf.Suppress[str | None] = None
+    """With which settings, likewise; the checkpoints of a run have the same two."""
+
+    def setup(self, **kwargs: Any) -> "SLPipeline":
+        """The pipeline, for nerfstudio's commands: faults are messages, and a signal is no traceback."""
+        if kwargs.get("test_mode", "val") != "val":
+            INTERRUPTION.install()
+        with faults_as_messages():
+            return SLPipeline(self, **kwargs)
 
 
 class SLPipeline(VanillaPipeline):
@@ -40,11 +60,14 @@ class SLPipeline(VanillaPipeline):
     - The viewer shows projectors, and at the end of training the next commands are printed.
     """
 
+    config: SLPipelineConfig
     datamanager: SLDataManager
 
     def __init__(self, config: SLPipelineConfig, device: str | torch.device, **kwargs: Any) -> None:
         super().__init__(config, str(device), **kwargs)
         self._seed = torch.initial_seed()
+        self.register_buffer(SCAN_KEY, as_tensor(config.scan_fingerprint))
+        self.register_buffer(SETTINGS_KEY, as_tensor(config.settings_fingerprint))
         loaded = self.datamanager.dataparser.loaded
         self.scene_view = SceneView(loaded.scan, loaded.S_scene_world, lambda: self._sl_model.poses_scene())
         self.show_projectors = self.scene_view.show_projectors
@@ -56,6 +79,7 @@ class SLPipeline(VanillaPipeline):
         """The model's callbacks, with those of this pipeline before and after them."""
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
         return [
+            TrainingCallback([before], cast(SLTrainer, training_callback_attributes.trainer).begin_step),
             TrainingCallback([before], self._seed_step),
             *super().get_training_callbacks(training_callback_attributes),
             TrainingCallback([after], self._update_viewer),
@@ -71,8 +95,17 @@ class SLPipeline(VanillaPipeline):
         return cast(SLModel, self.model)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load weights; unless training continues (`test_mode` "val"), move the cameras to their refined poses."""
+        """Load weights; unless training continues (`test_mode` "val"), move the cameras to their refined poses.
+
+        Weights of another run, or of another scan, end the command with a message.
+        """
+        if self.test_mode != "val":
+            loaded = self.datamanager.dataparser.loaded
+            with faults_as_messages():
+                require_together(self.config, loaded_state, loaded.scan.root, loaded.fingerprint)
         super().load_pipeline(loaded_state, step)
+        self.get_buffer(SCAN_KEY).copy_(as_tensor(self.config.scan_fingerprint))
+        self.get_buffer(SETTINGS_KEY).copy_(as_tensor(self.config.settings_fingerprint))
         if self.test_mode != "val":
             self.datamanager.stand_at(self._sl_model.poses_scene()[0])
 
@@ -123,6 +156,32 @@ class SLPipeline(VanillaPipeline):
             print(what_next(trainer.config.get_base_dir() / "config.yml", self.datamanager.get_datapath()), flush=True)
 
 
+@contextmanager
+def faults_as_messages() -> Iterator[None]:
+    """In a command of nerfstudio: an error that a user can fix is printed, and ends the process with status 1."""
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def require_together(config: SLPipelineConfig, weights: Mapping[str, Any], root: Path, scan: str) -> None:
+    """Raise UserError unless config.yml, the checkpoint's weights and the scan in `root` are of one run.
+
+    `scan` is the fingerprint of the scan that is there.
+    """
+    trained_on, settings = as_text(weights.get(SCAN_KEY)), as_text(weights.get(SETTINGS_KEY))
+    if (trained_on, settings) != (config.scan_fingerprint, config.settings_fingerprint):
+        other = "the scan" if settings == config.settings_fingerprint else "the settings"
+        raise UserError(
+            f"config.yml and the checkpoint of this run do not belong together: {other} they name are not the same\n"
+            "    cause:  one of them was exchanged, edited or written by another version of this package\n"
+            "    remedy: put back the file that belongs there, or train again under another name"
+        )
+    require_same_scan(root, scan, config.scan_fingerprint, "this run")
+
+
 def what_next(config: Path, scan: Path) -> str:
     """Where the result is, and the commands to continue with."""
     settings, data = shlex.quote(str(config)), shlex.quote(str(scan))
@@ -130,7 +189,7 @@ def what_next(config: Path, scan: Path) -> str:
         [
             f"Result: {config.parent}",
             "To view it, and to export the surface and the refined poses in the scan's units:",
-            f"  ns-viewer --load-config {settings}",
+            f"  ns-viewer --load-config {settings} --viewer.websocket-host 127.0.0.1",
             f"  sl-export --load-config {settings} --output mesh.ply --poses refined/",
             f"  sl-eval   --mesh mesh.ply --data {data} --poses refined/transforms.json --report report.html",
         ]

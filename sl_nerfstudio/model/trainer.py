@@ -1,64 +1,91 @@
 """Checks before training starts: faults are found before anything is written."""
 
+import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Literal
 
 import torch
+import tyro
+import yaml
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
+from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.intrinsics_refinement import refine_intrinsics
 from sl_nerfstudio.model.messages import refined_intrinsics_message
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
+from sl_nerfstudio.model.pipeline import SLPipelineConfig
+from sl_nerfstudio.model.training.checkpoints import Checkpoint, checkpoints_in, find_checkpoint, read_checkpoint
+from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
+from sl_nerfstudio.model.training.interruption import INTERRUPTION
+from sl_nerfstudio.model.training.loop import SLTrainer
+from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
 from sl_nerfstudio.scan import require_valid
+from sl_nerfstudio.scan.atomic import write_atomic
+
+_TAKEN: dict[Path, RunFolder] = {}
+"""The folders that this process writes to: not part of a configuration, which is written to config.yml."""
 
 
 @dataclass
 class SLTrainerConfig(TrainerConfig):
     """nerfstudio's settings of a run, checked before the run starts."""
 
+    _target: type = field(default_factory=lambda: SLTrainer)
     schedule_iterations: int | None = None
     """Number of steps over which learning rates decay and annealing takes place: by default --max-num-iterations, or
     for a resumed run the length of the run that it resumes."""
+    seconds_per_save: float = 60.0
+    """A checkpoint is also written when this many seconds, and at least 100 steps, have passed since the last one."""
+    last_step: tyro.conf.Suppress[int | None] = None
+    """Number of the run's last step, set when the run begins; --load-config continues up to it."""
 
     def set_timestamp(self) -> None:
-        """Check the run; nerfstudio calls this first, before it writes the run's folder.
+        """Check the run and take its folder; nerfstudio calls this first, before it writes anything.
 
         An error that the user can fix is printed without a traceback and ends the process with status 1.
         """
+        if self.machine.num_devices * self.machine.num_machines == 1:
+            INTERRUPTION.install()
         try:
-            self.prepare()
+            begun = self._continue() if self.last_step is not None else self.prepare()
+            super().set_timestamp()
+            self._take_folder(begun)
         except UserError as error:
+            INTERRUPTION.remove()
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(1) from None
-        super().set_timestamp()
 
-    def prepare(self) -> None:
+    def prepare(self) -> Checkpoint | None:
         """Check scan, device and checkpoint; make paths absolute; set intrinsics and the length of the schedules.
 
-        Raises UserError.
+        Returns the checkpoint that is resumed. Raises UserError.
         """
         root = self._scan_root()
-        if self.max_num_iterations < 1:
-            raise UserError(f"--max-num-iterations {self.max_num_iterations}: at least 1 is needed")
+        self._require_flags()
         _require_device(self.machine.device_type)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
-        begun = None if checkpoint is None else read_begun(checkpoint)
+        begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
         require_valid(root)
-        dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
-        model: SLModelConfig = self.pipeline.model  # type: ignore[assignment]
-        dataparser.intrinsics_change = _intrinsics_change(root, dataparser.intrinsics_change, begun, model)
+        pipeline: SLPipelineConfig = self.pipeline  # type: ignore[assignment]
+        pipeline.scan_fingerprint = load_scan(root).fingerprint
+        if begun is not None:
+            require_same_scan(root, pipeline.scan_fingerprint, begun.scan, str(begun.path))
+        dataparser = pipeline.datamanager.dataparser  # type: ignore[attr-defined]
+        model: SLModelConfig = pipeline.model  # type: ignore[assignment]
+        if self.last_step is None or begun is not None:  # else config.yml holds what was found
+            dataparser.intrinsics_change = _intrinsics_change(root, dataparser.intrinsics_change, begun, model)
         load_scan(root, dataparser.intrinsics_change)  # cached; fails if no rays meet
         self.data = root
-        self.pipeline.datamanager.data = root
+        pipeline.datamanager.data = root
         self.output_dir = self.output_dir.expanduser().absolute()
+        self.load_dir, self.load_step, self.load_checkpoint = None, None, None if begun is None else begun.path
         if self.schedule_iterations is None:
             stated = None if begun is None else begun.schedule_iterations
             self.schedule_iterations = stated or self.max_num_iterations
@@ -67,6 +94,80 @@ class SLTrainerConfig(TrainerConfig):
             name: {**group, "scheduler": _with_length(group["scheduler"], self.schedule_iterations)}
             for name, group in self.optimizers.items()
         }
+        pipeline.settings_fingerprint = settings_fingerprint(self)
+        return begun
+
+    def _require_flags(self) -> None:
+        """Raise UserError for numbers and names that no training can have."""
+        rays, seed = self.pipeline.datamanager.train_num_rays_per_batch, self.machine.seed  # type: ignore[attr-defined]
+        for flag, value in (
+            ("--max-num-iterations", self.max_num_iterations),
+            ("--schedule-iterations", self.schedule_iterations),
+            ("--pipeline.datamanager.train-num-rays-per-batch", rays),
+        ):
+            if value is not None and value < 1:
+                raise UserError(f"{flag} {value}: at least 1 is needed")
+        if not 0 <= seed < 2**32:
+            raise UserError(f"--machine.seed {seed}: give a number from 0 to {2**32 - 1}")
+        for flag, name in (("--timestamp", self.timestamp), ("--experiment-name", self.experiment_name)):
+            if name is not None and (not name.strip() or Path(name).is_absolute() or ".." in Path(name).parts):
+                raise UserError(f"{flag} {name!r}: is not the name of a folder inside --output-dir")
+
+    def save_config(self) -> None:
+        """Write config.yml, complete or not at all."""
+        write_atomic(self.get_base_dir() / CONFIG, yaml.dump(self).encode())
+
+    def leave_folder(self) -> None:
+        """Let other processes have the run's folder."""
+        folder = _TAKEN.pop(self.get_base_dir(), None)
+        if folder is not None:
+            folder.leave()
+
+    def _continue(self) -> Checkpoint | None:
+        """For the config.yml of an earlier run: go on where its last checkpoint is, up to the run's last step."""
+        assert self.last_step is not None
+        if checkpoints_in(self.get_checkpoint_dir()):
+            self.load_dir, self.load_step, self.load_checkpoint = self.get_checkpoint_dir(), None, None
+        begun = self.prepare()
+        done = -1 if begun is None else begun.step
+        if done >= self.last_step:
+            raise UserError(
+                f"{self.get_base_dir()}: this run is complete, at step {done}\n"
+                "    cause:  --load-config continues a run up to the length that it was started with\n"
+                f"    remedy: to train it further: {self._further_command()}"
+            )
+        self.max_num_iterations = self.last_step - done
+        return begun
+
+    def _further_command(self) -> str:
+        assert self.method_name is not None and self.data is not None and self.experiment_name is not None
+        words = ["ns-train", self.method_name, "--data", self.data, "--load-dir", self.get_checkpoint_dir()]
+        words += ["--output-dir", self.output_dir, "--experiment-name", self.experiment_name]
+        words += ["--timestamp", self.timestamp, "--max-num-iterations", 500]
+        return shlex.join(map(str, words))
+
+    def _take_folder(self, begun: Checkpoint | None) -> None:
+        """Have the run's folder for this process alone, if nothing is there that would be overwritten."""
+        folder, models, method = self.get_base_dir(), self.get_checkpoint_dir(), self.method_name
+        assert method is not None
+        same = begun is not None and begun.path.parent.resolve() == models.resolve()
+        continued = self.last_step is not None
+
+        def require() -> None:
+            if begun is not None and same:
+                _require_continuation(begun, self.pipeline, folder, method)  # type: ignore[arg-type]
+            elif not continued:
+                require_unused(folder, models, method)
+
+        require()
+        taken = RunFolder(folder)
+        try:
+            require()  # again: another process may have written meanwhile
+        except UserError:
+            taken.leave()
+            raise
+        _TAKEN[folder] = taken
+        self.last_step = self.max_num_iterations + (-1 if begun is None else begun.step)
 
     def _scan_root(self) -> Path:
         dataparser = self.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
@@ -82,7 +183,7 @@ class SLTrainerConfig(TrainerConfig):
 
 
 def _intrinsics_change(
-    root: Path, stated: IntrinsicsChange, begun: "BegunRun | None", model: SLModelConfig
+    root: Path, stated: IntrinsicsChange, begun: Checkpoint | None, model: SLModelConfig
 ) -> IntrinsicsChange:
     """The change of the intrinsics: that of the run it resumes, else the stated one, refined on request."""
     if begun is not None and begun.intrinsics_change is not None:
@@ -129,41 +230,20 @@ def _require_device(device_type: str) -> None:
         )
 
 
-@dataclass(frozen=True)
-class BegunRun:
-    """What a checkpoint records about the run that wrote it; None where it records nothing."""
-
-    schedule_iterations: int | None
-    intrinsics_change: IntrinsicsChange | None
-
-
-def find_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> Path | None:
-    """The checkpoint that nerfstudio will load, None for a new run. Raises UserError if it is missing."""
-    if load_dir is not None:
-        pattern = "step-*.ckpt" if load_step is None else f"step-{load_step:09d}.ckpt"
-        found = sorted(load_dir.glob(pattern))
-        if not found:
-            raise UserError(
-                f"--load-dir {load_dir}: no checkpoint {pattern} there. "
-                "Give the folder nerfstudio_models/ of a run, which is next to its config.yml."
-            )
-        return found[-1]
-    if load_checkpoint is not None and not load_checkpoint.is_file():
-        raise UserError(f"--load-checkpoint {load_checkpoint}: no such file")
-    return load_checkpoint
-
-
-def read_begun(checkpoint: Path) -> BegunRun:
-    """What a checkpoint records about the run that wrote it. Raises UserError if it is unreadable."""
-    try:
-        state = torch.load(checkpoint, map_location="cpu", mmap=True)
-        schedulers, weights = state.get("schedulers", {}), state.get("pipeline", {})
-    except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError) as error:
+def _require_continuation(begun: Checkpoint, pipeline: SLPipelineConfig, folder: Path, method: str) -> None:
+    """Raise UserError unless a run goes on in its own folder from its last checkpoint, with its own settings."""
+    last = checkpoints_in(begun.path.parent)[-1]
+    if last.name != begun.path.name:
         raise UserError(
-            f"{checkpoint}: cannot be read as a checkpoint ({type(error).__name__}). "
-            "It is probably incomplete. Choose an older one with --load-step, or train again."
-        ) from error
-    lengths = [rate["max_steps"] for s in schedulers.values() for rate in s.get("lr_lambdas", []) if rate]
-    changes = [value for key, value in weights.items() if key.endswith("model.intrinsics_change")]
-    change = IntrinsicsChange.of(changes[0].tolist()) if changes else None
-    return BegunRun(max(lengths, default=None), change)
+            f"{begun.path}: {last.name} is there, too\n"
+            "    cause:  a run is resumed in its own folder, but not from its last checkpoint\n"
+            "    remedy: choose another --timestamp for the run that branches off"
+        )
+    if begun.settings != pipeline.settings_fingerprint:
+        raise UserError(
+            f"{folder}: holds a run with other settings, and nothing was changed\n"
+            "    cause:  a run goes on in its own folder only with the settings that it was started with, except for "
+            "--max-num-iterations\n"
+            "    remedy: repeat the flags of that run, or choose another --timestamp; "
+            f"if it was interrupted: {go_on_command(method, folder)}"
+        )

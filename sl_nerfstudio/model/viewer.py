@@ -49,6 +49,8 @@ class SceneView(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
+        if viewer.config.websocket_host == "0.0.0.0":  # the default of ns-viewer, which a plugin cannot change
+            print("The viewer listens on all networks; --viewer.websocket-host 127.0.0.1 restricts it to this machine.")
         # nerfstudio assumes that cameras are inside the unit box; here the object is, and they are far outside.
         # It draws its own frusta after this, with the same setting.
         distance = float(np.median(np.linalg.norm(self._initial[0][:, :3, 3], axis=1)))

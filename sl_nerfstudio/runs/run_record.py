@@ -1,8 +1,6 @@
 """What a person needs to repeat a run: settings, versions, convergence; as plain JSON values."""
 
-import math
 import platform
-from dataclasses import fields, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -10,6 +8,7 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
+from sl_nerfstudio.model.training.fingerprints import plain
 from sl_nerfstudio.runs.trained_run import TrainedRun
 
 _PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", "open3d")
@@ -70,21 +69,6 @@ def package_versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed as a package"
     return found
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses, paths, types, numbers and containers as JSON values; numbers that are not finite become None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value) if not f.name.startswith("_")}
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    return value.__name__ if isinstance(value, type) else str(value)
 
 
 def _device(device: torch.device) -> str:

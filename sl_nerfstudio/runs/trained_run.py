@@ -6,12 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
@@ -20,6 +18,8 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.model.training.checkpoints import checkpoints_in, read_checkpoint
+from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
 from sl_nerfstudio.scan import Scan
 
 _SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
@@ -74,64 +74,62 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
     Raises UserError for anything missing, broken or made by another method.
     """
-    path = config_path / "config.yml" if config_path.is_dir() else config_path
-    config = _read_config(path)
-    checkpoint = _last_checkpoint(config, path)
-    config.pipeline.datamanager.data = _scan_folder(config, data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
+        from sl_nerfstudio.dataparser.dataparser import load_scan
+        from sl_nerfstudio.model.pipeline import SLPipeline, require_together
+        from sl_nerfstudio.runs.config_file import read_config
+
+    path = config_file(config_path)
+    config: Any = read_config(path)
+    checkpoint = read_checkpoint(last_checkpoint(config, path))
+    if checkpoint.step < 0:
+        raise UserError(
+            f"{checkpoint.path}: holds adjusted poses, but no surface yet\n"
+            "    cause:  the training was interrupted before its first step\n"
+            f"    remedy: go on: ns-train {config.method_name} --load-config {path}"
+        )
+    require_settings(path, config)
+    root = _scan_folder(config, data)
+    config.pipeline.datamanager.data = root
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    state = _read_checkpoint(checkpoint)
-    pipeline = config.pipeline.setup(device=device, test_mode="inference")
-    _require_same_keys(checkpoint, state["pipeline"], pipeline.state_dict())
+    loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
+    require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
+    pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
+    _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
     try:
-        pipeline.load_pipeline(state["pipeline"], state["step"])
+        pipeline.load_pipeline(checkpoint.weights, checkpoint.step)
     except RuntimeError as error:
         raise UserError(
-            f"{checkpoint}: does not fit the scan in {config.pipeline.datamanager.data} ({_last_line(error)})\n"
-            "    cause:  the scan has other frames than in the training, or another version of this package was used\n"
-            "    remedy: give the scan of the training with --data FOLDER, or train again"
+            f"{checkpoint.path}: does not fit the settings in {path} ({_last_line(error)})\n"
+            "    cause:  another version of this package was used\n"
+            "    remedy: use the version that trained it, or train again"
         ) from error
     pipeline.eval()
     _require_same_scene(path.absolute().parent / "dataparser_transforms.json", pipeline.model.S_scene_world)
-    return TrainedRun(pipeline.model, config, int(state["step"]))
+    return TrainedRun(pipeline.model, config, checkpoint.step)
 
 
-def _read_config(path: Path) -> Any:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
-        from nerfstudio.engine.trainer import TrainerConfig
+def config_file(path: Path) -> Path:
+    """The config.yml of a run, given it or its folder."""
+    return path / "config.yml" if path.is_dir() else path
 
-        from sl_nerfstudio.model.config import SLModelConfig
 
-    if not path.is_file():
+def require_settings(path: Path, config: Any) -> None:
+    """Raise UserError if settings in config.yml that decide the result were edited after the run began."""
+    if settings_fingerprint(config) != config.pipeline.settings_fingerprint:
         raise UserError(
-            f"--load-config {path}: no such file\n"
-            "    cause:  the path is mistyped, or the training never started\n"
-            "    remedy: give the config.yml that ns-train prints at the end: outputs/SCAN/sl-neus/DATE/config.yml"
+            f"{path}: its settings are not those that the run was started with\n"
+            "    cause:  the file was edited, or written by another version of this package\n"
+            "    remedy: put back the original file, or train again with the settings that you want"
         )
-    try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except (yaml.YAMLError, UnicodeDecodeError, ImportError, AttributeError, TypeError, OSError) as error:
-        raise UserError(
-            f"{path}: cannot be read as a training configuration ({type(error).__name__}: {_last_line(error)})\n"
-            "    cause:  the file is damaged, or was written by a version with other settings\n"
-            "    remedy: give an untouched config.yml, and the version of this package that wrote it"
-        ) from error
-    if not isinstance(config, TrainerConfig):
-        raise UserError(f"{path}: is not a training configuration\n    remedy: give the config.yml that ns-train wrote")
-    if not isinstance(config.pipeline.model, SLModelConfig):
-        raise UserError(
-            f"{path}: is a run of {config.method_name}\n"
-            "    cause:  sl-export works only with runs of sl-neus and sl-neus-paper\n"
-            "    remedy: use ns-export for other methods"
-        )
-    return config
 
 
-def _last_checkpoint(config: Any, path: Path) -> Path:
-    """The last checkpoint next to config.yml, or where the settings put it if there is none."""
+def last_checkpoint(config: Any, path: Path) -> Path:
+    """The last checkpoint next to config.yml, or where the settings put it if there is none. Raises UserError."""
     folders = [path.absolute().parent / config.relative_model_dir, config.get_checkpoint_dir()]
     for folder in folders:
-        found = sorted(folder.glob("step-*.ckpt"))
+        found = checkpoints_in(folder)
         if found:
             return found[-1]
     raise UserError(
@@ -153,18 +151,6 @@ def _scan_folder(config: Any, data: Path | None) -> Path:
             f"    cause:  {cause}\n    remedy: give its folder: --data FOLDER"
         )
     return root
-
-
-def _read_checkpoint(path: Path) -> dict[str, Any]:
-    try:
-        state = torch.load(path, map_location="cpu")
-        return {"pipeline": state["pipeline"], "step": state["step"]}
-    except (RuntimeError, OSError, ValueError, EOFError, UnpicklingError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path}: cannot be read as a checkpoint ({type(error).__name__})\n"
-            "    cause:  it is truncated, for example by a full disk, or another kind of file\n"
-            "    remedy: remove it, so that the previous one is used, or train again"
-        ) from error
 
 
 def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str]) -> None:
@@ -191,8 +177,8 @@ def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
         raise UserError(
             f"{path}: the scan has another place in the scene than in the training "
             f"(off by {np.abs(moved).max():.2g} of the scene's radius)\n"
-            "    cause:  its poses, unit or coordinates were changed, or another version of this package made the run\n"
-            "    remedy: give the unchanged scan with --data FOLDER, use the version that trained it, or train again"
+            "    cause:  the file was edited, or another version of this package made the run\n"
+            "    remedy: put back the file, use the version that trained it, or train again"
         )
 
 

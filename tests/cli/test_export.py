@@ -14,7 +14,7 @@ import torch
 from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.runs.run_record import plain
+from sl_nerfstudio.model.training.fingerprints import plain
 from sl_nerfstudio.scan import Scan, read_poses
 from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of
 

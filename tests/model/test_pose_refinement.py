@@ -12,6 +12,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
+from sl_nerfstudio.dataparser.fingerprint import scan_fingerprint
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
@@ -32,6 +33,7 @@ from sl_nerfstudio.model.pose_refinement import (
     sigmas_in_scan_units,
 )
 from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.model.training.fingerprints import as_tensor
 from sl_nerfstudio.scan import (
     PickedPixel,
     PoseSigma,
@@ -284,11 +286,14 @@ def test_a_run_stores_the_change_in_its_settings(scan, corrected, monkeypatch, c
     assert "Intrinsics changed" in capsys.readouterr().out
 
 
-def checkpoint_of(folder: Path, change: IntrinsicsChange) -> Path:
+def checkpoint_of(folder: Path, scan: Scan, change: IntrinsicsChange) -> Path:
     folder.mkdir()
-    weights = {"_model.intrinsics_change": torch.tensor(change.values, dtype=torch.float64)}
-    rate = {"shape": "cosine", "final": 0.1, "warm_up": 0, "max_steps": 700}
-    state = {"step": 9, "pipeline": weights, "schedulers": {"mlp": {"lr_lambdas": [rate]}}}
+    weights = {
+        "_model.intrinsics_change": torch.tensor(change.values, dtype=torch.float64),
+        "scan_fingerprint": as_tensor(scan_fingerprint(scan)),
+    }
+    state = {"step": 9, "pipeline": weights, "optimizers": {}, "schedulers": {}, "scalers": {}}
+    state["schedule_iterations"] = 700
     torch.save(state, folder / "step-000000009.ckpt")
     return folder
 
@@ -297,7 +302,7 @@ def test_a_resumed_run_has_the_intrinsics_of_its_checkpoint(scan, corrected, tmp
     """Nothing is refined a second time, and the flag may remain set."""
     monkeypatch.setattr("sl_nerfstudio.model.trainer.refine_intrinsics", lambda *_: pytest.fail("refined again"))
     config = settings_for(scan, refine_intrinsics=True)
-    config.load_dir = checkpoint_of(tmp_path / "models", corrected.change)
+    config.load_dir = checkpoint_of(tmp_path / "models", scan, corrected.change)
     config.prepare()
     assert config.pipeline.datamanager.dataparser.intrinsics_change == corrected.change
     assert config.schedule_iterations == 700
