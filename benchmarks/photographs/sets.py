@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.scenes.surroundings import Background

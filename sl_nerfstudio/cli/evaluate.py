@@ -49,7 +49,7 @@ def evaluate_scan(config: EvalConfig) -> None:
     from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
     from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
-    from sl_nerfstudio.scan.atomic import write_atomic
+    from sl_nerfstudio.files.atomic import write_atomic
 
     inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
     thumbnails = ResidualThumbnails()

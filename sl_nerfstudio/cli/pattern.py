@@ -61,7 +61,7 @@ def _write() -> None:
         raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
     if arguments.print_width is not None and not arguments.print_width > 0:
         raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
-    from sl_nerfstudio.scan.atomic import require_empty
+    from sl_nerfstudio.files.atomic import require_empty
 
     require_empty(arguments.output)
     print(_write_grid(arguments) if arguments.kind == "grid" else _write_gray_code(arguments))
@@ -110,7 +110,7 @@ def _write_layout(arguments: Arguments, layout: "PatternLayout") -> None:
     """pattern.png and pattern.json."""
     import numpy as np
 
-    from sl_nerfstudio.scan.atomic import write_atomic
+    from sl_nerfstudio.files.atomic import write_atomic
 
     _write_image(arguments, "pattern.png", np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8))
     write_atomic(arguments.output / "pattern.json", layout.encode())
@@ -122,7 +122,7 @@ def _write_image(arguments: Arguments, name: str, image: "ndarray") -> None:
 
     from PIL import Image
 
-    from sl_nerfstudio.scan.atomic import write_atomic
+    from sl_nerfstudio.files.atomic import write_atomic
 
     buffer = io.BytesIO()
     per_inch = None if arguments.print_width is None else image.shape[1] / arguments.print_width * 25.4

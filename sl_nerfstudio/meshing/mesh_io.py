@@ -8,8 +8,8 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.file_error import FileError, check_file
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb")

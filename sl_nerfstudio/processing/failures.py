@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.processing.advice import first_line
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameStageResult
@@ -14,7 +15,6 @@ from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.processing.summary import left_out
 from sl_nerfstudio.registration.result import Registration
-from sl_nerfstudio.scan.atomic import write_atomic
 
 FEWEST_FRAMES = 2
 REPORT = "processing.html"

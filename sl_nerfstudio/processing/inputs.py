@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import require_empty
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.processing.captures import Captures, find_captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -13,7 +14,6 @@ from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
 from sl_nerfstudio.processing.selection.user_masks import find_masks
 from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length
-from sl_nerfstudio.scan.atomic import require_empty
 
 
 @dataclass(frozen=True)

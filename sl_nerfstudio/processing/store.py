@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from sl_nerfstudio.decoding.decoded import Decoded
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.file_error import read_bytes
 from sl_nerfstudio.scan.writing import encode_json
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from jaxtyping import Float
 from numpy import ndarray
 
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
@@ -15,7 +16,6 @@ from sl_nerfstudio.runs.object_cut import ObjectCut, cut_object
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import PoseSigma, write_transforms
-from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.writing import encode_json, sigma_fields
 

@@ -10,9 +10,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import Fault, ScanError
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.scan.atomic import write_atomic
 from sl_nerfstudio.scan.document import TRANSFORMS, Record, document_faults, frame_label, read_document
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.file_error import FileError

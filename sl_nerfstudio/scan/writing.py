@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import require_empty, write_atomic
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.scan.atomic import require_empty, write_atomic
 from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.pose_problem import pose_problem

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.files.atomic import require_empty, write_atomic
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan.atomic import require_empty, write_atomic
 from sl_nerfstudio.scan.images import as_grey, encode_png
 from sl_nerfstudio.scan.types import PoseSigma, Scale
 from sl_nerfstudio.scan.writing import ScanWriter, device_fields, encode_json, sigma_fields

@@ -1,6 +1,5 @@
 """Writing scans: what is written comes back, and nothing half-written stays."""
 
-import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from sl_nerfstudio.scan import (
     read_ground_truth,
     read_scan,
 )
-from sl_nerfstudio.scan.atomic import write_atomic
 
 
 def files(root: Path) -> set[str]:
@@ -217,35 +215,3 @@ def test_a_frame_needs_intrinsics(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a frame needs its own camera"):  # noqa: SIM117
         with ScanWriter(tmp_path / "scan", **settings(camera=None)) as writer:
             writer.add_frame("f0", **frame())
-
-
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("old")
-
-    def full(self: Path, target: Path) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(UserError) as error:
-        write_atomic(path, b"new")
-    assert str(error.value) == (
-        f"{path}: cannot be written (No space left on device)\n"
-        "    cause:  the disk is full, the folder is read-only, or there is a file where a folder is needed\n"
-        "    remedy: free some space, or choose another output"
-    )
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_file_where_a_folder_is_needed(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("x")
-    with pytest.raises(UserError, match="cannot be written"):
-        write_atomic(tmp_path / "a" / "b" / "c.json", b"")
-
-
-def test_write_atomic_replaces_and_makes_folders(tmp_path: Path) -> None:
-    write_atomic(tmp_path / "a" / "b.txt", b"1")
-    write_atomic(tmp_path / "a" / "b.txt", b"2")
-    assert files(tmp_path) == {"a/b.txt"}
-    assert (tmp_path / "a" / "b.txt").read_bytes() == b"2"
