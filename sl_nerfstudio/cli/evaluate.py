@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from sl_nerfstudio.evaluation.evaluate import Evaluation
     from sl_nerfstudio.verdict.verdict import Verdict
 
+_JSON_MARK, _REPORT_MARK = b'"verdict"', b"<title>Scan report: "  # by which earlier results are known
+
 
 @dataclass(frozen=True)
 class EvalConfig:
@@ -43,6 +45,14 @@ class EvalConfig:
 def evaluate_scan(config: EvalConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     _check(config)
+    from sl_nerfstudio.files.results import held_results
+
+    marks = {path: mark for path, mark in ((config.json, _JSON_MARK), (config.report, _REPORT_MARK)) if path}
+    with held_results(marks):
+        _evaluate(config)
+
+
+def _evaluate(config: EvalConfig) -> None:
     from sl_nerfstudio.evaluation.evaluate import evaluate
     from sl_nerfstudio.evaluation.inputs import read_inputs
     from sl_nerfstudio.evaluation.judgement import judge
@@ -86,6 +96,8 @@ def _check(config: EvalConfig) -> None:
         )
     if config.seed < 0:
         raise UserError(f"--seed: {config.seed} is negative\n    remedy: give a whole number of at least 0")
+    if config.json and config.report and config.json.absolute() == config.report.absolute():
+        raise UserError(f"--json and --report: both are {config.json}\n    remedy: give two files")
     if config.reference and config.reference.suffix.lower() == ".npy":
         raise UserError(
             f"--reference: {config.reference} is an .npy file\n    remedy: give an .npz file with the key xyz"

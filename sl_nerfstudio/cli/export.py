@@ -2,6 +2,7 @@
 
 import os
 import shlex
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,9 +53,14 @@ def main() -> None:
 def export(config: ExportConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     check_outputs(config)
-    from sl_nerfstudio.runs.trained_run import load_run
+    from sl_nerfstudio.files.lock import locked, locked_file
 
-    print(export_trained(load_run(config.load_config, config.data), config))
+    folder = _pose_folder(config)
+    with locked_file(config.output), nullcontext() if folder is None else locked(folder):
+        check_outputs(config)  # again: a process that held them until now may have written them
+        from sl_nerfstudio.runs.trained_run import load_run
+
+        print(export_trained(load_run(config.load_config, config.data), config))
 
 
 def check_outputs(config: ExportConfig) -> None:
@@ -64,6 +70,12 @@ def check_outputs(config: ExportConfig) -> None:
     check_suffix(config.output)
     if config.resolution < 2:
         raise UserError(f"--resolution {config.resolution}: at least 2 cells are needed; 256 or 512 is usual")
+    folder = _pose_folder(config)
+    if folder is not None and config.output.absolute() in (folder.absolute(), *folder.absolute().parents):
+        raise UserError(
+            f"{config.output}: is to be the mesh, and --poses {config.poses} a folder there\n"
+            "    remedy: choose another output"
+        )
     for path in (config.output, *_pose_files(config)):
         if path.is_dir():
             raise UserError(f"{path}: is a folder\n    remedy: choose another output")

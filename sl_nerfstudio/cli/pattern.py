@@ -12,6 +12,7 @@ from sl_nerfstudio.errors import UserError
 if TYPE_CHECKING:
     from numpy import ndarray
 
+    from sl_nerfstudio.files.new_folder import NewFolder
     from sl_nerfstudio.pattern.layout import PatternLayout
 
 _SUPERSAMPLING = 4  # of pattern.png
@@ -61,13 +62,14 @@ def _write() -> None:
         raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
     if arguments.print_width is not None and not arguments.print_width > 0:
         raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
-    from sl_nerfstudio.files.atomic import require_empty
+    from sl_nerfstudio.files.new_folder import NewFolder
 
-    require_empty(arguments.output)
-    print(_write_grid(arguments) if arguments.kind == "grid" else _write_gray_code(arguments))
+    with NewFolder(arguments.output) as folder:
+        said = _write_grid(arguments, folder) if arguments.kind == "grid" else _write_gray_code(arguments, folder)
+    print(said)
 
 
-def _write_grid(arguments: Arguments) -> str:
+def _write_grid(arguments: Arguments, folder: "NewFolder") -> str:
     import numpy as np
 
     from sl_nerfstudio.pattern.codes import hamming_margin
@@ -77,7 +79,7 @@ def _write_grid(arguments: Arguments) -> str:
         arguments.preset, arguments.width, arguments.height, arguments.period, arguments.line_width, arguments.gap,
         arguments.seed,
     )  # fmt: skip
-    _write_layout(arguments, grid)
+    _write_layout(arguments, grid, folder)
     codes = np.asarray(grid.codes)
     return (
         f"wrote a grid of {grid.columns} x {grid.rows} nodes to {arguments.output}: 3 x 3 windows differ in at least "
@@ -85,7 +87,7 @@ def _write_grid(arguments: Arguments) -> str:
     )
 
 
-def _write_gray_code(arguments: Arguments) -> str:
+def _write_gray_code(arguments: Arguments, folder: "NewFolder") -> str:
     from sl_nerfstudio.pattern.graycode import GrayCode
     from sl_nerfstudio.pattern.presets import PRESETS
 
@@ -97,37 +99,34 @@ def _write_gray_code(arguments: Arguments) -> str:
         layout = GrayCode(arguments.width or w, arguments.height or h, arguments.cell)
     except ValueError as error:
         raise UserError(f"--width, --height, --cell: {error}") from error
-    _write_layout(arguments, layout)
     for index, image in enumerate(layout.sequence()):
-        _write_image(arguments, f"sequence/{index:02d}.png", image)
+        folder.write(f"sequence/{index:02d}.png", _image_file(arguments, image))
+    _write_layout(arguments, layout, folder)
     return (
         f"wrote a Gray-code sequence of {layout.images} images to {arguments.output}: show them in the order of their "
         "names"
     )
 
 
-def _write_layout(arguments: Arguments, layout: "PatternLayout") -> None:
+def _write_layout(arguments: Arguments, layout: "PatternLayout", folder: "NewFolder") -> None:
     """pattern.png and pattern.json."""
     import numpy as np
 
-    from sl_nerfstudio.files.atomic import write_atomic
+    picture = np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8)
+    folder.write("pattern.png", _image_file(arguments, picture))
+    folder.write("pattern.json", layout.encode(), last=True)
 
-    _write_image(arguments, "pattern.png", np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8))
-    write_atomic(arguments.output / "pattern.json", layout.encode())
 
-
-def _write_image(arguments: Arguments, name: str, image: "ndarray") -> None:
+def _image_file(arguments: Arguments, image: "ndarray") -> bytes:
     """A PNG file that says how wide to print it."""
     import io
 
     from PIL import Image
 
-    from sl_nerfstudio.files.atomic import write_atomic
-
     buffer = io.BytesIO()
     per_inch = None if arguments.print_width is None else image.shape[1] / arguments.print_width * 25.4
     Image.fromarray(image).save(buffer, "PNG", **({} if per_inch is None else {"dpi": (per_inch, per_inch)}))
-    write_atomic(arguments.output / name, buffer.getvalue())
+    return buffer.getvalue()
 
 
 if __name__ == "__main__":

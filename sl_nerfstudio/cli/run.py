@@ -1,30 +1,66 @@
 """How every command of the package ends: faults that a user can correct are shown without a traceback."""
 
 import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 from sl_nerfstudio.errors import UserError
 
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+EXIT_TERMINATED = 143  # 128 + SIGTERM
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM arrived. All that cleans up after control-C does so now, too."""
 
 
 def run(main: Callable[[], None]) -> None:
-    """Call `main`; a `UserError` becomes `error: ...` on stderr and exit status 1, control-C status 130.
+    """Call `main`; a `UserError` becomes `error: ...` on stderr and exit status 1, control-C status 130, SIGTERM 143.
 
     Anything else is a bug in this package and keeps its traceback.
     """
     try:
-        main()
-        sys.stdout.flush()
+        with sigterm_raised():
+            main()
+            sys.stdout.flush()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(EXIT_FAULT)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        _ignore_more_signals()
+        terminated = isinstance(stop, Terminated)
+        print("terminated" if terminated else "interrupted", file=sys.stderr)
+        sys.exit(EXIT_TERMINATED if terminated else EXIT_INTERRUPTED)
     except BrokenPipeError:
         # The reader (`head`, a pager) has gone; what is still buffered must not raise again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAULT)
+
+
+@contextmanager
+def sigterm_raised() -> Iterator[None]:
+    """SIGTERM raises `Terminated` in the main thread, unless it is ignored or handled by somebody else already."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def _ignore_more_signals() -> None:
+    """Everything is cleaned up: a second control-C must not print a traceback while Python ends."""
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)

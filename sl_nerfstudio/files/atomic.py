@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.lock_file import in_use, open_alone
-from sl_nerfstudio.files.paths import beside, cannot_write
+from sl_nerfstudio.files.paths import beside, cannot_write, is_beside
 
 PARTIAL = "partial"
 """Ending of the temporary files."""
@@ -49,10 +49,12 @@ def _write(file: int, content: bytes) -> None:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove the temporary files in and below a folder that no other process is writing to."""
-    for path in folder.rglob(f".*.{PARTIAL}"):
-        with suppress(OSError):
-            path.unlink()
+    """Remove the temporary files in a folder (not below it) to which no other process is writing."""
+    with suppress(FileNotFoundError):
+        for path in folder.iterdir():
+            if is_beside(path.name, PARTIAL):
+                with suppress(OSError):
+                    path.unlink()
 
 
 def require_empty(root: Path) -> None:

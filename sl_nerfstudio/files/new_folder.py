@@ -75,12 +75,16 @@ class NewFolder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Let go of the folder; after an exception without what was written."""
+        self.close(complete=kind is None)
+
+    def close(self, complete: bool) -> None:
+        """Let go of the folder, as at the end of the block; `complete`: keep what was written."""
         try:
-            if kind is not None:
+            if not complete:
                 _remove(self.root, self._written)
         finally:
             self._lock.release()
-            if kind is not None:
+            if not complete:
                 remove_empty(self._made)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
@@ -12,6 +13,11 @@ _DIGITS = 16  # of a name's digest
 def beside(path: Path, ending: str) -> Path:
     """A hidden file next to `path` that belongs to it: the same one in every process, and never too long a name."""
     return path.parent / f".{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_DIGITS]}.{ending}"
+
+
+def is_beside(name: str, ending: str) -> bool:
+    """Whether `beside` makes such names."""
+    return re.fullmatch(rf"\.[0-9a-f]{{{_DIGITS}}}\.{ending}", name) is not None
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:

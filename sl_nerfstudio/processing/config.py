@@ -1,5 +1,6 @@
 """The flags of `sl-process`; the docstrings of the fields are their help text."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -44,7 +45,8 @@ class ProcessConfig:
     jobs: int | None = None
     """number of processes that decode frames; default: one for each core"""
     work: Path | None = None
-    """folder in which decoded frames are kept for the next run; default: OUTPUT.work"""
+    """folder in which decoded frames, the registration and the adjustment are kept for the next run; default:
+    OUTPUT.work"""
     seed: int = 0
     """seed of all random choices: the same captures and flags give the same scan"""
 
@@ -58,8 +60,14 @@ class ProcessConfig:
         for holds, flag, value, why in rules:
             if not holds:
                 raise UserError(f"{flag} {value}: {why}")
+        work, output = (os.path.realpath(path) for path in (self.work_folder, self.output))
+        if os.path.commonpath([work, output]) == output:
+            raise UserError(
+                f"--work {self.work_folder}: is in the output, which is to be a new folder; give another one"
+            )
 
     @property
     def work_folder(self) -> Path:
-        """The folder in which decoded frames are kept."""
-        return self.work or self.output.with_name(self.output.name + ".work")
+        """The folder in which results of stages are kept."""
+        output = self.output if self.output.name not in ("", "..") else Path(os.path.abspath(self.output))
+        return self.work or output.parent / f"{output.name}.work"

@@ -1,10 +1,10 @@
 """The frame stage: every capture decoded and calibrated by itself, in several processes."""
 
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Generator, Sequence
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from contextlib import closing
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
-from sl_nerfstudio.processing.store import Manifest
+from sl_nerfstudio.processing.kept.store import Manifest
+from sl_nerfstudio.processing.workers import no_interrupts, worker_pool
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.threads import only_one_library_thread
+from sl_nerfstudio.threads import one_library_thread, only_one_library_thread
 
 
 def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
@@ -30,11 +31,12 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
         settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
     jobs = config.jobs or cores()
-    for result in track(run_frames(job, todo, jobs), "decoding and calibrating", len(todo)):
-        found[result.name] = result
-        done = "decoded before" if result.resumed else "decoded"
-        status = f"failed in {result.stage}" if result.stage else done
-        manifest.note(result.name, result.key, status, result.reason)
+    with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
+        for result in track(ready, "decoding and calibrating", len(todo)):
+            found[result.name] = result
+            done = "decoded before" if result.resumed else "decoded"
+            status = f"failed in {result.stage}" if result.stage else done
+            manifest.note(result.name, result.key, status, result.reason)
     return [found[frame.name] for frame in captures.frames]
 
 
@@ -51,25 +53,29 @@ def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:
     return f"{begin}: {rate:.0%} of the pattern, epipolar residual {epipolar:.2f} px (medians)"
 
 
-def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Iterator[FrameStageResult]:
+def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Generator[FrameStageResult, None, None]:
     """Results in the order in which they are ready, from `jobs` processes (1: this one).
 
     Raises UserError if a process was killed.
     """
     if jobs == 1 or len(frames) < 2:
-        yield from map(FrameWorker(job), frames)
+        worker = FrameWorker(job)
+        for frame in frames:
+            with one_library_thread():  # as in worker processes: sums over several threads differ in the last digit
+                result = worker(frame)
+            yield result
         return
-    pool = ProcessPoolExecutor(min(jobs, len(frames)), get_context("spawn"), _start_worker, (job,))
     try:
-        for future in as_completed([pool.submit(_work, frame) for frame in frames]):
-            yield future.result()
+        with worker_pool(min(jobs, len(frames)), _start_worker, job) as pool:
+            with no_interrupts():
+                futures = [pool.submit(_work, frame) for frame in frames]
+            for future in as_completed(futures):
+                yield future.result()
     except BrokenProcessPool as error:
         raise UserError(
             f"a process that decoded frames was killed\n    cause:  {jobs} processes need more memory than there is\n"
             "    remedy: give a smaller number with --jobs; frames decoded so far are kept"
         ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def cores() -> int:

@@ -10,8 +10,9 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.processing.kept.stages import StageStore
+from sl_nerfstudio.processing.kept.store import DecodedStore
 from sl_nerfstudio.processing.selection.user_masks import UserMasks
-from sl_nerfstudio.processing.store import DecodedStore
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
@@ -66,6 +67,7 @@ class FrameWorker:
     def __init__(self, job: FrameJob) -> None:
         self._job = job
         self._store = DecodedStore(job.work, job.decoder.key)
+        self._stages = StageStore(job.work)
 
     def __call__(self, frame: CapturedFrame) -> FrameStageResult:
         """Decode (or load) and calibrate a frame. A frame that fails is left out, with its reason."""
@@ -87,7 +89,11 @@ class FrameWorker:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
         job, coords = self._job, decoded.coords
         try:
-            pose = estimate_relative_pose(*correspondences_of(coords), job.camera, job.projector, job.seed)
+            pose = self._stages.kept(
+                f"calibration {result.name}",
+                (coords, job.camera, job.projector, job.seed),
+                lambda: estimate_relative_pose(*correspondences_of(coords), job.camera, job.projector, job.seed),
+            )
             cloud = frame_cloud(result.name, coords, job.camera, job.projector, pose)
         except RelativePoseError as error:
             return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))

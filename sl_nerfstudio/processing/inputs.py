@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import require_empty
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.processing.captures import Captures, find_captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -29,7 +28,6 @@ class Inputs:
 def read_inputs(config: ProcessConfig) -> Inputs:
     """Read what the flags name. Raises UserError for flags and files that are wrong."""
     config.check()
-    require_empty(config.output)
     known = parse_known_length(config.known_length) if config.known_length else None
     layout = read_layout(config.pattern)
     decoder = choose_decoder(layout, config.decoder, config.pattern)

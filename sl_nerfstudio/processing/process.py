@@ -2,6 +2,7 @@
 
 Frames are read, decoded and calibrated one by one; then all are registered, adjusted together, brought to the unit of
 the scan, and written. A frame that fails is left out, with its reason. The scan folder appears complete or not at all.
+Decoded frames, the registration and the adjustment are kept in the work folder, where the next run goes on.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ from collections.abc import Callable, Sequence
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
@@ -16,6 +18,8 @@ from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
+from sl_nerfstudio.processing.kept.stages import StageStore
+from sl_nerfstudio.processing.kept.work_folder import work_folder
 from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.refined_focal import refine_focal
 from sl_nerfstudio.processing.result import ProcessResult, with_object_only
@@ -25,7 +29,7 @@ from sl_nerfstudio.processing.selection.object_words import object_sentences
 from sl_nerfstudio.processing.summary import summarise
 from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.projector_choice import ProjectorChoice, choose_projectors
+from sl_nerfstudio.registration.projector_choice import ProjectorChoice, choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration, with_undecided
 
@@ -39,6 +43,12 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     Raises UserError for flags and files that are wrong, and if fewer than two frames can be used: their report is then
     in the work folder.
     """
+    config.check()
+    with NewFolder(config.output) as folder, work_folder(config.work_folder):
+        return _process(config, folder, make_report, log)
+
+
+def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, log: Log) -> ProcessResult:
     inputs = read_inputs(config)
     job, captures = inputs.job, inputs.captures
     log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {job.decoder.name}")
@@ -55,16 +65,18 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
         require_known_frames(inputs.known, clouds)
     given = _given_for_clouds(inputs.given, results)
     start = None if given is None else given.T_world_camera
-    choice, registration = _register(clouds, not config.unordered, config.seed, start, log)
-    if not (config.unordered or registration.ordered):
-        log("the frames do not follow each other in the order of capture: --unordered says so")
-        if any(cloud.alternatives for cloud in clouds):  # they were compared with the wrong neighbours
-            choice, registration = _register(clouds, False, config.seed, start, log)
-    clouds, results = list(choice.clouds), with_clouds(results, choice.clouds)
+    store = StageStore(job.work, log)
+    chosen, registration = store.kept(
+        "registration",
+        (clouds, config.unordered, config.seed, start),
+        lambda: _register(clouds, config.unordered, config.seed, start, log),
+    )
+    clouds = chosen_clouds(clouds, chosen)
+    results = with_clouds(results, clouds)
     log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
     _require_registered(config, inputs, results, registration, make_report)
 
-    consistent = adjust_consistent(clouds, registration, log)
+    consistent = store.kept("adjustment", (clouds, registration), lambda: adjust_consistent(clouds, registration, log))
     registration = consistent.registration
     poses = find_scan_poses(clouds, registration, consistent.adjusted, inputs.known, given)
     result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross)
@@ -74,16 +86,29 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
         poses, result = with_usable_scale(poses, found), with_object_only(result, found)
     if result.joint_px is not None:
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
-    write_scan(config.output, job, results, poses, result, make_report)
+    write_scan(folder, job, results, poses, result, make_report)
     return result
 
 
 def _register(
+    clouds: Sequence[FrameCloud], unordered: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
+) -> tuple[tuple[int, ...], Registration]:
+    """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
+    choice, registration = _register_once(clouds, not unordered, seed, start, log)
+    if not (unordered or registration.ordered):
+        log("the frames do not follow each other in the order of capture: --unordered says so")
+        if any(cloud.alternatives for cloud in clouds):  # they were compared with the wrong neighbours
+            choice, registration = _register_once(clouds, False, seed, start, log)
+    return choice.chosen, registration
+
+
+def _register_once(
     clouds: Sequence[FrameCloud], sequence: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
 ) -> tuple[ProjectorChoice, Registration]:
     """The pose of every frame's projector where several are possible, then the poses of the frames."""
     choice = choose_projectors(clouds, sequence, seed)
-    return choice, with_undecided(register(choice.clouds, sequence, seed, start, log), choice.undecided)
+    registration = register(chosen_clouds(clouds, choice.chosen), sequence, seed, start, log)
+    return choice, with_undecided(registration, choice.undecided)
 
 
 def _require_clouds(

@@ -1,12 +1,12 @@
 """The scan folder of the registered frames, with the report on all frames."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
 
+from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.processing.failures import REPORT
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
@@ -22,26 +22,27 @@ _SUPERSAMPLING = 4  # of pattern.png
 
 
 def write_scan(
-    root: Path,
+    folder: NewFolder,
     job: FrameJob,
     results: Sequence[FrameStageResult],
     poses: ScanPoses,
     result: ProcessResult,
     make_report: Callable[[ProcessResult, Sequence[Preview]], str],
 ) -> None:
-    """Write all frames that are in the scan by `result`. The folder is new, and complete or not there at all."""
+    """Write all frames that are in the scan by `result`. Leaving the folder completes it."""
     layout = job.decoder.layout
     row = {cloud.name: k for k, cloud in enumerate(clouds_of(results))}
     worker = FrameWorker(job)
     size = (job.projector.w, job.projector.h)
     previews: list[Preview] = []
     with ScanWriter(
-        root,
+        folder.root,
         units=poses.units,
         scale=poses.scale,
         projector=job.projector,
         pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
         camera=job.camera,
+        within=folder,
     ) as writer:
         for frame, record in zip(track(results, "writing"), result.frames, strict=True):
             image = _image(frame)

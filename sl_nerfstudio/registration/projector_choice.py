@@ -21,10 +21,15 @@ from sl_nerfstudio.threads import one_library_thread
 
 @dataclass(frozen=True)
 class ProjectorChoice:
-    """One cloud of every frame, and the frames where the choice is not certain."""
+    """Which cloud of every frame, and the frames where the choice is not certain."""
 
-    clouds: tuple[FrameCloud, ...]
+    chosen: tuple[int, ...]  # for every frame 0, its own cloud, or the number of an alternative from 1
     undecided: tuple[UndecidedProjector, ...]
+
+
+def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[FrameCloud]:
+    """Of every frame the cloud that was chosen, without alternatives."""
+    return [replace((cloud, *cloud.alternatives)[k], alternatives=()) for cloud, k in zip(clouds, chosen, strict=True)]
 
 
 @one_library_thread()
@@ -37,16 +42,16 @@ def choose_projectors(
     """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
     open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
     if not open_frames:
-        return ProjectorChoice(tuple(clouds), ())
+        return ProjectorChoice((0,) * len(clouds), ())
     search = _Choice(clouds, sequence, np.random.default_rng(seed), settings)
-    chosen, undecided = [replace(c, alternatives=()) for c in clouds], []
+    chosen, undecided = [0] * len(clouds), []
     for k in track(open_frames, "comparing poses of projectors"):
         support = search.support(k)
         best = int(np.argmax(support))
-        chosen[k] = replace(search.choices[k][best], alternatives=())
+        chosen[k] = best
         rivals = [h for h in range(len(support)) if h != best and support[h] >= settings.choice.rival * support[best]]
         if rivals:
-            angle = max(_angle_deg(chosen[k], search.choices[k][h]) for h in rivals)
+            angle = max(_angle_deg(search.choices[k][best], search.choices[k][h]) for h in rivals)
             undecided.append(UndecidedProjector(clouds[k].name, angle))
     return ProjectorChoice(tuple(chosen), tuple(undecided))
 

@@ -1,7 +1,6 @@
 """Writing a scan folder, one frame at a time."""
 
 import json
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import require_empty, write_atomic
+from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.images import encode_png
@@ -26,7 +25,8 @@ class ScanWriter:
     """Writes a scan folder (format 1) frame by frame, and transforms.json last.
 
     Use it as a context manager. The folder is a scan only after the block has ended; if an exception leaves the block,
-    everything written is removed again. Each file is written under a temporary name and renamed.
+    everything written is removed again. Each file is written under a temporary name and renamed. What a killed process
+    left is removed by the next writer.
 
         with ScanWriter(root, units="mm", scale=Scale(False), projector=.., pattern=.., camera=..) as writer:
             writer.add_frame("frame_00000", image=.., coords=.., T_world_camera=.., T_world_projector=..)
@@ -42,13 +42,14 @@ class ScanWriter:
         pattern: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"],
         camera: Device | None = None,
         extra: dict[str, Any] | None = None,
+        within: NewFolder | None = None,
     ) -> None:
         """Start a folder at `root`, which must not exist or be empty (else UserError).
 
         `camera` holds the intrinsics common to all frames; None: each frame has its own. `pattern` has the
-        projector's size. `extra` holds further top-level keys of transforms.json.
+        projector's size. `extra` holds further top-level keys of transforms.json. `within` is a new folder that the
+        caller fills, and that `root` is or lies in: after an exception it is the caller's to remove.
         """
-        require_empty(root)
         if units not in UNITS:
             raise ValueError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
         if camera is not None and camera.model != "OPENCV":
@@ -69,9 +70,13 @@ class ScanWriter:
         self._head.update(extra or {})
         self._frames: list[dict[str, Any]] = []
         self._truth: list[dict[str, Any]] = []
-        self._written: list[Path] = []
-        self._made: list[Path] = [p for p in (root, *root.parents) if not p.exists()]
-        self._write("pattern.png", encode_png(pattern))
+        self._folder, self._own = within or NewFolder(root), within is None
+        self._below = root.relative_to(self._folder.root)
+        try:
+            self._write("pattern.png", encode_png(pattern))
+        except BaseException:
+            self._close(complete=False)
+            raise
 
     def __enter__(self) -> "ScanWriter":
         """The writer itself."""
@@ -81,14 +86,17 @@ class ScanWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Write transforms.json, or remove everything after an exception."""
-        if kind is None:
-            try:
+        complete = False
+        try:
+            if kind is None:
                 self._finish()
-            except BaseException:
-                self._remove()
-                raise
-        else:
-            self._remove()
+                complete = True
+        finally:
+            self._close(complete)
+
+    def _close(self, complete: bool) -> None:
+        if self._own:
+            self._folder.close(complete)
 
     def add_frame(
         self,
@@ -146,9 +154,8 @@ class ScanWriter:
             raise ValueError(f"{path!r} leaves the scan folder")
         self._write(path, content)
 
-    def _write(self, path: str, content: bytes) -> str:
-        self._written.append(self.root / path)
-        write_atomic(self.root / path, content)
+    def _write(self, path: str, content: bytes, last: bool = False) -> str:
+        self._folder.write((self._below / path).as_posix(), content, last=last)
         return path
 
     def _finish(self) -> None:
@@ -162,7 +169,8 @@ class ScanWriter:
             truth = {k: v for k, v in self._head.items() if k != "sl_pose_sigma"}
             frames = [{k: v for k, v in f.items() if k != "sl_pose_sigma"} for f in self._truth]
             self._write("ground_truth/transforms.json", encode_json({**truth, "frames": frames}))
-        self._write("transforms.json", encode_json({**self._head, "frames": self._frames}))
+        document = encode_json({**self._head, "frames": self._frames})
+        self._write("transforms.json", document, last=self.root == self._folder.root)
 
     def _settle_intrinsics(self) -> None:
         """If one frame has its own camera, give every frame its own: programs differ in which value they use."""
@@ -172,16 +180,6 @@ class ScanWriter:
         self._head = {key: value for key, value in self._head.items() if key not in common}
         self._frames = [{**common, **frame} for frame in self._frames]
         self._truth = [{**common, **frame} for frame in self._truth]
-
-    def _remove(self) -> None:
-        """Remove what this writer wrote and the folders it made, as far as the system allows."""
-        for path in self._written:
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
-        below = {parent for path in self._written for parent in path.parents if self.root in parent.parents}
-        for folder in [*sorted(below, key=lambda p: -len(p.parts)), *self._made]:
-            with suppress(OSError):  # not empty: it holds files of others
-                folder.rmdir()
 
 
 def device_fields(device: Device, model_key: str) -> dict[str, Any]:

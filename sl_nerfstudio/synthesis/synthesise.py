@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.files.atomic import require_empty, write_atomic
+from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.pattern.normalise import normalise_locally
@@ -50,19 +50,11 @@ def synthesise(config: SynthConfig, output: Path) -> None:
     with exact coordinates and poses. Raises UserError for bad flags or files, or an output that is not empty.
     """
     config.check()
-    require_empty(output)
     if config.clean:
         config = without_noise(config)
-    setup = make_setup(config)
-    if config.images_only:
-        _write_captures(config, setup, output)
-    else:
-        with _scan_writer(config, setup, output) as writer:
-            for index, frame in enumerate(_frames(config, setup)):
-                start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
-                _add(writer, frame, start, truth)
-                writer.add_file(f"ground_truth/{_object_mask_path(frame)}", _encode_mask(frame.object_mask))
-            _add_files(writer, config, setup, "ground_truth/")
+    with NewFolder(output) as folder:  # before the slow work: nobody else may start it
+        setup = make_setup(config)
+        (_write_captures if config.images_only else _write_scan)(config, setup, folder)
 
 
 def without_noise(config: SynthConfig) -> SynthConfig:
@@ -133,7 +125,7 @@ def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
     return np.rint(255 * image).astype(np.uint8)
 
 
-def _scan_writer(config: SynthConfig, setup: Setup, root: Path) -> ScanWriter:
+def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolder) -> ScanWriter:
     extra: dict[str, Any] = {}
     if config.pose_sigma and setup.sigma is not None:
         extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
@@ -146,6 +138,7 @@ def _scan_writer(config: SynthConfig, setup: Setup, root: Path) -> ScanWriter:
         pattern=_to_8_bit(setup.pattern),
         camera=setup.devices.camera,
         extra=extra,
+        within=folder,
     )
 
 
@@ -208,22 +201,32 @@ def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
     return {"appearance": config.appearance, "background": config.background, "frames": frames}
 
 
-def _write_captures(config: SynthConfig, setup: Setup, output: Path) -> None:
+def _write_scan(config: SynthConfig, setup: Setup, folder: NewFolder) -> None:
+    """A scan with its truth."""
+    with _scan_writer(config, setup, folder.root, folder) as writer:
+        for index, frame in enumerate(_frames(config, setup)):
+            start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
+            _add(writer, frame, start, truth)
+            writer.add_file(f"ground_truth/{_object_mask_path(frame)}", _encode_mask(frame.object_mask))
+        _add_files(writer, config, setup, "ground_truth/")
+
+
+def _write_captures(config: SynthConfig, setup: Setup, folder: NewFolder) -> None:
     """The images that a decoder starts from, and separately the scan that it should produce."""
     exact = replace(config, noise=0.0, missing=0.0, wrong=0.0, pose_sigma=False)
-    with _scan_writer(exact, setup, output / "ground_truth") as truth:
+    with _scan_writer(exact, setup, folder.root / "ground_truth", folder) as truth:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
             truth.add_file(_object_mask_path(frame), _encode_mask(frame.object_mask))
-            write_atomic(output / "images" / f"{frame.name}{frame.suffix}", frame.encoded)
+            folder.write(f"images/{frame.name}{frame.suffix}", frame.encoded)
         truth.add_file("captures.json", encode_json(_captures_document(config, setup)))
         _add_files(truth, exact, setup, "")
-    write_atomic(output / "pattern.png", encode_png(_to_8_bit(setup.pattern)))
+    folder.write("pattern.png", encode_png(_to_8_bit(setup.pattern)))
     if setup.layout is not None:
-        write_atomic(output / "pattern.json", setup.layout.encode())
+        folder.write("pattern.json", setup.layout.encode())
     intrinsics = {
         "units": config.units,
         **device_fields(setup.devices.camera, "camera_model"),
         "projector": {**device_fields(setup.devices.projector, "model"), "pattern_path": "pattern.png"},
     }
-    write_atomic(output / "intrinsics.json", (json.dumps(intrinsics, indent=1) + "\n").encode())
+    folder.write("intrinsics.json", (json.dumps(intrinsics, indent=1) + "\n").encode(), last=True)

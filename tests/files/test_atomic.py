@@ -76,11 +76,11 @@ def test_what_a_killed_process_left_is_replaced(tmp_path: Path) -> None:
     beside(tmp_path / "a", PARTIAL).write_bytes(bytes(1000))
     write_atomic(tmp_path / "a", b"new")
     assert files(tmp_path) == {"a"} and (tmp_path / "a").read_bytes() == b"new"
-    (tmp_path / "b").mkdir()
-    for folder in (tmp_path, tmp_path / "b"):
-        beside(folder / "x", PARTIAL).write_text("half")
+    beside(tmp_path / "x", PARTIAL).write_text("half")
+    (tmp_path / ".rsync.partial").write_text("of another program")
     remove_partial(tmp_path)
-    assert files(tmp_path) == {"a"}
+    remove_partial(tmp_path / "nowhere")
+    assert files(tmp_path) == {"a", ".rsync.partial"}
 
 
 def test_two_processes_do_not_write_into_the_same_file(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
@@ -34,7 +35,8 @@ def made(ramp_scan, tmp_path_factory):
 def test_what_is_written_is_what_was_found(made, tmp_path):
     job, results, poses, _ = made
     previews = []
-    write_scan(tmp_path / "s", *made, lambda _, shown: previews.extend(shown) or "page")
+    with NewFolder(tmp_path / "s") as folder:
+        write_scan(folder, *made, lambda _, shown: previews.extend(shown) or "page")
     assert check_scan(tmp_path / "s") == []
     scan = read_scan(tmp_path / "s")
     assert (scan.projector, scan.units, scan.scale) == (job.projector, "arbitrary", poses.scale)
@@ -59,7 +61,8 @@ def test_frames_that_are_not_in_the_scan_are_only_shown(made, tmp_path):
     failed = replace(results[3], cloud=None, stage="calibrating", reason="flat")
     some = replace(result, frames=(result.frames[0], lost, result.frames[2], replace(lost, name=NAMES[3])))
     previews = []
-    write_scan(tmp_path / "s", job, [*results[:3], failed], poses, some, lambda _, p: previews.extend(p) or "")
+    with NewFolder(tmp_path / "s") as folder:
+        write_scan(folder, job, [*results[:3], failed], poses, some, lambda _, p: previews.extend(p) or "")
     scan = read_scan(tmp_path / "s")
     assert [frame.name for frame in scan.frames] == [NAMES[0], NAMES[2]]
     np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera[[0, 2]], atol=1e-12)
@@ -70,6 +73,9 @@ def test_frames_that_are_not_in_the_scan_are_only_shown(made, tmp_path):
 def test_nothing_is_left_if_writing_fails(made, tmp_path):
     job, results, poses, result = made
     away = replace(job, work=tmp_path / "other")
-    with pytest.raises(UserError, match=f"the decoded frame {NAMES[0]} is missing"):
-        write_scan(tmp_path / "s", away, results, poses, result, lambda *_: "")
+    with (
+        pytest.raises(UserError, match=f"the decoded frame {NAMES[0]} is missing"),
+        NewFolder(tmp_path / "s") as folder,
+    ):
+        write_scan(folder, away, results, poses, result, lambda *_: "")
     assert list(tmp_path.iterdir()) == []

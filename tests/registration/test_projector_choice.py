@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.registration.projector_choice import choose_projectors
+from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.result import UndecidedProjector
 from sl_nerfstudio.relative_pose.plane_starts import plane_starts
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, ray_pairs
@@ -69,13 +69,15 @@ CLOUDS = clouds_of(RIG, SIZE)
 def test_the_true_pose_is_chosen_by_what_the_neighbours_saw(true_first):
     frame = two_poses(OPEN, IMAGES[OPEN], true_first)
     assert len(frame.alternatives) == 1
-    found = choose_projectors([*CLOUDS[:OPEN], frame, *CLOUDS[OPEN + 1 :]])
+    all_frames = [*CLOUDS[:OPEN], frame, *CLOUDS[OPEN + 1 :]]
+    found = choose_projectors(all_frames)
     assert found.undecided == ()
-    chosen = found.clouds[OPEN]
+    clouds = chosen_clouds(all_frames, found.chosen)
+    chosen = clouds[OPEN]
     assert chosen.alternatives == ()
     assert max(errors_deg(chosen.pose.T_camera_projector, RIG.T_camera_projector[OPEN].numpy())) < 1e-6
     for k in (0, 1, 3, 4):
-        assert found.clouds[k].points is CLOUDS[k].points
+        assert clouds[k].points is CLOUDS[k].points
 
 
 def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
@@ -84,7 +86,7 @@ def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
     found = choose_projectors(flat)
     named = {u.frame for u in found.undecided}
     assert named
-    for k, cloud in enumerate(found.clouds):
+    for k, cloud in enumerate(chosen_clouds(flat, found.chosen)):
         error = max(errors_deg(cloud.pose.T_camera_projector, RIG.T_camera_projector[k].numpy()))
         assert cloud.name in named or error < 1e-6
     for doubt in found.undecided:
@@ -97,4 +99,4 @@ def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
 
 def test_without_alternatives_nothing_is_done():
     found = choose_projectors(CLOUDS[:2])
-    assert found.clouds == tuple(CLOUDS[:2]) and found.undecided == ()
+    assert found.chosen == (0, 0) and found.undecided == ()

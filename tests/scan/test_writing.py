@@ -9,6 +9,7 @@ import pytest
 from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, pattern_image, poses, write_sphere
 
 from sl_nerfstudio.errors import ScanError, UserError
+from sl_nerfstudio.files.lock import LOCK
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import (
     PoseSigma,
@@ -127,7 +128,7 @@ def test_nothing_stays_of_a_scan_that_failed(tmp_path: Path) -> None:
     root = tmp_path / "new" / "scan"
     with pytest.raises(ZeroDivisionError), ScanWriter(root, **settings()) as writer:
         writer.add_frame("f0", **frame())
-        assert files(root) == {"pattern.png", "images/f0.png", "coords/f0.npz"}  # no transforms.json yet
+        assert files(root) == {LOCK, "pattern.png", "images/f0.png", "coords/f0.npz"}  # no transforms.json yet
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
 

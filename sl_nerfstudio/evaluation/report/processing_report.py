@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
@@ -16,6 +15,7 @@ from sl_nerfstudio.processing.selection.object_only import FrameShares
 from sl_nerfstudio.processing.selection.object_words import object_sentences
 
 _TEMPLATE = "processing.html.j2"
+_WITHOUT_EFFECT = ("output", "work", "jobs")  # flags on which no result depends
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,15 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "object_only": () if found is None else object_sentences(found),
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
-        "settings": sorted((key, str(value)) for key, value in vars(result.config).items() if value is not None),
-        "made_at": datetime.now(),
+        "settings": _settings(result),
     }
     return page(_TEMPLATE, values, first_line=first_line)
+
+
+def _settings(result: ProcessResult) -> list[tuple[str, str]]:
+    """The flags on which the scan depends; with others, and at another time, the report is the same byte for byte."""
+    flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
+    return sorted((key, str(value)) for key, value in flags.items() if value is not None)
 
 
 def _sentence(result: ProcessResult) -> str:

@@ -10,7 +10,7 @@ from sl_nerfstudio.decoding.decoders import DECODERS
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.store import DecodedStore, Manifest
+from sl_nerfstudio.processing.kept.store import DecodedStore, Manifest
 
 
 @pytest.fixture
@@ -55,7 +55,10 @@ def test_damaged_files_count_as_not_decoded(tmp_path, frame, decoded):
     store.save(frame, key, decoded)
     path = next((tmp_path / "decoded").iterdir())
     content = path.read_bytes()
-    for bad in (b"", content[: len(content) // 2], b"no archive"):
+    flipped = [bytearray(content) for _ in range(20)]
+    for bad, place in zip(flipped, np.random.default_rng(0).integers(0, len(content), 20), strict=True):
+        bad[place] ^= 1  # the checksums of the archive itself do not cover its names and headers
+    for bad in (b"", content[: len(content) // 2], b"no archive", *flipped):
         path.write_bytes(bad)
         assert store.load(frame, key) is None
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import zipfile
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,14 @@ import numpy as np
 
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.files.atomic import write_atomic
+from sl_nerfstudio.files.checked import read_checked, write_checked
 from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.scan.file_error import read_bytes
 from sl_nerfstudio.scan.writing import encode_json
 
 _KEY_LENGTH = 24
 MANIFEST = "manifest.json"
+DECODED = "decoded"
 
 
 class DecodedStore:
@@ -35,14 +36,11 @@ class DecodedStore:
 
     def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
         """A frame that was decoded before; None if there is none, or if its file is damaged."""
-        path = self._path(frame, key)
-        try:
-            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-                coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        content = read_checked(self._path(frame, key))
+        if content is None:
             return None
-        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
-            return None
+        with np.load(BytesIO(content), allow_pickle=False) as stored:
+            coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
         return Decoded(coords, mask, pattern.astype(np.float32) / np.float32(65535))
 
     def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
@@ -50,11 +48,11 @@ class DecodedStore:
         buffer = BytesIO()
         pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
         np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern)
-        write_atomic(self._path(frame, key), buffer.getvalue())
+        write_checked(self._path(frame, key), buffer.getvalue())
         return Decoded(decoded.coords, decoded.mask, pattern.astype(np.float32) / np.float32(65535))
 
     def _path(self, frame: CapturedFrame, key: str) -> Path:
-        return self.root / "decoded" / f"{frame.name}-{key}.npz"
+        return self.root / DECODED / f"{frame.name}-{key}.npz"
 
 
 class Manifest:

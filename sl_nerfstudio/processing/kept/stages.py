@@ -1,0 +1,74 @@
+"""Results of stages, kept in the work folder: a file for each, with a digest of everything that it follows from."""
+
+import hashlib
+import platform
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+import sl_nerfstudio
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
+from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.files.checked import read_checked, write_checked
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.processing.consistency import ConsistentFrames
+from sl_nerfstudio.processing.kept.records import decode, digest, encode
+from sl_nerfstudio.registration import result
+from sl_nerfstudio.relative_pose.degeneracy import Degeneracy
+from sl_nerfstudio.relative_pose.estimation import RelativePose
+from sl_nerfstudio.scan.types import PoseSigma
+from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement, PairAgreement
+
+T = TypeVar("T")
+
+KEPT: tuple[type, ...] = (
+    result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
+    result.PoorPair, result.CoordinatesDisagree, result.UndecidedProjector, result.UncertainRotation,
+    ConsistentFrames, AdjustedFrames, DevicePoses, PoseSigma, SelfCalibration,
+    CrossFrameAgreement, FrameCrossAgreement, PairAgreement, RelativePose, Degeneracy,
+)  # fmt: skip
+"""The dataclasses that results of stages consist of."""
+
+_PACKAGES = ("numpy", "scipy", "torch", "numba")  # the results may differ in the last digit with other versions
+FOLDER = "stages"
+_KEY_LENGTH = 24
+
+
+class StageStore:
+    """Results of stages in a work folder."""
+
+    def __init__(self, work: Path, log: Callable[[str], None] = lambda _: None) -> None:
+        """`log` gets a line for every result that is taken from an earlier run."""
+        self._folder, self._log = work / FOLDER, log
+
+    def kept(self, stage: str, inputs: object, compute: Callable[[], T]) -> T:
+        """The result of `compute`, or of an earlier run from equal `inputs`, by the same code.
+
+        Both are exactly the same: a result is returned as it will be read. `inputs` and the result are dataclasses,
+        tuples, arrays and plain values; the result's dataclasses are among `KEPT`.
+        """
+        key = digest((surroundings(), inputs))
+        path = self._folder / f"{stage}-{key[:_KEY_LENGTH]}.npz"
+        stored = read_checked(path)
+        if stored is not None:
+            found_key, value = decode(stored, KEPT)
+            if found_key == key:
+                self._log(f"{stage}: kept from an earlier run")
+                return value
+        content = encode((key, compute()))
+        write_checked(path, content)
+        return decode(content, KEPT)[1]
+
+
+@cache
+def surroundings() -> str:
+    """A digest of the code of this package, of the packages that compute, and of the kind of machine."""
+    root = Path(sl_nerfstudio.__file__).parent
+    found = hashlib.sha256(f"{platform.machine()} {platform.python_version()}".encode())
+    for name in _PACKAGES:
+        found.update(f"{name} {version(name)} ".encode())
+    for path in sorted(root.rglob("*.py")):
+        found.update(str(path.relative_to(root)).encode() + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()

@@ -1,0 +1,158 @@
+"""A run that was interrupted goes on where it was, and ends with the same bytes as one that was not."""
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.attacks.dying import dying
+from sl_nerfstudio.decoding.decoders import DECODERS
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
+from sl_nerfstudio.files.lock import LOCK, locked
+from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.pattern.files import LAYOUTS
+from sl_nerfstudio.processing import frame_stage, frame_worker
+from sl_nerfstudio.processing import process as stages
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.kept.records import digest
+from sl_nerfstudio.processing.process import process
+from tests.decoding.ramps_decoder import RampsDecoder
+from tests.pattern.ramps import Ramps
+from tests.processing.ramp_scan import NAMES
+
+pytestmark = pytest.mark.usefixtures("ramps_registered")
+
+KEPT = ["registration: kept from an earlier run", "adjustment: kept from an earlier run"]
+
+
+def run(config):
+    log = []
+    process(config, render_processing_report, log.append)
+    return log
+
+
+def content(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(ramp_scan, tmp_path_factory):
+    """The scan of a run that nothing interrupted, and its work folder."""
+    root = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(LAYOUTS, Ramps.kind, Ramps)
+        patch.setitem(DECODERS, RampsDecoder.name, RampsDecoder)
+        run(ramp_scan.config(root / "s", known_length="baseline of frame 1 = 5 cm"))
+    return root
+
+
+@pytest.fixture
+def config(ramp_scan, tmp_path):
+    return ramp_scan.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm")
+
+
+def killed(config, moment):
+    """A run in a copy of this process, killed at its change of the disk number `moment`; whether it was."""
+    with dying(moment):
+        child = os.fork()
+        if child == 0:
+            try:
+                process(config, render_processing_report, lambda _: None)
+            finally:
+                os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+@pytest.fixture
+def resumed(whole, config):
+    """Another output, with the work folder of the run that nothing interrupted."""
+    shutil.copytree(whole / "s.work", config.work_folder)
+    return config
+
+
+def test_killed_at_any_moment_the_next_run_ends_with_the_same_bytes(whole, config):
+    """Moments from the beginning to the end, one after the other in the same folders."""
+    assert sum(killed(config, moment) for moment in (0, 9, 28, 42, 50, 60, 71, 95)) >= 6
+    log = run(config)
+    assert content(config.output) == content(whole / "s")
+    assert [line for line in log if line in KEPT] == KEPT and "4 had been decoded before" in "".join(log)
+    kept, expected = content(config.work_folder), content(whole / "s.work")
+    assert kept.keys() == expected.keys()
+    assert all(kept[name] == expected[name] for name in kept if name != "manifest.json")
+
+
+def test_nothing_is_computed_again(whole, resumed, monkeypatch):
+    for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frame_worker, "estimate_relative_pose")):
+        monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called again"))
+    run(resumed)
+    assert content(resumed.output) == content(whole / "s")
+
+
+@pytest.mark.parametrize("change", [{"unordered": True}, {"seed": 1}, {"poses": True}])
+def test_with_other_settings_frames_are_registered_again(ramp_scan, resumed, change, monkeypatch, tmp_path):
+    if "poses" in change:
+        frames = zip(NAMES, ramp_scan.T_world_camera.tolist(), strict=True)
+        document = {"frames": [{"file_path": f"{name}.png", "transform_matrix": T} for name, T in frames]}
+        change = {"poses": tmp_path / "rough.json"}
+        change["poses"].write_text(json.dumps(document))
+    monkeypatch.setattr(stages, "register", lambda *_: pytest.fail("registered again"))
+    with pytest.raises(pytest.fail.Exception, match="registered again"):
+        run(replace(resumed, **change))
+    assert not resumed.output.exists()
+
+
+def test_results_in_another_order_are_the_same_and_in_the_order_of_the_captures(ramp_scan, resumed, monkeypatch):
+    job, captures = ramp_scan.job(resumed.work_folder), find_captures(ramp_scan.root / "images", True)
+    usual = frame_stage.run_frame_stage(resumed, job, captures)
+    real = frame_stage.run_frames
+
+    def reversed_frames(*arguments):
+        yield from reversed(list(real(*arguments)))
+
+    monkeypatch.setattr(frame_stage, "run_frames", reversed_frames)
+    turned = frame_stage.run_frame_stage(resumed, job, captures)
+    assert [result.name for result in turned] == list(NAMES)
+    assert digest([result.cloud for result in turned]) == digest([result.cloud for result in usual])
+
+
+def test_two_runs_in_one_place_are_refused(config):
+    with locked(config.work_folder), pytest.raises(UserError, match=r"s.work: is in use by"):
+        run(config)
+    assert not config.output.exists() and not config.work_folder.exists()
+    with NewFolder(config.output), pytest.raises(UserError, match=r"s: is in use by"):
+        run(config)
+    assert not config.work_folder.exists()
+
+
+def test_the_work_folder_may_not_be_in_the_output(config):
+    for work in (config.output, config.output / "inside", config.output / ".." / config.output.name):
+        with pytest.raises(UserError, match=r"--work .*: is in the output, which is to be a new folder"):
+            run(replace(config, work=work))
+    assert not config.output.exists()
+
+
+def test_temporary_files_of_killed_workers_do_not_stay(resumed):
+    for folder in ("", "decoded", "stages"):
+        (resumed.work_folder / folder / ".0123456789abcdef.partial").write_bytes(b"half")
+    (resumed.work_folder / LOCK).write_bytes(b"")
+    run(resumed)
+    assert not [path for path in resumed.work_folder.rglob(".*") if path.is_file()]
+    assert len(list((resumed.work_folder / "decoded").iterdir())) == len(NAMES)
+
+
+def test_damaged_files_in_the_work_folder_are_made_again(whole, resumed):
+    spoilt = [
+        path for path in resumed.work_folder.rglob("*.npz") if not path.name.startswith("adjustment")
+    ]  # it is slow
+    for k, path in enumerate(sorted(spoilt)):
+        text = bytearray(path.read_bytes())
+        text[np.random.default_rng(k).integers(len(text))] ^= 4
+        path.write_bytes(text)
+    log = run(resumed)
+    assert "had been decoded before" not in "".join(log) and KEPT[0] not in log and KEPT[1] in log
+    assert content(resumed.output) == content(whole / "s")
