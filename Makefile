@@ -25,7 +25,8 @@ SUITABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_inf
 
 help:
 	@echo "make install   create .venv with pinned dependencies and this package"
-	@echo "make demo      synthesise, train, export and evaluate a scan: outputs/demo/report.html (minutes)"
+	@echo "make demo      synthesise, train, export and evaluate a scan: outputs/demo/report.html (minutes);"
+	@echo "                 if it was interrupted, it goes on where it was"
 	@echo "make demo-images   the same from images alone, with decoding, calibration and registration first (minutes)"
 	@echo "make test      run the test suite"
 	@echo "make bench     run the benchmarks that take minutes; results in benchmarks/results/"
@@ -66,33 +67,57 @@ $(STAMP): $(BIN)/python pyproject.toml constraints.txt
 	}
 	@touch $@
 
-demo: install
-	rm -rf $(DEMO)
-	$(BIN)/sl-synth --output $(DEMO)/scan
-	$(BIN)/ns-train sl-neus --data $(DEMO)/scan --output-dir $(DEMO)/run \
-	  --experiment-name cone-and-cylinder --timestamp demo
-	$(BIN)/sl-export --load-config $(DEMO_RUN)/config.yml --output $(DEMO)/mesh.ply --poses $(DEMO)/refined
-	$(BIN)/sl-eval --mesh $(DEMO)/mesh.ply --data $(DEMO)/scan --poses $(DEMO)/refined/transforms.json \
-	  --json $(DEMO)/evaluation.json --report $(DEMO)/report.html
+# Every step of the demos is a target: `make demo` goes on after what is complete. Each command writes its file that is
+# the target last, and removes by itself what an interrupted one left. `make clean` starts anew.
+demo: $(DEMO)/report.html
 	@echo
 	@echo "surface  $(DEMO)/mesh.ply"
 	@echo "poses    $(DEMO)/refined/transforms.json"
 	@echo "figures  $(DEMO)/evaluation.json"
-	@echo "report   $(CURDIR)/$(DEMO)/report.html (open it in a browser)"
+	@echo "report   $(abspath $(DEMO)/report.html) (open it in a browser)"
 
-# The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.
-demo-images: install
-	rm -rf $(IMAGES)
+$(DEMO)/scan/transforms.json: | install
+	$(BIN)/sl-synth --output $(DEMO)/scan
+
+$(DEMO)/trained: $(DEMO)/scan/transforms.json
+	if [ -e $(DEMO_RUN)/config.yml ]; then $(BIN)/ns-train sl-neus --load-config $(DEMO_RUN)/config.yml; \
+	else $(BIN)/ns-train sl-neus --data $(DEMO)/scan --output-dir $(DEMO)/run \
+	  --experiment-name cone-and-cylinder --timestamp demo; fi
+	@touch $@
+
+$(DEMO)/refined/training.json: $(DEMO)/trained
+	$(BIN)/sl-export --load-config $(DEMO_RUN)/config.yml --output $(DEMO)/mesh.ply --poses $(DEMO)/refined --overwrite
+
+$(DEMO)/report.html: $(DEMO)/refined/training.json
+	$(BIN)/sl-eval --mesh $(DEMO)/mesh.ply --data $(DEMO)/scan --poses $(DEMO)/refined/transforms.json \
+	  --json $(DEMO)/evaluation.json --report $@
+
+demo-images: $(IMAGES)/report.html
+	@echo "report   $(abspath $(IMAGES)/report.html) (open it in a browser)"
+
+$(IMAGES)/captures/intrinsics.json: | install
 	$(BIN)/sl-synth --output $(IMAGES)/captures --scene head --frames 22 --images-only \
 	  --appearance realistic --background table
+
+$(IMAGES)/scan/transforms.json: $(IMAGES)/captures/intrinsics.json
 	$(BIN)/sl-process --images $(IMAGES)/captures/images --pattern $(IMAGES)/captures/pattern.json \
 	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/scan --object-only
-	$(BIN)/ns-train sl-neus --data $(IMAGES)/scan --output-dir $(IMAGES)/run \
-	  --experiment-name head --timestamp demo
-	$(BIN)/sl-export --load-config $(IMAGES_RUN)/config.yml --output $(IMAGES)/mesh.ply --poses $(IMAGES)/refined
+
+$(IMAGES)/trained: $(IMAGES)/scan/transforms.json
+	if [ -e $(IMAGES_RUN)/config.yml ]; then $(BIN)/ns-train sl-neus --load-config $(IMAGES_RUN)/config.yml; \
+	else $(BIN)/ns-train sl-neus --data $(IMAGES)/scan --output-dir $(IMAGES)/run \
+	  --experiment-name head --timestamp demo; fi
+	@touch $@
+
+$(IMAGES)/refined/training.json: $(IMAGES)/trained
+	$(BIN)/sl-export --load-config $(IMAGES_RUN)/config.yml --output $(IMAGES)/mesh.ply --poses $(IMAGES)/refined --overwrite
+
+# The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.
+$(IMAGES)/report.html: $(IMAGES)/refined/training.json
+	rm -rf $(IMAGES)/scan/ground_truth
 	cp -r $(IMAGES)/captures/ground_truth $(IMAGES)/scan/ground_truth
 	$(BIN)/sl-eval --mesh $(IMAGES)/mesh.ply --data $(IMAGES)/scan --poses $(IMAGES)/refined/transforms.json \
-	  --json $(IMAGES)/evaluation.json --report $(IMAGES)/report.html
+	  --json $(IMAGES)/evaluation.json --report $@
 
 # On up to four cores. The tests of one file run together, because they share what was trained for them.
 test: install

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, training_folders
+from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, output_folders, training_folders
 from benchmarks.attacks.case import Case
 
 GROUPS: tuple[Callable[[], list[Case]], ...] = (
@@ -10,4 +10,6 @@ GROUPS: tuple[Callable[[], list[Case]], ...] = (
     foreign_runs.cases,
     interrupted_trainings.cases,
     training_folders.cases,
+    output_folders.cases,
 )
+"""Every function gives the cases of a module."""

@@ -77,17 +77,26 @@ def check_outputs(config: ExportConfig) -> None:
             "    remedy: choose another output"
         )
     for path in (config.output, *_pose_files(config)):
-        if path.is_dir():
-            raise UserError(f"{path}: is a folder\n    remedy: choose another output")
-        if path.exists() and not config.overwrite:
+        try:
+            _check_output(path, config.overwrite)
+        except OSError as error:
             raise UserError(
-                f"{path}: already exists\n    cause:  an earlier export\n"
-                "    remedy: choose another output, or add --overwrite"
-            )
-        folder = next(p for p in path.absolute().parents if p.exists())
-        if not folder.is_dir() or not os.access(folder, os.W_OK):
-            problem = "is not writable" if folder.is_dir() else "is a file, not a folder"
-            raise UserError(f"{path}: cannot be written, {folder} {problem}\n    remedy: choose another output")
+                f"{path}: cannot be written ({error.strerror})\n    remedy: choose another output"
+            ) from error
+
+
+def _check_output(path: Path, overwrite: bool) -> None:
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder\n    remedy: choose another output")
+    if path.exists() and not overwrite:
+        raise UserError(
+            f"{path}: already exists\n    cause:  an earlier export\n"
+            "    remedy: choose another output, or add --overwrite"
+        )
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        problem = "is not writable" if folder.is_dir() else "is a file, not a folder"
+        raise UserError(f"{path}: cannot be written, {folder} {problem}\n    remedy: choose another output")
 
 
 def export_trained(trained: "TrainedRun", config: ExportConfig) -> str:

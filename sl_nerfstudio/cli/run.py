@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from types import FrameType
 
 from sl_nerfstudio.errors import UserError
@@ -24,6 +25,9 @@ def run(main: Callable[[], None]) -> None:
 
     Anything else is a bug in this package and keeps its traceback.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may hold bytes that no encoding can show
     try:
         with sigterm_raised():
             main()

@@ -1,12 +1,12 @@
 """Outputs of one process alone: a second one on the same folder or file is refused."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.lock_file import LockFile
-from sl_nerfstudio.files.paths import beside, made_with
+from sl_nerfstudio.files.paths import beside, made_with, remove_empty
 
 LOCK = ".sl-lock"
 """Name of the lock in a folder."""
@@ -48,10 +48,3 @@ def _locked(lock: Path, output: Path, folder: Path) -> Iterator[None]:
             held.release()
     finally:
         remove_empty(made)
-
-
-def remove_empty(folders: Sequence[Path]) -> None:
-    """Remove those folders that are empty, in the order given."""
-    for folder in folders:
-        with suppress(OSError):  # not empty
-            folder.rmdir()

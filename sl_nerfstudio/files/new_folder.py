@@ -10,9 +10,9 @@ from types import TracebackType
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.atomic import PARTIAL, require_empty, write_atomic
-from sl_nerfstudio.files.lock import LOCK, remove_empty
+from sl_nerfstudio.files.lock import LOCK
 from sl_nerfstudio.files.lock_file import LockFile
-from sl_nerfstudio.files.paths import beside, made_with
+from sl_nerfstudio.files.paths import beside, made_with, remove_empty
 
 
 class NewFolder:

@@ -3,6 +3,8 @@
 import hashlib
 import os
 import re
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
@@ -30,10 +32,22 @@ def cannot_write(path: Path, error: OSError) -> UserError:
 
 
 def made_with(folder: Path) -> list[Path]:
-    """`folder` and those above it that do not exist yet, the innermost first; all are made now."""
+    """`folder` and those above it that do not exist yet, the innermost first; all are made now, or none.
+
+    Raises UserError if they cannot be made.
+    """
+    missing: list[Path] = []
     try:
         missing = [p for p in (folder, *folder.parents) if not p.exists()]
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        remove_empty(missing)
         raise cannot_write(folder, error) from error
     return missing
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those folders that are empty, in the order given."""
+    for folder in folders:
+        with suppress(OSError):  # not empty, or not there
+            folder.rmdir()

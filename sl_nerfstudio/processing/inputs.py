@@ -12,7 +12,7 @@ from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
 from sl_nerfstudio.processing.selection.user_masks import find_masks
-from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length
+from sl_nerfstudio.registration.known_length import KnownLength, is_index, parse_known_length
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:
     """The known length with its frames by name; numbers count the captures from 0."""
     found = []
     for frame in known.frames:
-        if frame not in names and not (frame.isdecimal() and int(frame) < len(names)):
+        if frame not in names and not is_index(frame, len(names)):
             raise UserError(
                 f"--known-length: there is no frame {frame}\n    cause:  a typing error, or a number counted from 1\n"
                 f"    remedy: give a number from 0 to {len(names) - 1}, or the name of an image without its ending"

@@ -13,6 +13,7 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth
 from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
+_LEAST_METRES, _MOST_METRES = 1e-9, 1e9  # nothing that a camera sees is smaller or larger
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 _NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
@@ -40,7 +41,7 @@ class KnownLength:
 def parse_known_length(text: str) -> KnownLength:
     """`baseline of frame 0 = 85 mm` or `distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm`.
 
-    Raises UserError where the text is neither, the unit is unknown or the length is not above zero.
+    Raises UserError where the text is neither, the unit is unknown, or the length is not above zero or beyond reason.
     """
     text = " ".join(text.split())
     if baseline := _BASELINE.fullmatch(text):
@@ -55,9 +56,12 @@ def parse_known_length(text: str) -> KnownLength:
         )
     if unit not in _METRES:
         raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
-    if length <= 0:
-        raise UserError(f'known length "{text}": a length must be above zero')
-    return KnownLength(length * _METRES[unit], unit, frames, pixels)
+    metres = length * _METRES[unit]
+    if not _LEAST_METRES <= metres <= _MOST_METRES:
+        least, most = _LEAST_METRES / _METRES[unit], _MOST_METRES / _METRES[unit]
+        problem = "above zero" if length <= 0 else f"between {least:g} and {most:g} {unit}"
+        raise UserError(f'known length "{text}": a length must be {problem}')
+    return KnownLength(metres, unit, frames, pixels)
 
 
 def scale_to(
@@ -93,11 +97,16 @@ def scale_to(
     return known.metres / _METRES[unit] / found
 
 
+def is_index(frame: str, count: int) -> bool:
+    """Whether a text is a number from 0 to below `count`."""
+    return frame.isdecimal() and len(frame) <= len(str(count)) and int(frame) < count
+
+
 def _frame_index(frame: str, clouds: Sequence[FrameCloud]) -> int:
     names = [c.name for c in clouds]
     if frame in names:
         return names.index(frame)
-    if frame.isdigit() and int(frame) < len(names):
+    if is_index(frame, len(names)):
         return int(frame)
     raise UserError(f'there is no frame "{frame}"\n    remedy: give its number (0 to {len(names) - 1}) or its name')
 

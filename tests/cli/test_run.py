@@ -61,3 +61,9 @@ def test_the_handler_of_the_calling_program_stays():
         signal.signal(signal.SIGTERM, before)
     run(lambda: seen.append(signal.getsignal(signal.SIGTERM)))
     assert signal.getsignal(signal.SIGTERM) == before != seen[1]
+
+
+def test_names_that_no_encoding_can_show_are_printed_with_escapes():
+    code = "import sys; from sl_nerfstudio.cli.run import run; run(lambda: print('wrote', sys.argv[1]))"
+    done = subprocess.run([sys.executable, "-c", code, b"x\xff"], capture_output=True, check=True)
+    assert done.stdout == b"wrote x\\udcff\n" and done.stderr == b""
