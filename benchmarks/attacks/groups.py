@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, output_folders, training_folders
+from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, kills, output_folders, process_input, training_folders
 from benchmarks.attacks.case import Case
 
 GROUPS: tuple[Callable[[], list[Case]], ...] = (
@@ -11,5 +11,7 @@ GROUPS: tuple[Callable[[], list[Case]], ...] = (
     interrupted_trainings.cases,
     training_folders.cases,
     output_folders.cases,
+    kills.cases,
+    process_input.cases,
 )
 """Every function gives the cases of a module."""

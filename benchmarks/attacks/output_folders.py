@@ -23,7 +23,7 @@ PROCESS = ("sl-process", "--images", "captures/images", "--pattern", "captures/p
 EXPORT = ("sl-export", "--load-config", CONFIG, "--resolution", "24", "--keep-unobserved", "--output")
 EVAL = ("sl-eval", "--mesh", MESH, "--data", "scan", "--samples", "1000")
 
-_FIXTURES: dict[str, tuple[Fixture, ...]] = {
+FIXTURES: dict[str, tuple[Fixture, ...]] = {
     "sl-process": ("captures",), "sl-export": ("scan", "run"), "sl-eval": ("scan",),
 }  # fmt: skip
 _FOLDERS: dict[str, tuple[str, ...]] = {
@@ -56,8 +56,10 @@ def cases() -> list[Case]:
             found += [_nowhere(f"{title} at {place!r}", (*command, place)) for place in _TAKEN]
         if title not in ("sl-process", "sl-process --work", "sl-export --poses", "sl-synth --images-only"):
             found += [_fine(f"{title} at {_short(place)}", (*command, place)) for place in _FINE]
+    inner = [place for place in _NOWHERE if place.endswith("x")]
     for title, (command, ending) in _FILES.items():
-        found += [_nowhere(f"{title} to {_short(p)}", (*command, p + ending)) for p in (*_NOWHERE, "", "d", "foreign")]
+        for place in (*inner, "loop", "fifo", "n" * 300, "d", "foreign"):
+            found.append(_nowhere(f"{title} to {_short(place)}", (*command, place + ending)))
     found += [_fine("sl-process at ä ö", (*PROCESS, "ä ö/日本")), _fine("sl-export to ä ö", (*EXPORT, "ä ö/日本.ply"))]
     found += [
         _fine(f"sl-eval to {_short(p)}", (*EVAL, "--json", f"{p}/e.json")) for p in ("ä ö 日本", "x\udcff", "a\nb")
@@ -87,7 +89,7 @@ def _full_disks() -> list[Case]:
         "sl-eval": (*EVAL, "--json", "new.json", "--report", "new.html"),
     }  # fmt: skip
     return [
-        Case(GROUP, f"{title}, files of at most {most} bytes", _FIXTURES.get(command[0], ()), _full_disk(command, most))
+        Case(GROUP, f"{title}, files of at most {most} bytes", FIXTURES.get(command[0], ()), _full_disk(command, most))
         for title, command in commands.items()
         for most in (1000, 2000, 4000, 10_000)
     ]
@@ -156,17 +158,17 @@ def _nowhere(title: str, command: tuple[str, ...]) -> Case:
         before = listing(folder)
         return _refused_or_parsed(call(folder, *command)) or left_behind(folder, before)
 
-    return Case(GROUP, title, _FIXTURES.get(command[0], ()), attack)
+    return Case(GROUP, title, FIXTURES.get(command[0], ()), attack)
 
 
 def _fine(title: str, command: tuple[str, ...]) -> Case:
     def attack(folder: Path) -> str:
         lay_places(folder)
         before = listing(folder)
-        done = call(folder, *command)
+        done = call(folder, *command, seconds=300)
         return accepted(done) or ("" if listing(folder) > before else "wrote nothing where it should")
 
-    return Case(GROUP, title, _FIXTURES.get(command[0], ()), attack)
+    return Case(GROUP, title, FIXTURES.get(command[0], ()), attack)
 
 
 def _refused_or_parsed(done: Done) -> str:

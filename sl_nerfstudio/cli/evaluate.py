@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sl_nerfstudio.evaluation.evaluate import Evaluation
     from sl_nerfstudio.verdict.verdict import Verdict
 
-_JSON_MARK, _REPORT_MARK = b'"verdict"', b"<title>Scan report: "  # by which earlier results are known
+_JSON_MARK, _REPORT_MARK = b'"format": 1,\n  "verdict"', b"<title>Scan report: "  # by which earlier results are known
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def check_outputs(config: ExportConfig) -> None:
 def _check_output(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise UserError(f"{path}: is a folder\n    remedy: choose another output")
-    if path.exists() and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise UserError(
             f"{path}: already exists\n    cause:  an earlier export\n"
             "    remedy: choose another output, or add --overwrite"

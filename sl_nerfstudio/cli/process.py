@@ -46,8 +46,8 @@ def closing_words(result: "ProcessResult") -> str:
         f"verdict: {result.verdict.band}\n{reasons}"
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
         f"report: {output / 'processing.html'}\n"
-        f"decoded frames are kept in {result.config.work_folder} for the next run; remove this folder once you "
-        "are happy with the scan\n"
+        f"decoded frames and poses are kept in {result.config.work_folder} for the next run; remove this folder once "
+        "you are happy with the scan\n"
     )
 
 

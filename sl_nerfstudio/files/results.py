@@ -1,5 +1,6 @@
 """Files that a command writes again and again, such as a report: only its own earlier ones are replaced."""
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -27,10 +28,10 @@ def held_results(marks: Mapping[Path, bytes]) -> Iterator[None]:
 
 def _require_earlier_result(path: Path, mark: bytes) -> None:
     try:
-        if not path.exists():
+        if not os.path.lexists(path):
             return
         if not path.is_file():
-            problem, cause = "is not a file", "there is a folder, a device or a pipe"
+            problem, cause = "is not a file", "there is a folder, a device, a pipe or a broken link"
         else:
             with path.open("rb") as stream:
                 begin = stream.read(_LOOKED_AT)
@@ -38,5 +39,5 @@ def _require_earlier_result(path: Path, mark: bytes) -> None:
                 return
             problem, cause = "would be overwritten, and is no earlier result of this command", "a typing error"
     except OSError as error:
-        problem, cause = f"cannot be read ({error.strerror})", "a link to itself, or missing permissions"
+        problem, cause = f"cannot be read ({error.strerror})", "a name that is too long, or missing permissions"
     raise UserError(f"{path}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")

@@ -13,6 +13,7 @@ import tyro
 
 from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan, main
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.results import held_results
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
@@ -78,6 +79,10 @@ def test_truth_and_true_poses_are_judged_perfect(scan: Path, tmp_path: Path, cap
     printed = capsys.readouterr().out
     assert "rigid" in printed and str(out) in printed.replace("\n", "")
     assert sorted(p.name for p in out.parent.iterdir()) == ["evaluation.json", "report.html"]
+    with held_results(
+        {out: b'"format": 1,\n  "verdict"', page: b"<title>Scan report: "}
+    ):  # earlier results may be replaced
+        assert "evaluation.json: is in use by" in failure("--mesh", mesh_of(scan), "--data", scan, "--json", out)
 
 
 def test_the_poses_file_brings_its_intrinsics(scan: Path, untrue: Path, tmp_path: Path) -> None:
@@ -254,6 +259,31 @@ def test_place_where_nothing_can_be_written(scan: Path, untrue: Path, tmp_path: 
     (tmp_path / "file").write_text("")
     message = failure("--mesh", mesh_of(scan), "--data", untrue, "--json", tmp_path / "file" / "out.json")
     assert "cannot be written" in message
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--json", "mine"), "mine: would be overwritten, and is no earlier result of this command"),
+        (("--report", "mine"), "mine: would be overwritten, and is no earlier result of this command"),
+        (("--json", "folder"), "folder: is not a file"),
+        (("--json", "broken"), "broken: is not a file"),
+        (("--json", "/dev/null"), "/dev/null: is not a file"),
+        (("--json", "n" * 256), "cannot be"),
+        (("--json", "a", "--report", "./a"), "--json and --report: both are a"),
+        (("--json", "/proc/x"), "/proc/x: cannot be written"),
+    ],
+)
+def test_files_that_are_no_earlier_results_stay(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine").write_text('{"frames": []}')
+    Path("folder").mkdir()
+    Path("broken").symlink_to("nowhere")
+    assert message in failure("--mesh", mesh_of(scan), "--data", scan, *flags)
+    assert {p.name for p in tmp_path.iterdir()} == {"mine", "folder", "broken"}
+    assert Path("mine").read_text() == '{"frames": []}'
 
 
 def test_command_ends_with_status_1_and_one_message(

@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -35,16 +34,17 @@ def test_a_signal_ends_a_command_with_its_status_and_nothing_stays(tmp_path, num
 
 
 def test_a_second_signal_during_the_clean_up_changes_nothing_but_the_status(tmp_path):
-    slow = _WAITING.replace(
-        "time.sleep(60)", "try:\n            time.sleep(60)\n        finally:\n            time.sleep(0.5)"
+    before, after = _WAITING.split('print("ready", flush=True)')
+    slow = (
+        f"{before}try: print('ready', flush=True); time.sleep(60)\n"
+        f"        finally: print('cleaning', flush=True); time.sleep(60){after}"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", slow, tmp_path / "new"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    assert process.stdout.readline() == "ready\n"
-    process.send_signal(signal.SIGINT)
-    time.sleep(0.1)
-    process.send_signal(signal.SIGTERM)
+    for said, number in (("ready\n", signal.SIGINT), ("cleaning\n", signal.SIGTERM)):
+        assert process.stdout.readline() == said
+        process.send_signal(number)
     assert process.communicate() == ("", "terminated\n") and process.returncode == 143
     assert list(tmp_path.iterdir()) == []
 
