@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, kills, output_folders, process_input, training_folders
+from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, kill_process, kills, output_folders, process_input, training_folders
 from benchmarks.attacks.case import Case
 
 GROUPS: tuple[Callable[[], list[Case]], ...] = (
@@ -12,6 +12,7 @@ GROUPS: tuple[Callable[[], list[Case]], ...] = (
     training_folders.cases,
     output_folders.cases,
     kills.cases,
+    kill_process.cases,
     process_input.cases,
 )
 """Every function gives the cases of a module."""
