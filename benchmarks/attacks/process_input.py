@@ -11,7 +11,7 @@ from benchmarks.attacks.output_folders import PROCESS, left_behind, listing
 
 GROUP = "Flags of sl-process"
 _VALUES = (
-    "1e400", "-1e400", "1e309", "1e308", "1e12", "1e-320", "1e-400", "1e-10", "0", "-0", "0.0", "-1", "-85", "nan",
+    "1e400", "-1e400", "1e309", "1e308", "1e13", "1e-320", "1e-400", "1e-10", "0", "-0", "0.0", "-1", "-85", "nan",
     "inf", "-inf", "NaN", "1,5", "0x10", "1_0", "", " ", "1e", "e5", "--1", "85 85", "٨٥e400", "9" * 400, "9" * 5000,
 )  # fmt: skip
 _TEXTS = (

@@ -28,7 +28,7 @@ class Inputs:
 def read_inputs(config: ProcessConfig) -> Inputs:
     """Read what the flags name. Raises UserError for flags and files that are wrong."""
     config.check()
-    known = parse_known_length(config.known_length) if config.known_length else None
+    known = None if config.known_length is None else parse_known_length(config.known_length)
     layout = read_layout(config.pattern)
     decoder = choose_decoder(layout, config.decoder, config.pattern)
     captures = find_captures(config.images, decoder.sequence)

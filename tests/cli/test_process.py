@@ -168,6 +168,7 @@ def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_fo
         (["--decoder", "network"], "describes a Gray-code sequence, which --decoder network does not read"),
         (["--decoder", "netwrok"], "--decoder netwrok: there is no decoder of this name"),
         (["--known-length", "85 mm"], 'known length "85 mm" is not understood'),
+        (["--known-length", ""], 'known length "" is not understood'),
         (["--known-length", "baseline of frame 9 = 85 mm"], "--known-length: there is no frame 9"),
         (["--jobs", "0"], "--jobs 0: give at least 1"),
         (["--poses", "nowhere.json"], "nowhere.json: is missing"),

@@ -47,6 +47,11 @@ def test_lengths_are_understood(text, known):
         ("85 mm", 'not understood(.|\n)*remedy: write "baseline of frame 0 = 85 mm"'),
         ("baseline of frame 0 = 85 inch", 'unit "inch" is none of m, cm, mm, um'),
         ("baseline of frame 0 = -85 mm", "a length must be above zero"),
+        ("baseline of frame 0 = 0 mm", "a length must be above zero"),
+        ("baseline of frame 0 = 1e-400 mm", "a length must be above zero"),
+        ("baseline of frame 0 = 1e-320 mm", r"a length must be between 1e-06 and 1e\+12 mm"),
+        ("baseline of frame 0 = 1e400 mm", r"a length must be between 1e-06 and 1e\+12 mm"),
+        ("baseline of frame 0 = nan mm", "not understood"),
         ("distance between frame 3 and frame 7 = 50 mm", "not understood"),
     ],
 )
