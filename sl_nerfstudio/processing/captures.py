@@ -1,12 +1,13 @@
 """The photographs of each frame."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.file_error import FileError, unreadable
 from sl_nerfstudio.scan.images import read_header
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -35,9 +36,12 @@ def find_captures(root: Path, sequences: bool) -> Captures:
     The most frequent image size is taken to be right. Images of another size, and images that cannot be read, are
     faults of their frames. Raises FileError if there are fewer than two frames.
     """
-    if not root.is_dir():
+    if not os.path.isdir(root):  # Path.is_dir raises for a name that is too long
         raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
-    frames = _folders(root) if sequences else _single_images(root)
+    try:
+        frames = _folders(root) if sequences else _single_images(root)
+    except OSError as error:
+        raise unreadable(root, error) from error
     if len(frames) < 2:
         what = "folders with images" if sequences else "images"
         other = _single_images(root) if sequences else _folders(root)

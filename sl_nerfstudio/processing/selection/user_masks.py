@@ -1,6 +1,7 @@
 """The user's masks: one image for each frame, named like the frame."""
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import ENDINGS
 from sl_nerfstudio.processing.selection.mask_file import read_mask
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.file_error import FileError, unreadable
 from sl_nerfstudio.verdict.verdict import listed
 
 _LISTED = 20  # frames in a message
@@ -63,9 +64,12 @@ def find_masks(folder: Path, frames: Sequence[str], size: tuple[int, int]) -> Us
 
     Raises FileError that names all frames without a mask, or all masks that cannot be used.
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # Path.is_dir raises for a name that is too long
         raise FileError(folder, "is no folder", "a typing error in --masks", "give the folder with the masks")
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+    try:
+        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and not p.name.startswith("."))
+    except OSError as error:
+        raise unreadable(folder, error) from error
     if not found:
         raise FileError(
             folder, "holds no masks", "a typing error in --masks, or images of another format",
