@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.lock_file import in_use, open_alone
+from sl_nerfstudio.files.lock_file import in_use, open_alone, write_all
 from sl_nerfstudio.files.paths import beside, cannot_write, is_beside
 
 PARTIAL = "partial"
@@ -29,7 +29,8 @@ def write_atomic(path: Path, content: bytes) -> None:
         raise cannot_write(path, error) from error
     # The file stays open, and thereby locked, until it has its name: nobody else can then write into it.
     try:
-        _write(file, content)
+        os.ftruncate(file, 0)
+        write_all(file, content)
         temporary.replace(path)
     except BaseException as error:
         with suppress(OSError):
@@ -39,13 +40,6 @@ def write_atomic(path: Path, content: bytes) -> None:
         raise
     finally:
         os.close(file)
-
-
-def _write(file: int, content: bytes) -> None:
-    os.ftruncate(file, 0)
-    rest = memoryview(content)
-    while len(rest):
-        rest = rest[os.write(file, rest) :]
 
 
 def remove_partial(folder: Path) -> None:

@@ -118,7 +118,7 @@ class LockFile:
     def add(self, line: bytes) -> None:
         """Add a line, which ends with a newline."""
         try:
-            os.write(self._file, line)
+            write_all(self._file, line)
         except OSError as error:
             raise cannot_write(self.output, error) from error
 
@@ -145,6 +145,13 @@ def open_alone(path: Path) -> tuple[int, bool]:
             os.close(file)
             raise
         os.close(file)  # its process renamed or removed it before this one had the lock
+
+
+def write_all(file: int, content: bytes) -> None:
+    """Write everything; where the disk fills up, the system first writes a part without an error."""
+    rest = memoryview(content)
+    while len(rest):
+        rest = rest[os.write(file, rest) :]
 
 
 def _lock(file: int) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 
 import pytest
 from hypothesis import given
@@ -135,3 +136,16 @@ def test_a_list_from_elsewhere_reaches_nothing_outside(tmp_path_factory, paths):
     with NewFolder(tmp / "new") as folder:
         folder.write("a", b"")
     assert (tmp / "mine").read_text() == "mine" and os.listdir(tmp / "new") == ["a"]
+
+
+def test_on_a_full_disk_nothing_is_left(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for most in (10, 100, 200, 300, 1000):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        try:
+            with pytest.raises(UserError, match="cannot be written"), NewFolder(tmp_path / "new") as folder:
+                for k in range(100):
+                    folder.write(f"inner/{k}", b"short")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert list(tmp_path.iterdir()) == []
