@@ -6,7 +6,8 @@ from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+from zipfile import BadZipFile
 
 import sl_nerfstudio
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
@@ -51,15 +52,25 @@ class StageStore:
         """
         key = digest((surroundings(), inputs))
         path = self._folder / f"{stage}-{key[:_KEY_LENGTH]}.npz"
-        stored = read_checked(path)
-        if stored is not None:
-            found_key, value = decode(stored, KEPT)
-            if found_key == key:
-                self._log(f"{stage}: kept from an earlier run")
-                return value
+        stored = _stored(path)
+        if stored is not None and stored[0] == key:
+            self._log(f"{stage}: kept from an earlier run")
+            return stored[1]
         content = encode((key, compute()))
         write_checked(path, content)
         return decode(content, KEPT)[1]
+
+
+def _stored(path: Path) -> tuple[Any, Any] | None:
+    """Key and value of a file; None where it is missing, damaged, or holds something else."""
+    content = read_checked(path)
+    if content is None:
+        return None
+    try:
+        key, value = decode(content, KEPT)
+    except (KeyError, ValueError, TypeError, AttributeError, EOFError, RecursionError, BadZipFile):
+        return None
+    return key, value
 
 
 @cache

@@ -5,6 +5,7 @@ import json
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -39,8 +40,13 @@ class DecodedStore:
         content = read_checked(self._path(frame, key))
         if content is None:
             return None
-        with np.load(BytesIO(content), allow_pickle=False) as stored:
-            coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
+        try:
+            with np.load(BytesIO(content), allow_pickle=False) as stored:
+                coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
+        except (ValueError, KeyError, EOFError, BadZipFile):
+            return None
+        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
+            return None
         return Decoded(coords, mask, pattern.astype(np.float32) / np.float32(65535))
 
     def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:

@@ -2,16 +2,25 @@
 
 import types
 import typing
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
 import pytest
 
+from sl_nerfstudio.files.checked import write_checked
 from sl_nerfstudio.processing.consistency import ConsistentFrames
 from sl_nerfstudio.processing.kept import stages
+from sl_nerfstudio.processing.kept.records import encode
 from sl_nerfstudio.processing.kept.stages import FOLDER, KEPT, StageStore
 from sl_nerfstudio.registration.result import NoCommonSurface
 from sl_nerfstudio.relative_pose.estimation import RelativePose
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """A class that no stage returns."""
+
+    value: int
 
 
 class Counted:
@@ -74,6 +83,18 @@ def test_a_damaged_result_is_computed_again(tmp_path, compute):
         path.write_bytes(text)
         store.kept("registration", 1, compute)
         assert compute.times == count and path.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no archive", encode(3), encode(("key",)), encode((1, 2, 3)), encode(Foreign(1)), encode("key")]
+)
+def test_a_whole_file_with_something_else_in_it_is_not_used(tmp_path, compute, content):
+    store = StageStore(tmp_path, print)
+    store.kept("registration", 1, compute)
+    (path,) = (tmp_path / FOLDER).iterdir()
+    write_checked(path, content)
+    store.kept("registration", 1, compute)
+    assert compute.times == 2
 
 
 def _inside(kind, seen):
