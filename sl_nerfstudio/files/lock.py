@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.lock_file import LockFile
-from sl_nerfstudio.files.paths import beside, made_with, remove_empty
+from sl_nerfstudio.files.paths import beside, made_with, remove_empty, require_possible
 
 LOCK = ".sl-lock"
 """Name of the lock in a folder."""
@@ -34,6 +34,7 @@ def locked_file(path: Path) -> Iterator[None]:
 def _locked(lock: Path, output: Path, folder: Path) -> Iterator[None]:
     made = made_with(folder)
     try:
+        require_possible(output)
         held = LockFile(lock, output)
         if held.lines:
             held.release(remove=False)

@@ -31,6 +31,16 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     )
 
 
+def require_possible(path: Path) -> None:
+    """Raise UserError for a path in an existing folder that can neither be found nor made: its name is too long."""
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
 def made_with(folder: Path) -> list[Path]:
     """`folder` and those above it that do not exist yet, the innermost first; all are made now, or none.
 
