@@ -2,7 +2,16 @@
 
 from collections.abc import Callable
 
-from benchmarks.attacks import command_lines, foreign_runs, interrupted_trainings, kill_process, kills, output_folders, process_input, training_folders
+from benchmarks.attacks import (
+    command_lines,
+    foreign_runs,
+    interrupted_trainings,
+    kill_process,
+    kills,
+    output_folders,
+    process_input,
+    training_folders,
+)
 from benchmarks.attacks.case import Case
 
 GROUPS: tuple[Callable[[], list[Case]], ...] = (

@@ -15,6 +15,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.intrinsics_refinement import refine_intrinsics
@@ -27,7 +28,6 @@ from sl_nerfstudio.model.training.interruption import INTERRUPTION
 from sl_nerfstudio.model.training.loop import SLTrainer
 from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
 from sl_nerfstudio.scan import require_valid
-from sl_nerfstudio.scan.atomic import write_atomic
 
 _TAKEN: dict[Path, RunFolder] = {}
 """The folders that this process writes to: not part of a configuration, which is written to config.yml."""
