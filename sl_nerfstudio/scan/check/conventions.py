@@ -14,10 +14,10 @@ from sl_nerfstudio.scan.check.interpretations import (
     GeometricFit,
     Interpretation,
     apply_interpretation,
-    distance_to_others,
     fit_geometry,
     other_interpretations,
 )
+from sl_nerfstudio.scan.check.other_clouds import OtherClouds
 from sl_nerfstudio.scan.problem import Problem
 
 # Epipolar residuals as fractions of the projector's focal length: angles in radians.
@@ -50,8 +50,9 @@ def convention_problems(
         yield None, "transform_matrix", hopeless(given, int(lost.sum()), len(frames))
         return
     if len(frames) > 2:
+        others = OtherClouds(given.clouds)
         for index, frame in enumerate(frames):
-            own = _better_interpretation_of_frame(frames, index, projector, given, focal)
+            own = _better_interpretation_of_frame(frames, index, projector, given, others, focal)
             if own is not None:
                 yield frame.name, key_of(own), describe(own, given, index)
     if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
@@ -73,7 +74,7 @@ def _better_interpretation(
 
 
 def _better_interpretation_of_frame(
-    frames: Sequence[Correspondences], index: int, projector: Device, given: GeometricFit, focal: float
+    frames: Sequence[Correspondences], index: int, projector: Device, given: GeometricFit, others: OtherClouds, focal: float
 ) -> Interpretation | None:
     """The interpretation of one frame alone under which it fits the others."""
     residual, spread = float(given.residual_px[index]), float(given.spread[index])
@@ -85,7 +86,7 @@ def _better_interpretation_of_frame(
         px, cloud = alone.typical_px, alone.clouds[0]
         if px > _FITS * focal:
             continue
-        apart = distance_to_others(cloud, given.clouds, index) / given.depth
+        apart = others.distance(cloud, index) / given.depth
         if apart < APART and _explains(residual, spread, px, apart, focal):
             found.append((_badness(px, apart, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None

@@ -39,7 +39,8 @@ def check_folder(root: Path) -> FolderCheck:
     partial = read_partial_scan(root, faults)
     good = check_headers(partial, faults)
     pattern = check_pattern(partial, good, faults)
-    contents = [check_content(f, partial, pattern, good, faults) for f in track(partial.frames, "Checking the scan")]
+    frames = list({frame.name: frame for frame in reversed(partial.frames)}.values())[::-1]  # a name twice is a fault
+    contents = [check_content(frame, partial, pattern, good, faults) for frame in track(frames, "Checking the scan")]
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
     for problem in shift_problems([content.shift for content in contents]):
