@@ -73,7 +73,7 @@ def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path
         ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
         ({"period": None}, "contradicts itself"),
         ({"codes": [[0, 1], [2]]}, "contradicts itself"),
-        ({"codes": [[9] * 10] * 7}, "codes must be 0 to 4"),
+        ({"codes": [[9] * 10] * 7}, "codes must be rows of whole numbers from 0 to 4"),
         ({"gap": 100}, "gap 100"),
     ],
 )

@@ -99,3 +99,12 @@ def wrong_unit(metres: float) -> Problem:
         "lengths are in another unit than stated (m and mm mixed up?)",
         'state the unit that the poses are in, or "arbitrary" if it is unknown',
     )
+
+
+def far_away(times: float) -> Problem:
+    """A device that is `times` as far from the others as they usually are."""
+    return Problem(
+        f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
+        "registration failed for this frame, or its position is in another unit",
+        "register it again, or leave the frame out",
+    )
