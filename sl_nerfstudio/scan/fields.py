@@ -12,7 +12,6 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.problem import Faults, Problem
 
-
 _ALIKE = 0.85  # similarity of two words, as difflib counts it, from which one is the other misspelt
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.calibration.formats.entry import DeviceEntry, Role
 from sl_nerfstudio.calibration.distortion_fit import LARGEST_MISS_PX
+from sl_nerfstudio.calibration.formats.entry import DeviceEntry, Role
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import MAX_PIXELS
 
