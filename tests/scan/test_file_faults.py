@@ -124,7 +124,8 @@ def test_a_transparent_colour_is_refused_as_transparency_is(sphere: Path) -> Non
 
 
 def test_colour_is_for_images_only(sphere: Path) -> None:
-    save(sphere / IMAGE, "RGB")
+    with Image.open(sphere / IMAGE) as image:
+        image.convert("RGB").save(sphere / IMAGE)
     assert check_scan(sphere) == []
     save(sphere / f"patterns/{NAMES[1]}.png", "RGB")
     assert only_fault(sphere).problem == "is in colour"

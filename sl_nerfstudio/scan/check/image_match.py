@@ -1,0 +1,110 @@
+"""Does a frame show the pattern where its coordinates say? Poses are not used.
+
+The pattern, looked up at the coordinates, must resemble the captured image. If it resembles it better after a move by
+whole pixels, the coordinates are shifted; if it never does, they are of another image, or of none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from sl_nerfstudio.scan.check.pattern_shift import look_up
+
+_PIXELS = 20000  # of a frame whose correlation is measured
+_FEWEST = 200
+_KEPT = 1000  # pixels that are compared with the images of other frames
+_WINDOW = 256  # side of the square, around the middle of the decoded pixels, in which a move is looked for
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a frame should show at some of its pixels."""
+
+    rows: Int64[ndarray, "n"]
+    columns: Int64[ndarray, "n"]
+    values: Float32[ndarray, "n"]
+
+    def correlation(
+        self, shown: Float32[ndarray, "h w"], allowed: Bool[ndarray, "h w"], x: int = 0, y: int = 0
+    ) -> float:
+        """With an image, moved by (x, y) pixels, where `allowed` is True; 0 where too little is left."""
+        rows, columns = self.rows + y, self.columns + x
+        inside = (rows >= 0) & (rows < shown.shape[0]) & (columns >= 0) & (columns < shown.shape[1])
+        inside[inside] = allowed[rows[inside], columns[inside]]
+        if inside.sum() < _FEWEST:
+            return 0.0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = np.corrcoef(self.values[inside], shown[rows[inside], columns[inside]])[0, 1]
+        return float(np.nan_to_num(found))
+
+    def thinned(self, count: int) -> "Prediction":
+        """At about `count` of the pixels, without the memory of the others."""
+        step = max(1, len(self.rows) // count)
+        return Prediction(self.rows[::step].copy(), self.columns[::step].copy(), self.values[::step].copy())
+
+
+@dataclass(frozen=True)
+class ImageMatch:
+    """How well one image of a frame shows the pattern at the frame's coordinates."""
+
+    correlation: float
+    moved: float  # the same after the best move
+    x: int  # the best move of the coordinates, pixels to the right and down
+    y: int
+    swapped: float  # correlation with x and y of the coordinates exchanged
+    prediction: Prediction  # at a few pixels: it is kept of every frame
+
+
+def match_image(
+    coords: Float32[ndarray, "h w 2"],
+    where: Bool[ndarray, "h w"],
+    pattern: Float32[ndarray, "rows columns"],
+    shown: Float32[ndarray, "h w"],
+    allowed: Bool[ndarray, "h w"],
+) -> ImageMatch | None:
+    """Compare the pattern at the `coords` of the pixels `where` with what is `shown` at the pixels `allowed`.
+
+    None if too little is decoded, or there is nothing in the image.
+    """
+    chosen = np.flatnonzero(where)
+    if len(chosen) < _FEWEST or not allowed.any() or np.ptp(shown[where]) == 0:
+        return None
+    expected = np.zeros(where.shape, dtype=np.float32)
+    expected[where] = look_up(pattern, coords[where])
+    chosen = chosen[:: max(1, len(chosen) // _PIXELS)]
+    rows, columns = np.divmod(chosen, where.shape[1])
+    prediction = Prediction(rows, columns, expected[rows, columns])
+    x, y = _best_move(expected, where, shown, allowed)
+    return ImageMatch(
+        correlation=prediction.correlation(shown, allowed),
+        moved=prediction.correlation(shown, allowed, x, y),
+        x=x,
+        y=y,
+        swapped=Prediction(rows, columns, look_up(pattern, coords[rows, columns, ::-1])).correlation(shown, allowed),
+        prediction=prediction.thinned(_KEPT),
+    )
+
+
+def _best_move(
+    expected: Float32[ndarray, "h w"],
+    where: Bool[ndarray, "h w"],
+    shown: Float32[ndarray, "h w"],
+    allowed: Bool[ndarray, "h w"],
+) -> tuple[int, int]:
+    """The move (x, y) with the largest cross-correlation, by Fourier transform of a part of the images."""
+    part = tuple(_around(np.nonzero(where)[axis], where.shape[axis]) for axis in (0, 1))
+    a = np.where(where, expected - expected[where].mean(), np.float32(0))[part]
+    b = np.where(allowed, shown - shown[allowed].mean(), np.float32(0))[part]
+    size = tuple(next_fast_len(2 * n, real=True) for n in a.shape)
+    spectrum = np.conj(rfft2(a, size)) * rfft2(b, size)
+    peak = np.unravel_index(int(np.argmax(irfft2(spectrum, size))), size)
+    y, x = (int(k) if k < n / 2 else int(k) - n for k, n in zip(peak, size, strict=True))
+    return x, y
+
+
+def _around(places: Int64[ndarray, "n"], size: int) -> slice:
+    start = int(np.clip(np.median(places) - _WINDOW // 2, 0, max(size - _WINDOW, 0)))
+    return slice(start, start + _WINDOW)
