@@ -131,6 +131,8 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         raise FileError(path, problem, "a point cloud, an empty result, or a truncated file", "give a surface mesh")
     if len(faces) > MAX_TRIANGLES:
         raise FileError(path, f"has {len(faces)} triangles", f"{MAX_TRIANGLES} are supported", "decimate it first")
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise FileError(path, "has vertices that are not three numbers each", "the file is damaged", again)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise FileError(
             path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is damaged", again

@@ -14,6 +14,7 @@ from sl_nerfstudio.scan.problem import Problem
 _CLEAR = 0.4  # from here on, the pattern is recognised
 _GAIN = 0.05  # of a move from there on: right frames gain nothing, and one pixel costs at least this
 _FAINT, _LARGE_GAIN = 0.25, 0.15  # the same for images too coarse to show the pattern well
+_RESTORED = 0.6  # share of the better frames' correlation that the right move gives back; a wrong one gives less
 _NOTHING = 0.25  # share of the better frames' correlation below which a frame does not show the pattern at all
 _OTHERS_GAIN = 0.3  # by which the coordinates fit the image of another frame better than their own
 _SWAPPED_GAIN = 0.1  # by which they fit with x and y exchanged: grids look alike, so it is less
@@ -41,20 +42,21 @@ def image_problems(
     strange = {name: match for name, match in known if match.correlation < max(_NOTHING * usual, _CLEAR / 2)}
     others = _fitting_others(strange, [frame.name for frame in frames], read_shown)
     for name, match in known:
-        if _is_shifted(match):
+        other = others.get(name, ("", 0.0))
+        if _is_shifted(match, usual) and match.moved > other[1]:
             yield name, _shifted(match)
         elif match.swapped >= _CLEAR and match.swapped - match.correlation >= _SWAPPED_GAIN:
             yield name, _swapped(match)
-        elif name in others:
-            yield name, _of_another_frame(match, *others[name])
+        elif other[0]:
+            yield name, _of_another_frame(match, *other)
         elif usual >= _CLEAR and match.correlation < _NOTHING * usual:
             yield name, _of_no_image(match, usual)
 
 
-def _is_shifted(match: ImageMatch) -> bool:
+def _is_shifted(match: ImageMatch, usual: float) -> bool:
     gain = match.moved - match.correlation
-    clear = match.moved >= _CLEAR and gain >= _GAIN
-    return (match.x, match.y) != (0, 0) and (clear or (match.moved >= _FAINT and gain >= _LARGE_GAIN))
+    enough = (match.moved >= _CLEAR and gain >= _GAIN) or (match.moved >= _FAINT and gain >= _LARGE_GAIN)
+    return (match.x, match.y) != (0, 0) and enough and match.moved >= _RESTORED * usual
 
 
 def _fitting_others(
