@@ -64,12 +64,17 @@ def _noise(coords: ndarray) -> ndarray:
     return np.where(np.isfinite(coords), values, np.nan).astype(np.float32)
 
 
+def _from_the_right(coords: ndarray) -> ndarray:
+    coords[..., 0] = 800 - coords[..., 0]
+    return coords
+
+
 def _content_faults() -> dict[str, Callable[[Path], None]]:
     found: dict[str, Callable[[Path], None]] = {
         "coordinates are noise": _on_coords(_noise),
         "rows and columns of the array exchanged": _on_coords(lambda c: c.transpose(1, 0, 2)),
         "x and y exchanged": _on_coords(lambda c: c[..., ::-1]),
-        "x counted from the right": _on_coords(lambda c: np.float32([800, 0]) + c * np.float32([-1, 1])),
+        "x counted from the right": _on_coords(_from_the_right),
         "array mirrored": _on_coords(lambda c: c[:, ::-1]),
         "array upside down": _on_coords(lambda c: c[::-1]),
         "coordinates of the next frame": lambda f: _store(f, _coords(f, _FRAME + 1)),

@@ -115,7 +115,7 @@ def read_points(path: Path) -> Float64[ndarray, "n 3"]:
     try:
         with path.open("rb") as stream:
             archive = np.load(stream, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
+            if isinstance(archive, np.ndarray):
                 raise ValueError("it is a plain array")
             if "xyz" not in archive:
                 raise FileError(

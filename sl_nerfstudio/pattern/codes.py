@@ -89,7 +89,11 @@ def is_generated(codes: Int[ndarray, "rows columns"], seed: int, margin: int, tu
     Margins that were not reached are not tried again, which takes much of the time of `code_array`.
     """
     attempts = [a for a in _attempts(3, 2) if a[0] <= margin and a[1] <= turned_margin]
-    return any(np.array_equal(codes, _attempt(*codes.shape, seed, *a)) for a in attempts or [(1, 0)])
+    for now, turned in attempts or [(1, 0)]:
+        generated = _attempt(codes.shape[0], codes.shape[1], seed, now, turned)
+        if generated is not None and np.array_equal(codes, generated):
+            return True
+    return False
 
 
 def _attempts(margin: int, turned_margin: int) -> Iterator[tuple[int, int]]:

@@ -50,8 +50,9 @@ def read_file_storage(path: Path) -> dict[str, Any]:
 def _xml_tree(content: bytes) -> Any:
     if b"<!DOCTYPE" in content or b"\0" in content:  # zeros: UTF-16, in which a DOCTYPE would not be found
         raise _NotAStorageError("it has a document type or is not UTF-8")
-    parser = ElementTree.XMLPullParser(("start", "end"))
-    depth, root = 0, None
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
+    depth = 0
+    root: ElementTree.Element | None = None
     for place in range(0, len(content), 4096):
         parser.feed(content[place : place + 4096])
         for event, element in parser.read_events():

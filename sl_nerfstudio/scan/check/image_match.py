@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
-from scipy.fft import irfft2, next_fast_len, rfft2
 
 from sl_nerfstudio.scan.check.pattern_shift import look_up
 
@@ -98,10 +97,10 @@ def _best_move(
     part = tuple(_around(np.nonzero(where)[axis], where.shape[axis]) for axis in (0, 1))
     a = np.where(where, expected - expected[where].mean(), np.float32(0))[part]
     b = np.where(allowed, shown - shown[allowed].mean(), np.float32(0))[part]
-    size = tuple(next_fast_len(2 * n, real=True) for n in a.shape)
-    spectrum = np.conj(rfft2(a, size)) * rfft2(b, size)
-    peak = np.unravel_index(int(np.argmax(irfft2(spectrum, size))), size)
-    y, x = (int(k) if k < n / 2 else int(k) - n for k, n in zip(peak, size, strict=True))
+    size = (2 * a.shape[0], 2 * a.shape[1])  # room for moves in all directions
+    together = np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size)
+    row, column = np.divmod(int(np.argmax(together)), size[1])
+    y, x = (int(k) if k < n / 2 else int(k) - n for k, n in zip((row, column), size, strict=True))
     return x, y
 
 
