@@ -155,8 +155,8 @@ def _keys() -> list[Case]:
     found = []
     for place in places:
         for value in _VALUES:
-            if (place, value) == (("sl_pose_sigma",), None):
-                continue  # null is allowed
+            if (place[-1], value) in (("sl_pose_sigma", None), ("known", True)):
+                continue  # these are right
 
             def change(document: Document, place: tuple[Any, ...] = place, value: Any = value) -> None:
                 for key in place[:-1]:
@@ -164,7 +164,8 @@ def _keys() -> list[Case]:
                 document[place[-1]] = value
 
             name = f"{'.'.join(map(str, place))} = {value!r}"
-            found.append(_wrong("Keys of transforms.json", name, _edited(change), str(place[-1])))
+            word = "is missing" if value == "x" and "path" in str(place[-1]) else str(place[-1])
+            found.append(_wrong("Keys of transforms.json", name, _edited(change), word))
     return found
 
 

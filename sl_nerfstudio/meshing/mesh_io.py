@@ -144,7 +144,10 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         raise FileError(path, problem, "it was written by a computation that failed", again)
     if (reach := np.abs(vertices).max()) > 1e12:
         raise FileError(path, f"reaches out to {reach:.0e} units", "a damaged file or a wrong unit", again)
-    return Mesh(vertices, faces)
+    mesh = Mesh(vertices, faces)
+    if not mesh.face_areas().any():
+        raise FileError(path, "has no triangle with an area", "a scale of 0, or an empty result", again)
+    return mesh
 
 
 def _first_line(error: Exception) -> str:

@@ -99,7 +99,7 @@ def test_right_coordinates_need_no_move(seed: int, missing: float) -> None:
     where = np.random.default_rng(seed).random(coords.shape[:2]) >= missing
     match = match_image(coords, where, PATTERN, 0.3 + 0.2 * shown_at(coords), np.ones(where.shape, dtype=bool))
     assert match is not None and (match.x, match.y) == (0, 0)
-    assert match.moved == match.correlation > max(0.9, match.swapped)
+    assert match.moved == match.correlation > max(0.9, match.interpreted)
 
 
 @settings(max_examples=25)

@@ -5,16 +5,23 @@ whole pixels, the coordinates are shifted; if it never does, they are of another
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.scan.check.interpretations import Interpretation
 from sl_nerfstudio.scan.check.pattern_shift import look_up
 
 _PIXELS = 20000  # of a frame whose correlation is measured
 _FEWEST = 200
 _KEPT = 1000  # pixels that are compared with the images of other frames
+_OTHER_AXES = tuple(
+    Interpretation(swapped=swapped, mirrored_x=x, mirrored_y=y)
+    for swapped, x, y in product((False, True), (False, True), (False, True))
+    if swapped or x or y
+)
 _WINDOW = 256  # side of the square, around the middle of the decoded pixels, in which a move is looked for
 
 
@@ -53,7 +60,8 @@ class ImageMatch:
     moved: float  # the same after the best move
     x: int  # the best move of the coordinates, pixels to the right and down
     y: int
-    swapped: float  # correlation with x and y of the coordinates exchanged
+    other_axes: Interpretation  # of the coordinates: exchanged or mirrored axes with the largest correlation
+    interpreted: float  # that correlation
     prediction: Prediction  # at a few pixels: it is kept of every frame
 
 
@@ -77,14 +85,26 @@ def match_image(
     rows, columns = np.divmod(chosen, where.shape[1])
     prediction = Prediction(rows, columns, expected[rows, columns])
     x, y = _best_move(expected, where, shown, allowed)
+    size = (pattern.shape[1], pattern.shape[0])
+    uv = coords[rows, columns]
+    found = [
+        Prediction(rows, columns, look_up(pattern, _interpreted(uv, how, size))).correlation(shown, allowed)
+        for how in _OTHER_AXES
+    ]
     return ImageMatch(
         correlation=prediction.correlation(shown, allowed),
         moved=prediction.correlation(shown, allowed, x, y),
         x=x,
         y=y,
-        swapped=Prediction(rows, columns, look_up(pattern, coords[rows, columns, ::-1])).correlation(shown, allowed),
+        other_axes=_OTHER_AXES[int(np.argmax(found))],
+        interpreted=max(found),
         prediction=prediction.thinned(_KEPT),
     )
+
+
+def _interpreted(uv: Float32[ndarray, "n 2"], how: Interpretation, size: tuple[int, int]) -> Float32[ndarray, "n 2"]:
+    x, y = uv.T[::-1] if how.swapped else uv.T
+    return np.stack([size[0] - x if how.mirrored_x else x, size[1] - y if how.mirrored_y else y], -1)
 
 
 def _best_move(

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.scan.check.convention_words import describe_coords
 from sl_nerfstudio.scan.check.image_match import ImageMatch
 from sl_nerfstudio.scan.problem import Problem
 
@@ -17,7 +18,7 @@ _FAINT, _LARGE_GAIN = 0.25, 0.15  # the same for images too coarse to show the p
 _RESTORED = 0.6  # share of the better frames' correlation that the right move gives back; a wrong one gives less
 _NOTHING = 0.25  # share of the better frames' correlation below which a frame does not show the pattern at all
 _OTHERS_GAIN = 0.3  # by which the coordinates fit the image of another frame better than their own
-_SWAPPED_GAIN = 0.1  # by which they fit with x and y exchanged: grids look alike, so it is less
+_AXES_GAIN = 0.1  # by which they fit with exchanged or mirrored axes: grids look alike, so it is less
 _BETTER = 0.75  # quantile of the frames to which the others are compared
 
 
@@ -45,8 +46,8 @@ def image_problems(
         other = others.get(name, ("", 0.0))
         if _is_shifted(match, usual) and match.moved > other[1]:
             yield name, _shifted(match)
-        elif match.swapped >= _CLEAR and match.swapped - match.correlation >= _SWAPPED_GAIN:
-            yield name, _swapped(match)
+        elif match.interpreted >= _CLEAR and match.interpreted - match.correlation >= _AXES_GAIN:
+            yield name, _other_axes(match)
         elif other[0]:
             yield name, _of_another_frame(match, *other)
         elif usual >= _CLEAR and match.correlation < _NOTHING * usual:
@@ -85,12 +86,11 @@ def _shifted(match: ImageMatch) -> Problem:
     )
 
 
-def _swapped(match: ImageMatch) -> Problem:
-    return Problem(
-        f"fits the image with x and y exchanged (correlation with the pattern {match.swapped:.2f} instead of "
-        f"{match.correlation:.2f})",
-        "rows and columns of the pattern were mixed up in this frame",
-        "store (x, y), x to the right and y down from the pattern's upper left corner: swap the two channels",
+def _other_axes(match: ImageMatch) -> Problem:
+    return describe_coords(
+        match.other_axes,
+        f"do not fit the image in this frame (correlation with the pattern {match.correlation:.2f}, otherwise "
+        f"{match.interpreted:.2f})",
     )
 
 
