@@ -106,3 +106,10 @@ def test_a_device_far_from_all_others(sphere: Path, key: str, x: float) -> None:
     fault = only_fault(sphere)
     assert (fault.frame, fault.field) == (NAMES[1], key)
     assert "puts the device" in fault.problem
+
+
+def test_an_uncertainty_without_bound(sphere: Path) -> None:
+    sigma = {"camera_translation": 1e308, "camera_rotation_deg": 1.0,
+             "relative_translation": 1.0, "relative_rotation_deg": 1.0}  # fmt: skip
+    edit(sphere, lambda document: document.update(sl_pose_sigma=sigma))
+    assert only_fault(sphere).field == "sl_pose_sigma.camera_translation"
