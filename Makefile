@@ -13,8 +13,11 @@ STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --progress-bar off --constraint constraints.txt
 DEMO := outputs/demo
 DEMO_RUN := $(DEMO)/run/cone-and-cylinder/sl-neus/demo
+DEMO_TRAINED = $(DEMO_RUN)/nerfstudio_models/step-000000999.ckpt
 IMAGES := outputs/demo-images
 IMAGES_RUN := $(IMAGES)/run/head/sl-neus/demo
+IMAGES_TRAINED = $(IMAGES_RUN)/nerfstudio_models/step-000000999.ckpt
+# The last checkpoint of a complete training.
 
 # Takes the first of these that runs, has a supported version and can create virtual environments.
 # `make install PYTHON=/path/to/python3.12` selects another.
@@ -79,13 +82,12 @@ demo: $(DEMO)/report.html
 $(DEMO)/scan/transforms.json: | install
 	$(BIN)/sl-synth --output $(DEMO)/scan
 
-$(DEMO)/trained: $(DEMO)/scan/transforms.json
+$(DEMO_TRAINED): $(DEMO)/scan/transforms.json
 	if [ -e $(DEMO_RUN)/config.yml ]; then $(BIN)/ns-train sl-neus --load-config $(DEMO_RUN)/config.yml; \
 	else $(BIN)/ns-train sl-neus --data $(DEMO)/scan --output-dir $(DEMO)/run \
 	  --experiment-name cone-and-cylinder --timestamp demo; fi
-	@touch $@
 
-$(DEMO)/refined/training.json: $(DEMO)/trained
+$(DEMO)/refined/training.json: $(DEMO_TRAINED)
 	$(BIN)/sl-export --load-config $(DEMO_RUN)/config.yml --output $(DEMO)/mesh.ply --poses $(DEMO)/refined --overwrite
 
 $(DEMO)/report.html: $(DEMO)/refined/training.json
@@ -103,13 +105,12 @@ $(IMAGES)/scan/transforms.json: $(IMAGES)/captures/intrinsics.json
 	$(BIN)/sl-process --images $(IMAGES)/captures/images --pattern $(IMAGES)/captures/pattern.json \
 	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/scan --object-only
 
-$(IMAGES)/trained: $(IMAGES)/scan/transforms.json
+$(IMAGES_TRAINED): $(IMAGES)/scan/transforms.json
 	if [ -e $(IMAGES_RUN)/config.yml ]; then $(BIN)/ns-train sl-neus --load-config $(IMAGES_RUN)/config.yml; \
 	else $(BIN)/ns-train sl-neus --data $(IMAGES)/scan --output-dir $(IMAGES)/run \
 	  --experiment-name head --timestamp demo; fi
-	@touch $@
 
-$(IMAGES)/refined/training.json: $(IMAGES)/trained
+$(IMAGES)/refined/training.json: $(IMAGES_TRAINED)
 	$(BIN)/sl-export --load-config $(IMAGES_RUN)/config.yml --output $(IMAGES)/mesh.ply --poses $(IMAGES)/refined --overwrite
 
 # The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.

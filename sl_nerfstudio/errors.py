@@ -1,7 +1,11 @@
 """Errors that a user can fix: their text is the whole message, and command lines print it without a traceback."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+_SHOWN = 3  # faults of one kind that are written out; of more, only the first is, and some of the others are named
+_NAMED = 4
 
 
 class UserError(Exception):
@@ -30,6 +34,13 @@ class Fault:
         where = ": ".join(part for part in (self.file, frame, self.field) if part)
         return f"{where}: {self.problem}\n    cause:  {self.cause}\n    remedy: {self.remedy}"
 
+    @property
+    def kind(self) -> tuple[str | None, ...]:
+        """The same for faults that differ only in their place and their numbers."""
+        place = self.field if self.frame is not None else None  # without frames, it is the fields that differ
+        file = self.file if self.frame is None else self.file.rpartition("/")[0]
+        return (file, place, *(re.sub(r"\d[\d.]*", "#", text) for text in (self.problem, self.cause, self.remedy)))
+
 
 class ScanError(UserError):
     """A scan folder that must not be used, with everything that is wrong with it."""
@@ -38,4 +49,21 @@ class ScanError(UserError):
         """`where` names the folder; `faults` holds at least one fault."""
         self.faults: list[Fault] = list(faults)
         count = "1 fault" if len(self.faults) == 1 else f"{len(self.faults)} faults"
-        super().__init__("\n".join([f"{count} in {where}", *map(str, self.faults)]))
+        super().__init__("\n".join([f"{count} in {where}", *_lines(self.faults)]))
+
+
+def _lines(faults: Sequence[Fault]) -> list[str]:
+    """The faults in their order; those of a frequent kind stand together at the first of them."""
+    kinds: dict[tuple[str | None, ...], list[Fault]] = {}
+    for fault in faults:
+        kinds.setdefault(fault.kind, []).append(fault)
+    return [line for alike in kinds.values() for line in _lines_of_kind(alike)]
+
+
+def _lines_of_kind(alike: Sequence[Fault]) -> list[str]:
+    if len(alike) <= _SHOWN:
+        return list(map(str, alike))
+    others = list(dict.fromkeys(fault.frame or fault.field or fault.file for fault in alike[1:]))
+    named = ", ".join(others[:_NAMED]) + (", .." if len(others) > _NAMED else "")
+    what = "frames" if alike[0].frame is not None else "places"
+    return [str(alike[0]), f"    and {len(alike) - 1} more {what}: {named}"]

@@ -23,8 +23,9 @@ sl-synth) put "${flag[output]}/ground_truth/mesh.ply"; fail
   put "${flag[output]}/$last" ;;
 sl-process) fail; put "${flag[output]}/transforms.json" ;;
 ns-train)
-  [ -v flag[load-config] ] || put "${flag[output-dir]}/${flag[experiment-name]}/sl-neus/demo/config.yml"
-  fail ;;
+  if [ -v flag[load-config] ]; then run=$(dirname "${flag[load-config]}")
+  else run=${flag[output-dir]}/${flag[experiment-name]}/sl-neus/demo; put "$run/config.yml"; fi
+  fail; put "$run/nerfstudio_models/step-000000999.ckpt" ;;
 sl-export) put "${flag[output]}"; fail; put "${flag[poses]}/transforms.json"; put "${flag[poses]}/training.json" ;;
 sl-eval) put "${flag[json]}"; fail; put "${flag[report]}" ;;
 esac

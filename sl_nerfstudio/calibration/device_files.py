@@ -6,7 +6,8 @@ from pathlib import Path
 from sl_nerfstudio.calibration.distortion_fit import LARGEST_MISS_PX, reduce_distortion
 from sl_nerfstudio.calibration.formats.colmap import read_colmap_entries
 from sl_nerfstudio.calibration.formats.entry import DeviceEntry, Role
-from sl_nerfstudio.calibration.formats.opencv import opencv_entries, read_file_storage
+from sl_nerfstudio.calibration.formats.file_storage import read_file_storage
+from sl_nerfstudio.calibration.formats.opencv import opencv_entries
 from sl_nerfstudio.calibration.formats.plain_json import read_json_entries
 from sl_nerfstudio.calibration.formats.procam import is_procam, procam_entries
 from sl_nerfstudio.geometry.devices import Device, DeviceKind

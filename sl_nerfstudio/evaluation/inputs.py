@@ -1,6 +1,5 @@
 """The files that an evaluation reads: mesh, scan, poses, truth or reference, and what is known about the training."""
 
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from sl_nerfstudio.scan import (
     read_poses,
     read_scan,
 )
+from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import TRANSFORMS, read_document
 from sl_nerfstudio.scan.file_error import check_file
 
@@ -113,7 +113,10 @@ def read_points(path: Path) -> Float64[ndarray, "n 3"]:
     """Points under the key `xyz` of an .npz file, never unpickled. Raises FileError."""
     check_file(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream:
+            archive = np.load(stream, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
+                raise ValueError("it is a plain array")
             if "xyz" not in archive:
                 raise FileError(
                     path,
@@ -122,7 +125,7 @@ def read_points(path: Path) -> Float64[ndarray, "n 3"]:
                     "save the points as numpy.savez(path, xyz=points), points (n, 3)",
                 )
             points = archive["xyz"]
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except (*ARRAY_DAMAGE, MemoryError) as error:
         raise FileError(
             path, f"cannot be read ({error})", "it is damaged or not an .npz file", "save the points again"
         ) from error

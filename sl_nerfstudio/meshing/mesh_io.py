@@ -131,6 +131,8 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         raise FileError(path, problem, "a point cloud, an empty result, or a truncated file", "give a surface mesh")
     if len(faces) > MAX_TRIANGLES:
         raise FileError(path, f"has {len(faces)} triangles", f"{MAX_TRIANGLES} are supported", "decimate it first")
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise FileError(path, "has vertices that are not three numbers each", "the file is damaged", again)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise FileError(
             path, f"has triangles at vertices that do not exist (it has {len(vertices)})", "the file is damaged", again
@@ -142,7 +144,10 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
         raise FileError(path, problem, "it was written by a computation that failed", again)
     if (reach := np.abs(vertices).max()) > 1e12:
         raise FileError(path, f"reaches out to {reach:.0e} units", "a damaged file or a wrong unit", again)
-    return Mesh(vertices, faces)
+    mesh = Mesh(vertices, faces)
+    if not mesh.face_areas().any():
+        raise FileError(path, "has no triangle with an area", "a scale of 0, or an empty result", again)
+    return mesh
 
 
 def _first_line(error: Exception) -> str:

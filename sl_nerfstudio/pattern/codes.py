@@ -10,6 +10,8 @@ Turning the pattern by 90 degrees exchanges 1 with 3 and 2 with 4; turning it by
 windows can be compared for every roll of the camera, in quarter turns.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float32, Int
 from numpy import ndarray
@@ -74,12 +76,39 @@ def code_array(
     cannot reach the margins, lower ones are tried; `hamming_margin` measures what was reached (3 and 2 for 40 x 40
     cells: in an upright window, one misread cell of nine can be corrected).
     """
-    while True:
-        rng = np.random.default_rng([seed, margin, turned_margin])
-        codes = rng.integers(0, SYMBOLS, (rows, columns)).astype(np.int8)
-        hopeless = margin <= 1 and turned_margin <= 0
-        if min(rows, columns) < WINDOW or hopeless:
+    for now, turned in _attempts(margin, turned_margin):
+        codes = _attempt(rows, columns, seed, now, turned)
+        if codes is not None:
             return codes
-        if resolve_conflicts(codes, margin, turned_margin, int(rng.integers(2**31))):
-            return codes
+    raise ValueError("unreachable: the last attempt cannot fail")
+
+
+def is_generated(codes: Int[ndarray, "rows columns"], seed: int, margin: int, turned_margin: int) -> bool:
+    """Whether `codes` are a `code_array` of this seed that reached `margin` and `turned_margin` or less.
+
+    Margins that were not reached are not tried again, which takes much of the time of `code_array`.
+    """
+    attempts = [a for a in _attempts(3, 2) if a[0] <= margin and a[1] <= turned_margin]
+    for now, turned in attempts or [(1, 0)]:
+        generated = _attempt(codes.shape[0], codes.shape[1], seed, now, turned)
+        if generated is not None and np.array_equal(codes, generated):
+            return True
+    return False
+
+
+def _attempts(margin: int, turned_margin: int) -> Iterator[tuple[int, int]]:
+    """Pairs of margins to try, the last of which any array has."""
+    yield margin, turned_margin
+    while margin > 1 or turned_margin > 0:
         turned_margin, margin = (turned_margin - 1, margin) if turned_margin > 0 else (turned_margin, margin - 1)
+        yield margin, turned_margin
+
+
+def _attempt(rows: int, columns: int, seed: int, margin: int, turned_margin: int) -> Int[ndarray, "r c"] | None:
+    """The array of this seed and these margins; None if they could not be reached."""
+    rng = np.random.default_rng([seed, margin, turned_margin])
+    codes = rng.integers(0, SYMBOLS, (rows, columns)).astype(np.int8)
+    hopeless = margin <= 1 and turned_margin <= 0
+    if min(rows, columns) < WINDOW or hopeless:
+        return codes
+    return codes if resolve_conflicts(codes, margin, turned_margin, int(rng.integers(2**31))) else None

@@ -1,6 +1,5 @@
 """pattern.json: the description of a pattern, kept beside its picture so that a decoder knows the codes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,10 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import FORMAT, PatternLayout
+from sl_nerfstudio.scan.document import document_faults, read_document
+from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.problem import Faults
 
 LAYOUTS: dict[str, type[PatternLayout]] = {
     GridPattern.kind: GridPattern,
@@ -21,7 +23,10 @@ LAYOUTS: dict[str, type[PatternLayout]] = {
 
 
 def read_layout(path: Path) -> PatternLayout:
-    """The pattern that a pattern.json describes. Raises UserError that names file and field."""
+    """The pattern that a pattern.json describes, which must be what sl-pattern makes of its own parameters.
+
+    Raises UserError that names file and field.
+    """
     document = _read_document(path)
     try:
         return LAYOUTS[document["kind"]].from_document(document)
@@ -43,11 +48,13 @@ def read_pattern(path: Path) -> tuple[Float32[ndarray, "h w"], PatternLayout | N
 
 
 def _read_document(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as a pattern description: {error}") from error
-    if not isinstance(document, dict) or document.get("kind") not in tuple(LAYOUTS):
+    document = read_document(path)
+    faults = Faults()
+    document_faults(document, path.name, faults)
+    if faults.found:
+        fault = faults.found[0]
+        raise FileError(path, f"{fault.field}: {fault.problem}", fault.cause, "write the file again with sl-pattern")
+    if document.get("kind") not in tuple(LAYOUTS):
         known = ", ".join(f'"{kind}"' for kind in LAYOUTS)
         raise UserError(
             f'{path}: this describes no pattern: "kind" must be one of {known}; '

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.pattern.layout import PatternLayout, whole_number
 
 HEAD = 2  # white and black
 
@@ -89,7 +89,11 @@ class GrayCode(PatternLayout):
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "GrayCode":
         """The sequence that a pattern.json describes."""
-        return cls(*(int(document[key]) for key in ("w", "h", "cell")))
+        layout = cls(*(whole_number(document, key) for key in ("w", "h", "cell")))
+        names = layout.fields()["sequence"]
+        if document.get("sequence", names) != names:
+            raise ValueError(f"sequence does not list the {len(names)} images of a {layout.w} x {layout.h} Gray code")
+        return layout
 
     def _stripes(self, axis: int) -> list[ndarray]:
         """Whether each pixel along an axis is lit, for every bit, coarse to fine."""

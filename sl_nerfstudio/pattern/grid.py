@@ -13,14 +13,16 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
 
-from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margin
-from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
+from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margin, is_generated
+from sl_nerfstudio.pattern.layout import Lattice, PatternLayout, number, whole_number
 
 # Offsets, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right).
 _OFFSETS = np.array(
     [[0, 0, 0, 0], [-1, 1, 0, 0], [1, -1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]],
     dtype=np.float64,
 )
+MAX_NODES = 200  # a side
+MAX_PIXELS = 100_000_000
 _LENGTHS = ("period", "line_width", "gap", "dark")
 
 
@@ -46,6 +48,10 @@ class GridPattern(PatternLayout):
                 f"a grid needs 0 < line_width < period and 0 <= gap < period - line_width, got "
                 f"line_width {self.line_width:g}, gap {self.gap:g}, period {self.period:g}"
             )
+        if not 0 <= self.dark < 1:
+            raise ValueError(f"dark is {self.dark:g}; the lines have 1, so it must be from 0 to less than 1")
+        if self.w * self.h > MAX_PIXELS or max(self.w, self.h) > MAX_NODES * self.period:
+            raise ValueError(f"a {self.w} x {self.h} pattern of period {self.period:g} is too large")
         rows, columns = int(self.h // self.period), int(self.w // self.period)
         if min(rows, columns) < 3:
             raise ValueError(f"a {self.w} x {self.h} pattern of period {self.period:g} has fewer than 3 x 3 nodes")
@@ -121,12 +127,21 @@ class GridPattern(PatternLayout):
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "GridPattern":
         """The grid that a pattern.json describes."""
-        numbers = {key: float(document[key]) for key in _LENGTHS}
-        w, h, seed = (int(document[key]) for key in ("w", "h", "seed"))
-        codes = np.array(document["codes"], dtype=np.int64)
-        if codes.min(initial=0) < 0 or codes.max(initial=0) >= SYMBOLS:
-            raise ValueError(f"codes must be 0 to {SYMBOLS - 1}")
-        return cls(w=w, h=h, seed=seed, codes=codes.astype(np.int8), **numbers)
+        numbers = {key: number(document, key) for key in _LENGTHS}
+        w, h, seed = (whole_number(document, key) for key in ("w", "h", "seed"))
+        codes = np.array(document["codes"])
+        if codes.dtype.kind != "i" or codes.ndim != 2 or codes.min(initial=0) < 0 or codes.max(initial=0) >= SYMBOLS:
+            raise ValueError(f"codes must be rows of whole numbers from 0 to {SYMBOLS - 1}")
+        pattern = cls(w=w, h=h, seed=seed, codes=codes.astype(np.int8), **numbers)
+        for key in ("rows", "columns", "x0", "y0"):
+            if number(document, key) != getattr(pattern, key):
+                raise ValueError(f"{key} is {document[key]}, but w, h and period make it {getattr(pattern, key):g}")
+        margins = (whole_number(document, key) for key in ("hamming_margin", "hamming_margin_turned"))
+        if not is_generated(np.asarray(pattern.codes), seed, *margins):
+            raise ValueError(
+                f"codes are not those of seed {seed}: with other symbols than those projected, places are confused"
+            )
+        return pattern
 
     @cached_property
     def _line_offsets(self) -> tuple[Float[ndarray, "rows s 2"], Float[ndarray, "r columns 2"]]:

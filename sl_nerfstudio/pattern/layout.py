@@ -1,6 +1,7 @@
 """What every kind of pattern offers: its size, a picture of it, and its description for pattern.json."""
 
 import json
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -9,6 +10,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 FORMAT = 1  # of pattern.json
+MAX_NUMBER = 2**53  # larger ones are not exact as float64
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,29 @@ class PatternLayout(ABC):
         """The layout that a pattern.json describes.
 
         Raises KeyError for a missing field, TypeError, ValueError or IndexError for values that make no pattern.
+        `number` and `whole_number` read the fields.
         """
 
     def encode(self, image: str = "pattern.png") -> bytes:
         """The text of pattern.json; `image` is the file beside it that shows the pattern."""
         head = {"sl_pattern": FORMAT, "kind": self.kind, "image": image, "w": self.w, "h": self.h}
         return _encode({**head, **self.fields()})
+
+
+def number(document: dict[str, Any], key: str) -> float:
+    """A finite number of a pattern.json. Raises KeyError if it is missing, ValueError for anything else."""
+    value = document[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_NUMBER:
+        raise ValueError(f"{key} is {str(value)[:20]}, not a number of reasonable size")
+    return float(value)
+
+
+def whole_number(document: dict[str, Any], key: str) -> int:
+    """The same for whole numbers."""
+    value = number(document, key)
+    if value != math.floor(value):
+        raise ValueError(f"{key} is {value:g}, not a whole number")
+    return int(value)
 
 
 def _encode(document: dict[str, Any]) -> bytes:

@@ -3,7 +3,7 @@
 from typing import Literal
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.grid import MAX_NODES, MAX_PIXELS, GridPattern
 
 Preset = Literal["800x800", "1280x720", "doe"]
 
@@ -35,8 +35,8 @@ def make_grid(
     w, h = preset_w if w is None else w, preset_h if h is None else h
     if not 2 <= period <= max(w, h):
         raise UserError(f"--period {period:g}: give 2 pixels or more, and less than the pattern's {max(w, h)}")
-    if max(w, h) / period > 200 or w * h > 100_000_000:
-        raise UserError(f"a {w} x {h} pattern of period {period:g} is too large: give at most 200 nodes a side")
+    if max(w, h) / period > MAX_NODES or w * h > MAX_PIXELS:
+        raise UserError(f"a {w} x {h} pattern of period {period:g} is too large: give at most {MAX_NODES} nodes a side")
     try:
         return GridPattern(
             w=w,

@@ -57,7 +57,7 @@ def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
         fault = faults.found[0]
         raise FileError(path, f"{fault.frame}: {fault.field} {fault.problem}", fault.cause, fault.remedy)
     units = document.get("units", "arbitrary")
-    if units not in UNITS:
+    if not isinstance(units, str) or units not in UNITS:
         raise FileError(path, f"units is {units!r}", "an unknown unit", f"give one of {', '.join(UNITS)}")
     given = GivenPoses(T, units)
     if given.known.sum() < 2:

@@ -18,7 +18,7 @@ from sl_nerfstudio.scan.file_error import FileError, check_file
 KEY = "coords"
 _MAX_MEMBERS = 64
 _EXPORT_AGAIN = "write it with numpy.savez_compressed(file, coords=array) from a float32 array of shape (H, W, 2)"
-_DAMAGE = (
+ARRAY_DAMAGE = (
     OSError,
     ValueError,
     EOFError,
@@ -29,6 +29,7 @@ _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
 )
+"""What reading a damaged .npy or .npz may raise."""
 
 
 def read_coords_size(path: Path) -> tuple[int, int]:
@@ -74,7 +75,7 @@ def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
             raise FileError(path, "is neither .npz nor .npy", "it is an array in another format", _EXPORT_AGAIN)
     except FileError:
         raise
-    except _DAMAGE as error:
+    except ARRAY_DAMAGE as error:
         raise FileError(
             path,
             f"cannot be read ({error})",

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from sl_nerfstudio.scan.problem import Faults, Problem
 
 TRANSFORMS = "transforms.json"
 MAX_BYTES = 256 << 20
+MAX_DEPTH = 32  # of lists and objects in each other; a scan has 6, and what walks a document may recurse this far
 _TOO_DEEP = Problem("is nested too deeply", "it does not describe a scan", "write the file again")
 _BOM = b"\xef\xbb\xbf"
 
@@ -51,6 +53,8 @@ def read_document(path: Path) -> Record:
         raise _syntax_error(path, content, error) from error
     except ValueError as error:  # a number with thousands of digits
         raise FileError(path, f"is not valid JSON ({error})", "a damaged number", "write the file again") from error
+    if _deeper_than(document, MAX_DEPTH):
+        raise FileError(path, _TOO_DEEP.problem, _TOO_DEEP.cause, _TOO_DEEP.remedy)
     if not isinstance(document, Record):
         raise FileError(
             path,
@@ -63,11 +67,8 @@ def read_document(path: Path) -> Record:
 
 def document_faults(document: Record, file: str, faults: Faults) -> None:
     """Add every key given twice and every number that is not finite, wherever they are."""
-    try:
-        for frame, key, problem in _walk(document, None, ""):
-            faults.add(problem, file, frame, key or None)
-    except RecursionError:
-        faults.add(_TOO_DEEP, file)
+    for frame, key, problem in _walk(document, None, ""):
+        faults.add(problem, file, frame, key or None)
 
 
 def frame_label(record: Any, index: int) -> str:
@@ -80,9 +81,21 @@ def frame_label(record: Any, index: int) -> str:
 def _record(pairs: list[tuple[str, Any]]) -> Record:
     record = Record(pairs)
     if len(record) != len(pairs):
-        keys = [key for key, _ in pairs]
-        record.duplicates = tuple(key for key in record if keys.count(key) > 1)
+        count = Counter(key for key, _ in pairs)
+        record.duplicates = tuple(key for key in record if count[key] > 1)
     return record
+
+
+def _deeper_than(document: Any, limit: int) -> bool:
+    """Whether lists and objects are nested more than `limit` times; level by level, without recursion."""
+    level = [document]
+    for _ in range(limit):
+        level = [item for outer in level if isinstance(outer, dict | list) for item in _inside(outer)]
+    return any(isinstance(item, dict | list) for item in level)
+
+
+def _inside(outer: dict[str, Any] | list[Any]) -> Iterable[Any]:
+    return outer.values() if isinstance(outer, dict) else outer
 
 
 def _syntax_error(path: Path, content: bytes, error: json.JSONDecodeError) -> FileError:

@@ -12,6 +12,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.problem import Faults, Problem
 
+_ALIKE = 0.85  # similarity of two words, as difflib counts it, from which one is the other misspelt
+
 
 @dataclass(frozen=True)
 class Fields:
@@ -127,9 +129,10 @@ class Fields:
 
     def check_spelling(self, known: Sequence[str]) -> None:
         """Add a fault for each key that looks like a misspelt one of `known` that is absent."""
-        absent = [key for key in known if key not in self.record]
+        absent = [(key, set(key)) for key in known if key not in self.record]
         for key in self.record:
-            close = [] if key in known else get_close_matches(key, absent, n=1, cutoff=0.85)
+            similar = [] if key in known else [name for name, letters in absent if _may_be_close(key, name, letters)]
+            close = get_close_matches(key, similar, n=1, cutoff=_ALIKE) if similar else []
             if close:
                 self.fault(key, "is not a key of a scan", "it is misspelt", f"did you mean {close[0]!r}?")
 
@@ -150,3 +153,9 @@ class Fields:
         text = "null" if value is None else repr(value)
         shown = text if len(text) <= 40 else text[:37] + "..."
         self.fault(key, f"is {shown} instead of {wanted}", "wrong type", f"give {wanted}")
+
+
+def _may_be_close(key: str, name: str, letters: set[str]) -> bool:
+    """False where two words cannot be `_ALIKE`: sizes or letters differ too much. A file may have very many keys."""
+    fewest = _ALIKE * (len(key) + len(name)) / 2  # letters that both must have in the same order
+    return fewest <= min(len(key), len(name)) and len(letters.difference(key)) <= len(name) - fewest

@@ -19,6 +19,7 @@ from sl_nerfstudio.scan.file_error import FileError, check_file, read_bytes, unr
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
 _EXIF_ORIENTATION = 0x0112
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 89_000_000  # just below the size at which Pillow warns of decompression bombs
 _OTHER_KINDS = {
     "P": "a colour palette",
@@ -81,6 +82,8 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
             "the file is truncated or damaged, for example by an interrupted copy or a full disk",
             "copy or export this image again",
         ) from error
+    if isinstance(image, PngImageFile):
+        _check_png_sums(path, content)
     _refuse_orientation(path, image)  # again: a PNG may have the tag after its pixels
     if header.bits == 16 and header.mode == "RGB":
         return _decode_deep_colour(path, content)
@@ -152,6 +155,24 @@ def _header(path: Path, image: ImageFile) -> ImageHeader:
         "it is not certain which intensity such a pixel has",
         "save it as grey or RGB with 8 or 16 bits, without palette or transparency",
     )
+
+
+def _check_png_sums(path: Path, content: bytes) -> None:
+    """Pillow decodes pixels without looking at the check sum that PNG keeps of every part. Raises FileError."""
+    place = len(_PNG_SIGNATURE)
+    while place + 12 <= len(content):
+        size, kind = struct.unpack(">I4s", content[place : place + 8])
+        end = place + 8 + size
+        if content[end : end + 4] != struct.pack(">I", zlib.crc32(content[place + 4 : end])):
+            raise FileError(
+                path,
+                f"is damaged: the check sum of its part {kind.decode('latin-1')!r} is wrong",
+                "bytes were changed by a failing disk, a faulty copy or an editor",
+                "copy or export this image again",
+            )
+        if kind == b"IEND":
+            return
+        place = end + 4
 
 
 def _refuse_orientation(path: Path, image: ImageFile) -> None:

@@ -17,6 +17,10 @@ PROJECTOR_KEYS = ("model", *REQUIRED, *DISTORTION, "pattern_path")
 _UNSUPPORTED = ("k3", "k4", "k5", "k6")
 _NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: fields of view of 0.57 and 157 degrees
 _ROUND_TRIP_PX = 1e-3
+_LEAST_STRETCH, _MOST_STRETCH = (
+    0.2,
+    2.0,
+)  # of distances from the principal point: fisheye lenses shrink them, none doubles
 
 
 def read_device(fields: Fields, kind: str) -> Device | None:
@@ -66,15 +70,8 @@ def device_problems(device: Device) -> Iterator[tuple[str, Problem]]:
                     "give the principal point in pixels of this image",
                 ),
             )
-    if not focal_problems and any(getattr(device, k) for k in DISTORTION) and not _distortion_invertible(device):
-        yield (
-            "k1",
-            Problem(
-                "and the other distortion terms fold the image over itself: two directions share a pixel",
-                "the terms are of another model, in another order, or were fitted without points near the corners",
-                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
-            ),
-        )
+    if not focal_problems and any(getattr(device, k) for k in DISTORTION):
+        yield from _distortion_problems(device)
 
 
 def _focal_problems(device: Device) -> Iterator[tuple[str, Problem]]:
@@ -100,8 +97,8 @@ def _focal_problems(device: Device) -> Iterator[tuple[str, Problem]]:
             )
 
 
-def _distortion_invertible(device: Device) -> bool:
-    """Whether every pixel returns to its place when it is undistorted and distorted again."""
+def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
+    """Every pixel must return to its place when it is undistorted and distorted again, from a place not far away."""
     x, y = torch.meshgrid(
         torch.linspace(0, device.w, 33, dtype=torch.float64),
         torch.linspace(0, device.h, 33, dtype=torch.float64),
@@ -112,4 +109,30 @@ def _distortion_invertible(device: Device) -> bool:
     intrinsics = Intrinsics.of(replace(device, model="OPENCV"), torch.float64)
     directions = unproject(intrinsics, uv)
     again, in_front = project(intrinsics, directions)
-    return bool(in_front.all() and ((again - uv).abs() < _ROUND_TRIP_PX).all())
+    if not (in_front.all() and ((again - uv).abs() < _ROUND_TRIP_PX).all()):
+        yield (
+            "k1",
+            Problem(
+                "and the other distortion terms fold the image over itself: two directions share a pixel",
+                "the terms are of another model, in another order, or were fitted without points near the corners",
+                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
+            ),
+        )
+        return
+    straight = directions[..., :2] / -directions[..., 2:]
+    bent = (uv - uv.new_tensor([device.cx, device.cy])) / uv.new_tensor([device.fl_x, device.fl_y])
+    stretch = (bent.norm(dim=-1) / straight.norm(dim=-1)).nan_to_num(1.0)
+    extreme = [value for value in (float(stretch.min()), float(stretch.max())) if not _plausible(value)]
+    if extreme:
+        yield (
+            "k1",
+            Problem(
+                f"and the other distortion terms multiply distances from the principal point by {extreme[0]:.2g}",
+                "a slip, terms of another model or in another order, or a fit to too few points; no lens does that",
+                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
+            ),
+        )
+
+
+def _plausible(stretch: float) -> bool:
+    return _LEAST_STRETCH <= stretch <= _MOST_STRETCH

@@ -12,7 +12,7 @@ from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.fields import Fields
 from sl_nerfstudio.scan.intrinsics import CAMERA_KEYS, read_device
 from sl_nerfstudio.scan.paths import read_path
-from sl_nerfstudio.scan.pose_problem import pose_problem
+from sl_nerfstudio.scan.pose_problem import FARTHEST, pose_problem
 from sl_nerfstudio.scan.problem import Faults, Problem
 from sl_nerfstudio.scan.types import Frame, PoseSigma
 
@@ -117,6 +117,12 @@ def read_sigma(fields: Fields) -> PoseSigma | None:
     section.check_spelling(SIGMA_KEYS)
     values = {key: section.read_number(key) for key in SIGMA_KEYS}
     for key, value in values.items():
+        if value is not None and value > FARTHEST:
+            section.fault(
+                key, f"is {value:g}", "the adjustment diverged, or the number was damaged",
+                "give the uncertainty of the starting poses, or leave sl_pose_sigma out",
+            )  # fmt: skip
+            return None
         if value is not None and value <= 0:
             section.fault(
                 key, f"is {value:g}", "a standard deviation must be greater than 0",

@@ -18,6 +18,12 @@ from sl_nerfstudio.scan.types import FORMAT, UNITS, Scale, Scan
 
 _TOP_KEYS = ("sl_format", "units", *CAMERA_KEYS, "projector", "scale", "frames", "sl_pose_sigma")
 
+_NO_PROJECTOR = Problem(
+    "is missing: there is no projector in this data set",
+    "it is an ordinary data set of nerfstudio, captured without a pattern projector",
+    "make a scan from captures of a projected pattern with sl-process",
+)
+
 
 @dataclass
 class PartialScan:
@@ -46,6 +52,9 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
     except FileError as error:
         faults.add(error, TRANSFORMS)
         return partial
+    if _without_projector(document):
+        faults.add(_NO_PROJECTOR, TRANSFORMS, None, "projector")
+        return partial
     document_faults(document, TRANSFORMS, faults)
     top = Fields(document, faults, TRANSFORMS)
     top.check_spelling(_TOP_KEYS)
@@ -68,6 +77,17 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
         check_scale_frames(partial.scale, {frame.name: frame.camera for frame in partial.frames}, faults)
     check_together(partial.frames, faults)
     return partial
+
+
+def _without_projector(document: dict[str, Any]) -> bool:
+    """Whether the file is one of nerfstudio's that was never meant to be a scan: not even a key of this format."""
+    frames = document.get("frames")
+    ours = {"sl_format", "projector"} & set(document)
+    return isinstance(frames, list) and bool(frames) and not ours and not any(map(_has_projector_keys, frames))
+
+
+def _has_projector_keys(record: Any) -> bool:
+    return not isinstance(record, dict) or any(key.startswith(("sl_", "projector")) for key in record)
 
 
 def _transforms_path(root: Path) -> Path:

@@ -7,6 +7,7 @@ from numpy import ndarray
 from sl_nerfstudio.scan.problem import Problem
 
 TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, a scale error of 0.01 % does not
+FARTHEST = 1e12  # units from the origin: beyond, numbers of 16 digits do not hold a position exactly enough
 
 
 def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
@@ -26,7 +27,7 @@ def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         return _last_row_problem(T)
-    return _rotation_problem(T[:3, :3])
+    return _rotation_problem(T[:3, :3]) or _position_problem(T[:3, 3])
 
 
 def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
@@ -41,6 +42,17 @@ def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
         f"has the last row {row} instead of 0, 0, 0, 1",
         "the matrix is projective or scaled, or its rows are in another order",
         "give a rigid motion from device to world",
+    )
+
+
+def _position_problem(position: Float64[ndarray, "3"]) -> Problem | None:
+    reach = float(np.abs(position).max())
+    if reach <= FARTHEST:
+        return None
+    return Problem(
+        f"puts the device {reach:.2g} units from the origin",
+        "registration or calibration diverged for this frame, or the number was damaged",
+        "calibrate it again or leave the frame out",
     )
 
 

@@ -20,9 +20,11 @@ class Faults:
     """Collects the faults of one folder."""
 
     found: list[Fault] = field(default_factory=list)
+    _known: set[Fault] = field(default_factory=set)  # the same; a scan may have very many
 
     def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
         """Add a problem, once. `file` is relative to the folder; `key` is a field in it."""
         fault = Fault(file, frame, key, problem.problem, problem.cause, problem.remedy)
-        if fault not in self.found:
+        if fault not in self._known:
+            self._known.add(fault)
             self.found.append(fault)

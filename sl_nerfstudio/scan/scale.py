@@ -18,7 +18,7 @@ def read_scale(top: Fields, frames: Sequence[str]) -> Scale | None:
     """The scale of a scan whose frames have these names; None after adding a fault.
 
     Scans written before `baseline_of` existed say "baseline of frame 3 (name)" or "baseline of frame 3" in `source`.
-    The name in brackets is used if it is there, else the number, if there is such a frame.
+    The name in brackets is used if it is there, else the number, if the names of the frames do not contradict it.
     """
     section = top.read_section("scale")
     if section is None:
@@ -43,7 +43,7 @@ def read_scale(top: Fields, frames: Sequence[str]) -> Scale | None:
         )  # fmt: skip
         return None
     if known and baseline_of is None and bar is None:
-        baseline_of = _old_baseline(source or "", frames)
+        baseline_of = _old_baseline(section, source or "", frames)
     return Scale(known, source or "", baseline_of, bar)
 
 
@@ -85,15 +85,35 @@ def scale_record(scale: Scale) -> dict[str, Any]:
     return record
 
 
-def _old_baseline(source: str, frames: Sequence[str]) -> str | None:
-    """The frame of a scan that has only `source`; a name that is not among `frames` is returned all the same."""
+def _old_baseline(section: Fields, source: str, frames: Sequence[str]) -> str | None:
+    """The frame of a scan that has only `source`; a name that is not among `frames` is returned all the same.
+
+    A number alone says nothing once frames were removed. That shows in names which have numbers of their own.
+    """
     found = _OLD_SOURCE.search(source)
     if found is None:
         return None
     number, name = int(found[1]), found[2]
     if name is not None and (name in frames or found[0] == source):
         return name
-    return frames[number] if number < len(frames) else None
+    own = [_last_number(frame) for frame in frames]
+    if number < len(frames) and (own[number] == number or None in own):
+        return frames[number]
+    section.fault(
+        "source",
+        f"names frame number {number}, and it is not certain which one that is"
+        if number < len(frames)
+        else f"names frame number {number}, but there are only {len(frames)} frames",
+        "frames were removed or renamed after the scan was made",
+        "name the frame in baseline_of; if it was removed, take the sentence out: then all lengths count alike",
+    )
+    return None
+
+
+def _last_number(name: str) -> int | None:
+    """7 for frame_00007; None for a name that does not end in a number."""
+    digits = re.search(r"[0-9]{1,9}$", name)
+    return None if digits is None else int(digits[0])
 
 
 def _read_bar(section: Fields) -> ScaleBar | None:

@@ -56,6 +56,25 @@ def test_a_faulty_scan(good: Path, tmp_path: Path) -> None:
     )
 
 
+def test_an_ordinary_data_set_gets_one_sentence(tmp_path: Path) -> None:
+    root = write_sphere(tmp_path / "scan")
+
+    def ordinary(document: dict) -> None:
+        for key in ("projector", "sl_format", "scale", "units"):
+            del document[key]
+        document["frames"] = [{"file_path": f["file_path"], "transform_matrix": 0} for f in document["frames"]] * 99
+
+    edit(root, ordinary)
+    done = command(str(root))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
+        f"error: 1 fault in {root}\n"
+        "transforms.json: projector: is missing: there is no projector in this data set\n"
+        "    cause:  it is an ordinary data set of nerfstudio, captured without a pattern projector\n"
+        "    remedy: make a scan from captures of a projected pattern with sl-process\n"
+    )
+
+
 def test_no_such_folder(tmp_path: Path) -> None:
     done = command(str(tmp_path / "nowhere"))
     assert done.returncode == 1

@@ -165,7 +165,7 @@ def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_fo
         (["--images", "nowhere"], "nowhere: is no folder"),
         (["--images", "n" * 300], "nnn: is no folder"),
         (["--masks", "n" * 300], "nnn: is no folder"),
-        (["--pattern", "nowhere.json"], "nowhere.json: cannot be read as a pattern description"),
+        (["--pattern", "nowhere.json"], "nowhere.json: is missing"),
         (["--intrinsics", "nowhere.json"], "nowhere.json: is missing"),
         (["--decoder", "network"], "describes a Gray-code sequence, which --decoder network does not read"),
         (["--decoder", "netwrok"], "--decoder netwrok: there is no decoder of this name"),

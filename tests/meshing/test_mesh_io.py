@@ -136,3 +136,16 @@ def test_normals_and_cutting():
     assert (upper.vertices[:, 2] > 3.0).all() and set(np.unique(upper.faces)) == set(range(len(upper.vertices)))
     expected = (MESH.vertices[MESH.faces][..., 2] > 3.0).all(1)
     assert upper.face_areas().sum() == pytest.approx(MESH.face_areas()[expected].sum())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "three numbers each|cannot be read"),
+        ("a.obj", "v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "no triangle with an area"),
+    ],
+)
+def test_meshes_without_a_surface(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(UserError, match=message):
+        read_mesh(tmp_path / name)

@@ -73,7 +73,7 @@ def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path
         ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
         ({"period": None}, "contradicts itself"),
         ({"codes": [[0, 1], [2]]}, "contradicts itself"),
-        ({"codes": [[9] * 10] * 7}, "codes must be 0 to 4"),
+        ({"codes": [[9] * 10] * 7}, "codes must be rows of whole numbers from 0 to 4"),
         ({"gap": 100}, "gap 100"),
     ],
 )
@@ -106,3 +106,52 @@ def test_files_that_are_no_pictures(tmp_path):
         read_pattern(path)
     with pytest.raises(UserError, match=r"absent\.png"):
         read_pattern(tmp_path / "absent.png")
+
+
+@pytest.mark.parametrize("code", [1e308, 10**30, 0.5, -1, None, "1", True])
+def test_codes_that_are_no_symbols(path, code):
+    document = json.loads(path.read_text())
+    document["codes"][2][3] = code
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match="contradicts itself: codes "):
+        read_layout(path)
+
+
+def test_codes_that_the_generator_does_not_give(grid, path):
+    """Each symbol counts, whichever it is; so does the seed."""
+    document = json.loads(path.read_text())
+    rng = np.random.default_rng(0)
+    for row, column in zip(rng.integers(0, 7, 10), rng.integers(0, 10, 10), strict=True):
+        codes = np.array(grid.codes)
+        codes[row, column] = (codes[row, column] + 1) % 5
+        path.write_text(json.dumps({**document, "codes": codes.tolist()}))
+        with pytest.raises(UserError, match="codes are not those of seed 9"):
+            read_layout(path)
+    for change in ({"codes": [[2] * 10] * 7}, {"seed": 10}, {"hamming_margin": 2, "hamming_margin_turned": 0}):
+        path.write_text(json.dumps({**document, **change}))
+        with pytest.raises(UserError, match="codes are not those of seed"):
+            read_layout(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"w": 160.5}, "w is 160.5, not a whole number"),
+        ({"h": 10**400}, "h: holds|h is 1000"),
+        ({"x0": 3}, "x0 is 3, but w, h and period make it"),
+        ({"dark": 1}, "dark is 1"),
+        ({"w": 10**7, "h": 10**7}, "too large"),
+    ],
+)
+def test_numbers_that_make_no_grid(path, change, message):
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(UserError, match=message):
+        read_layout(path)
+
+
+def test_large_arrays_of_low_margins_are_read_back(tmp_path):
+    """Their generator first tries margins that it cannot reach; the file says which it reached."""
+    grid = GridPattern(w=520, h=500, period=20.0, seed=4, codes=None)
+    path = tmp_path / "pattern.json"
+    path.write_bytes(grid.encode())
+    assert np.array_equal(read_layout(path).codes, grid.codes)

@@ -64,3 +64,12 @@ def test_faulty_poses(tmp_path, frames, extra, message):
     with pytest.raises(UserError, match=message) as caught:
         read_given_poses(path, ["a", "b", "c"])
     assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
+
+
+@pytest.mark.parametrize("units", [["mm"], {}, 1, True, "inch"])
+def test_units_that_are_none(tmp_path, units):
+    path = tmp_path / "poses.json"
+    frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    path.write_text(json.dumps({"units": units, "frames": frames}))
+    with pytest.raises(UserError, match="units is"):
+        read_given_poses(path, ["a", "b"])

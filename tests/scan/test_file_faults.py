@@ -124,7 +124,8 @@ def test_a_transparent_colour_is_refused_as_transparency_is(sphere: Path) -> Non
 
 
 def test_colour_is_for_images_only(sphere: Path) -> None:
-    save(sphere / IMAGE, "RGB")
+    with Image.open(sphere / IMAGE) as image:
+        image.convert("RGB").save(sphere / IMAGE)
     assert check_scan(sphere) == []
     save(sphere / f"patterns/{NAMES[1]}.png", "RGB")
     assert only_fault(sphere).problem == "is in colour"
@@ -248,3 +249,14 @@ def test_a_damaged_image_found_late_names_file_cause_and_remedy(tmp_path: Path) 
     assert str(error.value).startswith(f"{tmp_path / 'a.jpg'}: cannot be decoded (image file is truncated")
     assert "    cause:  the file is truncated or damaged" in str(error.value)
     assert "    remedy: copy or export this image again" in str(error.value)
+
+
+def test_a_png_whose_check_sum_is_wrong(sphere: Path) -> None:
+    """The last bits of the pixels may be changed and still be decoded."""
+    path = sphere / f"patterns/{NAMES[1]}.png"
+    content = bytearray(path.read_bytes())
+    place = content.index(b"IDAT") + 4
+    content[place - 8 + 12 + int.from_bytes(content[place - 8 : place - 4], "big") - 1] ^= 1  # of the sum itself
+    path.write_bytes(bytes(content))
+    fault = only_fault(sphere)
+    assert fault.file == f"patterns/{NAMES[1]}.png" and "the check sum of its part 'IDAT' is wrong" in fault.problem

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from sphere_scan import PROJECTOR, look_up, pattern_image
 
@@ -131,6 +132,7 @@ def test_half_a_pixel_is_reported_with_its_direction_and_nothing_else() -> None:
 def test_honest_coordinates_have_no_problem(seed: int, missing: float) -> None:
     """Any smooth coordinates inside the pattern, with any share of undecoded pixels."""
     rng = np.random.default_rng(seed)
-    coords = rng.uniform((0, 0), (PROJECTOR.w, PROJECTOR.h), (30, 40, 2)).astype(np.float32)
+    smooth = gaussian_filter(rng.normal(size=(30, 40, 2)), (4, 4, 0))
+    coords = ((smooth - smooth.min((0, 1))) / np.ptp(smooth, (0, 1)) * (PROJECTOR.w, PROJECTOR.h)).astype(np.float32)
     coords[rng.random((30, 40)) < missing] = np.nan
     assert list(coordinate_problems(coords, PROJECTOR)) == []

@@ -104,7 +104,6 @@ def test_removing_the_frame_with_the_known_length_is_a_fault(tmp_path: Path, sca
         ("baseline of frame 1", NAMES[1]),
         ("measured baseline of frame 3 (ruler)", NAMES[3]),
         (f"baseline of frame 1 ({NAMES[3]})", NAMES[3]),  # the name counts, not the number
-        ("baseline of frame 4", None),
         ("given camera poses", None),
         ("", None),
     ],
@@ -113,6 +112,18 @@ def test_scans_with_a_sentence_only_keep_their_meaning(sphere: Path, source: str
     edit(sphere, with_scale({"known": True, "source": source}))
     assert check_scan(sphere) == []
     assert read_scan(sphere).scale == Scale(True, source, baseline_of=frame)
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_a_number_alone_is_refused_once_frames_were_removed(sphere: Path, number: int) -> None:
+    """Without frame 0, number 0 would be frame 1; whoever removes only baseline_of is left with such a sentence."""
+    edit(sphere, with_scale({"known": True, "source": f"baseline of frame {number}"}))
+    if number == 0:
+        assert read_scan(sphere).scale.baseline_of == NAMES[0]
+        edit(sphere, remove(NAMES[0]))
+    fault = only_fault(sphere)
+    assert (fault.file, fault.field) == ("transforms.json", "scale.source")
+    assert f"names frame number {number}" in fault.problem and "removed" in fault.cause
 
 
 def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere: Path) -> None:

@@ -6,10 +6,8 @@ The projector was measured at the first pixel of each Gray-code cell, not at the
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sl_nerfstudio.calibration.formats.entry import DeviceEntry
-from sl_nerfstudio.calibration.formats.opencv import FIRST_CENTRE, opencv_entry
+from sl_nerfstudio.calibration.formats.opencv import FIRST_CENTRE, image_size, opencv_entry
 
 
 def is_procam(stored: dict[str, Any]) -> bool:
@@ -25,8 +23,8 @@ def procam_entries(path: Path, stored: dict[str, Any], step: int) -> list[Device
     shape = stored.get("img_shape")
     size = None
     if shape is not None:
-        rows, columns = np.asarray(shape, dtype=np.float64).reshape(-1)[:2]
-        size = (int(columns), int(rows))
+        rows, columns = image_size(path, shape)
+        size = (columns, rows)
     # Measured at `step * index of the cell`, its first pixel; its middle is (step - 1) / 2 further.
     middle = (step - 1) / 2 + FIRST_CENTRE
     return [

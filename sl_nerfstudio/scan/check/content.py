@@ -11,6 +11,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.check.coordinate_problems import coordinate_problems
 from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
+from sl_nerfstudio.scan.check.image_match import ImageMatch, match_image
+from sl_nerfstudio.scan.check.image_problems import Shown
 from sl_nerfstudio.scan.check.pattern_shift import pattern_shift
 from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.file_error import FileError
@@ -30,6 +32,8 @@ class FrameContent:
     decoded: float  # share of the masked pixels that have coordinates
     correspondences: Correspondences | None  # None if the frame cannot be triangulated
     shift: Float64[ndarray, "2"] | None  # what to add to the coordinates for the pattern to fit; None if unclear
+    match: ImageMatch | None  # of coordinates and normalised pattern (captured image); None if not comparable
+    image_match: ImageMatch | None  # of coordinates and captured image, where the frame has both images
 
 
 def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
@@ -76,9 +80,13 @@ def check_content(
         if inside.size and inside.min() == inside.max():
             faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, partial.root), frame.name)
     digest = None if image is None or coords is None else _digest(image, coords)
-    shift = None
-    if coords is not None and both is not None and shown is not None and pattern is not None:
-        shift = pattern_shift(coords, both, as_grey(shown), pattern)
+    shift = match = image_match = None
+    if coords is not None and both is not None and where is not None and shown is not None and pattern is not None:
+        grey = as_grey(shown)
+        shift = pattern_shift(coords, both, grey, pattern)
+        match = match_image(coords, both, pattern, grey, where)
+        if image is not None and shown is not image and image.shape[:2] == both.shape:
+            image_match = match_image(coords, both, pattern, as_grey(image), where)
     return FrameContent(
         frame.name,
         digest,
@@ -86,7 +94,22 @@ def check_content(
         0.0 if both is None or where is None or not where.any() else float(both.sum() / where.sum()),
         _correspondences(frame, partial, coords, both),
         shift,
+        match,
+        image_match,
     )
+
+
+def read_shown(frame: PartialFrame, good: set[Path]) -> Shown | None:
+    """What a frame shows of the pattern, and where; None if a file of it is damaged or absent."""
+    path, mask_path = frame.paths.get("sl_pattern_path", frame.paths.get("file_path")), frame.paths.get("mask_path")
+    if path not in good:
+        return None
+    try:
+        shown = as_grey(read_image(path))
+        mask = np.ones(shown.shape, dtype=bool) if mask_path not in good else read_image(mask_path) > 0
+    except FileError:
+        return None
+    return (shown, mask) if shown.shape == mask.shape else None
 
 
 def duplicate_problems(contents: list[FrameContent]) -> Iterator[tuple[str, Problem]]:

@@ -33,7 +33,7 @@ def describe(interpretation: Interpretation, given: GeometricFit, index: int | N
     which = "all frames" if index is None else "this frame"
     symptom = _symptom(residual, spread)
     if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
-        return _describe_coords(interpretation, f"do not fit the poses in {which}: {symptom}")
+        return describe_coords(interpretation, f"do not fit the poses in {which}: {symptom}")
     problem = f"does not fit the coordinates in {which}: {symptom}"
     if interpretation.projector_unit != 1:
         return Problem(
@@ -63,7 +63,8 @@ def _symptom(residual: float, spread: float) -> str:
     return f"camera rays and projector rays miss each other by {residual:.0f} px"
 
 
-def _describe_coords(interpretation: Interpretation, problem: str) -> Problem:
+def describe_coords(interpretation: Interpretation, problem: str) -> Problem:
+    """Coordinates with exchanged or mirrored axes; `problem` says how it shows."""
     done = [
         *(["x and y swapped"] if interpretation.swapped else []),
         *(["x counted from the right"] if interpretation.mirrored_x else []),
@@ -98,4 +99,13 @@ def wrong_unit(metres: float) -> Problem:
         f"would put the object {metres:.3g} m from the camera",
         "lengths are in another unit than stated (m and mm mixed up?)",
         'state the unit that the poses are in, or "arbitrary" if it is unknown',
+    )
+
+
+def far_away(times: float) -> Problem:
+    """A device that is `times` as far from the others as they usually are."""
+    return Problem(
+        f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
+        "registration failed for this frame, or its position is in another unit",
+        "register it again, or leave the frame out",
     )

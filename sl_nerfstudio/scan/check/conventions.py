@@ -5,19 +5,21 @@ if the poses as given fit badly *and* undoing one known mistake makes them fit s
 frames are worse than any calibration error can make them.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.scan.check.convention_words import APART, describe, hopeless, key_of, wrong_unit
+from sl_nerfstudio.scan.check.convention_words import APART, describe, far_away, hopeless, key_of, wrong_unit
 from sl_nerfstudio.scan.check.correspondences import Correspondences
 from sl_nerfstudio.scan.check.interpretations import (
     GeometricFit,
     Interpretation,
     apply_interpretation,
-    distance_to_others,
     fit_geometry,
     other_interpretations,
 )
+from sl_nerfstudio.scan.check.other_clouds import OtherClouds
 from sl_nerfstudio.scan.problem import Problem
 
 # Epipolar residuals as fractions of the projector's focal length: angles in radians.
@@ -29,6 +31,7 @@ _MUCH_BETTER = 0.2  # factor by which the right interpretation must lower the re
 _MUCH_CLOSER = 0.4  # factor by which the right interpretation must lower the distance between surfaces
 _ONE_SURFACE = 0.1  # the largest distance it may leave, in working distances, with frames wrong by 10 degrees
 _MOST = 0.9  # share of hopeless frames that makes a scan hopeless
+_FAR = 100.0  # times the median distance of all devices from their middle; rings and walls have 1 to 2
 _NEAREST, _FARTHEST = 1e-3, 100.0  # metres; working distances outside this range mean a wrong unit
 
 
@@ -49,11 +52,17 @@ def convention_problems(
     if lost.mean() >= _MOST:
         yield None, "transform_matrix", hopeless(given, int(lost.sum()), len(frames))
         return
+    explained: set[int] = set()
     if len(frames) > 2:
+        others = OtherClouds(given.clouds)
         for index, frame in enumerate(frames):
-            own = _better_interpretation_of_frame(frames, index, projector, given, focal)
+            own = _better_interpretation_of_frame(frames, index, projector, given, others, focal)
             if own is not None:
+                explained.add(index)
                 yield frame.name, key_of(own), describe(own, given, index)
+    for index, key, times in _far_devices(frames):
+        if index not in explained:
+            yield frames[index].name, key, far_away(times)
     if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
         yield None, "units", wrong_unit(given.depth * metres)
 
@@ -73,7 +82,12 @@ def _better_interpretation(
 
 
 def _better_interpretation_of_frame(
-    frames: Sequence[Correspondences], index: int, projector: Device, given: GeometricFit, focal: float
+    frames: Sequence[Correspondences],
+    index: int,
+    projector: Device,
+    given: GeometricFit,
+    others: OtherClouds,
+    focal: float,
 ) -> Interpretation | None:
     """The interpretation of one frame alone under which it fits the others."""
     residual, spread = float(given.residual_px[index]), float(given.spread[index])
@@ -85,10 +99,23 @@ def _better_interpretation_of_frame(
         px, cloud = alone.typical_px, alone.clouds[0]
         if px > _FITS * focal:
             continue
-        apart = distance_to_others(cloud, given.clouds, index) / given.depth
+        apart = others.distance(cloud, index) / given.depth
         if apart < APART and _explains(residual, spread, px, apart, focal):
             found.append((_badness(px, apart, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None
+
+
+def _far_devices(frames: Sequence[Correspondences]) -> Iterator[tuple[int, str, float]]:
+    """(frame, key, distance from the middle of all devices in median distances) of devices that are far away."""
+    cameras = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
+    projectors = np.stack([frame.T_world_projector[:3, 3] for frame in frames])
+    everything = np.concatenate([cameras, projectors])
+    middle = np.median(everything, 0)
+    usual = max(float(np.median(np.linalg.norm(everything - middle, axis=1))), 1e-300)
+    for key, positions in (("transform_matrix", cameras), ("projector_transform_matrix", projectors)):
+        times = np.linalg.norm(positions - middle, axis=1) / usual
+        for index in np.flatnonzero(times > _FAR).tolist():
+            yield index, key, float(times[index])
 
 
 def _explains(px_before: float, spread_before: float, px: float, spread: float, focal: float) -> bool:

@@ -16,6 +16,8 @@ _ABSURD = 4.0  # pattern sizes: no decoder puts a pixel this far beyond the bord
 _SENTINELS = ((-1.0, -1.0), (0.0, 0.0))
 _MANY_EQUAL = 0.02  # share of the decoded pixels with one value; neighbours may share a coordinate, but not so many
 _FEW = 20
+_FEWEST_NEIGHBOURS = 200
+_NOISE = 0.7  # of a typical distance from the median; a surface across 16 pixels has 0.25, independent values 1 to 1.5
 
 
 def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | None) -> Iterator[Problem]:
@@ -49,6 +51,13 @@ def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | N
     if sentinel is not None:
         yield sentinel
         return
+    if _is_noise(coords, values):
+        yield Problem(
+            "is noise: neighbouring pixels have coordinates as far apart as any two",
+            "the array was written in another order or type, or nothing was decoded",
+            "decode the image again, or leave the frame out",
+        )
+        return
     if (values == np.floor(values)).all():
         yield Problem(
             "holds whole numbers only",
@@ -57,6 +66,17 @@ def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | N
         )
     if projector is not None:
         yield from _range_problems(values, projector)
+
+
+def _is_noise(coords: Float32[ndarray, "h w 2"], values: Float32[ndarray, "n 2"]) -> bool:
+    """Whether most neighbours in a row differ like pixels anywhere; on a surface they are a footprint apart."""
+    left, right = coords[:, :-1], coords[:, 1:]
+    both = np.isfinite(left[..., 0]) & np.isfinite(right[..., 0])
+    if both.sum() < _FEWEST_NEIGHBOURS:
+        return False
+    step = np.median(np.abs(right[both] - left[both]), 0)
+    spread = np.median(np.abs(values - np.median(values, 0)), 0)
+    return bool((step > _NOISE * spread).all())
 
 
 def _sentinel_problem(values: Float32[ndarray, "n 2"]) -> Problem | None:

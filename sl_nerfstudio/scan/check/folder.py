@@ -1,7 +1,7 @@
 """The full check of a scan folder: everything `read_scan` checks, every pixel, and whether all of it fits together."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,13 +9,15 @@ import numpy as np
 
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan.check.content import FrameContent, check_content, check_pattern, duplicate_problems
+from sl_nerfstudio.scan.check.content import FrameContent, check_content, check_pattern, duplicate_problems, read_shown
 from sl_nerfstudio.scan.check.conventions import convention_problems
+from sl_nerfstudio.scan.check.image_problems import MatchedFrame, image_problems
 from sl_nerfstudio.scan.check.interpretations import GeometricFit, fit_geometry
 from sl_nerfstudio.scan.check.pattern_shift import shift_problems
 from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.headers import check_headers
 from sl_nerfstudio.scan.measured_length import measured_length
+from sl_nerfstudio.scan.partial_frame import PartialFrame
 from sl_nerfstudio.scan.partial_scan import PartialScan, read_partial_scan
 from sl_nerfstudio.scan.pose_files import GROUND_TRUTH, read_ground_truth
 from sl_nerfstudio.scan.problem import Faults
@@ -39,12 +41,14 @@ def check_folder(root: Path) -> FolderCheck:
     partial = read_partial_scan(root, faults)
     good = check_headers(partial, faults)
     pattern = check_pattern(partial, good, faults)
-    contents = [check_content(f, partial, pattern, good, faults) for f in track(partial.frames, "Checking the scan")]
+    frames = list({frame.name: frame for frame in reversed(partial.frames)}.values())[::-1]  # a name twice is a fault
+    contents = [check_content(frame, partial, pattern, good, faults) for frame in track(frames, "Checking the scan")]
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
     for problem in shift_problems([content.shift for content in contents]):
         faults.add(problem, TRANSFORMS, None, "sl_coords_path")
     _check_conventions(partial, contents, faults)
+    _check_images(frames, contents, good, faults)
     found = faults.found
     scan = None if found else partial.complete()
     if scan is not None:
@@ -79,6 +83,21 @@ def _check_conventions(partial: PartialScan, contents: list[FrameContent], fault
     with np.errstate(all="ignore"):
         for frame, key, problem in convention_problems(frames, partial.projector, metres):
             faults.add(problem, TRANSFORMS, frame, key)
+
+
+def _check_images(
+    frames: Sequence[PartialFrame], contents: Sequence[FrameContent], good: set[Path], faults: Faults
+) -> None:
+    """Do the coordinates of each frame belong to its images? Not asked where another fault was found in them."""
+    by_name = {frame.name: frame for frame in frames}
+    matched = [MatchedFrame(content.name, content.match) for content in contents]
+    found = dict(image_problems(matched, lambda name: read_shown(by_name[name], good)))
+    captured = [MatchedFrame(content.name, content.image_match) for content in contents]
+    found = {**dict(image_problems(captured, lambda _: None)), **found}
+    explained = {fault.frame for fault in faults.found if fault.field == "sl_coords_path"}
+    for content in contents:
+        if content.name in found and not {content.name, None} & explained:
+            faults.add(found[content.name], TRANSFORMS, content.name, "sl_coords_path")
 
 
 def _measure_scale_bar(scan: Scan) -> None:

@@ -9,19 +9,20 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from numpy import ndarray
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.check.correspondences import Correspondences
+from sl_nerfstudio.scan.check.other_clouds import OtherClouds
 
 PoseConvention = Literal["as given", "inverted", "OpenCV axes", "inverted, OpenCV axes"]
 POSE_CONVENTIONS: tuple[PoseConvention, ...] = ("as given", "inverted", "OpenCV axes", "inverted, OpenCV axes")
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # device axes of OpenCV <-> of this format
 _CLOUD_POINTS = 100  # of a frame, for distances between frames
-_FEWEST_POINTS = 10
+_FEWEST_CLOUD_POINTS = 20  # the same in a scan of very many frames
+_MOST_POINTS = 200_000  # of all frames together
 
 
 @dataclass(frozen=True)
@@ -97,21 +98,15 @@ def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> Geomet
     in_front = residual.isfinite()
     points = triangulate(*geometry)
     depth = float(points.depth_camera[in_front].median()) if in_front.any() else 0.0
-    clouds = tuple(_thin(p[ok].numpy()) for p, ok in zip(points.p_world, in_front, strict=True))
-    spread = [distance_to_others(cloud, clouds, index) for index, cloud in enumerate(clouds)]
+    count = max(_FEWEST_CLOUD_POINTS, min(_CLOUD_POINTS, _MOST_POINTS // len(frames)))
+    clouds = tuple(_thin(p[ok].numpy(), count) for p, ok in zip(points.p_world, in_front, strict=True))
+    others = OtherClouds(clouds)
+    spread = [others.distance(cloud, index) for index, cloud in enumerate(clouds)]
     return GeometricFit(residual.median(-1).values.numpy(), np.array(spread) / max(depth, 1e-300), depth, clouds)
 
 
-def distance_to_others(cloud: Float64[ndarray, "n 3"], clouds: Sequence[Float64[ndarray, "_ 3"]], index: int) -> float:
-    """Median distance from a cloud to the nearest point of any of `clouds` except number `index`; inf if unknown."""
-    others = np.concatenate([np.empty((0, 3)), *(c for i, c in enumerate(clouds) if i != index)])
-    if len(cloud) < _FEWEST_POINTS or len(others) < _FEWEST_POINTS:
-        return np.inf
-    return float(np.median(KDTree(others).query(cloud)[0]))
-
-
-def _thin(cloud: Float64[ndarray, "n 3"]) -> Float64[ndarray, "_ 3"]:
-    return cloud[:: max(1, len(cloud) // _CLOUD_POINTS)]
+def _thin(cloud: Float64[ndarray, "n 3"], count: int) -> Float64[ndarray, "_ 3"]:
+    return cloud[:: max(1, len(cloud) // count)]
 
 
 def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> Float64[ndarray, "4 4"]:

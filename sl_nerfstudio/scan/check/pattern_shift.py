@@ -69,10 +69,10 @@ def _correlation(
     pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2"], seen: Float32[ndarray, "n"]
 ) -> float:
     with np.errstate(invalid="ignore", divide="ignore"):
-        return float(np.corrcoef(_look_up(pattern, uv), seen)[0, 1])
+        return float(np.corrcoef(look_up(pattern, uv), seen)[0, 1])
 
 
-def _look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n"]:
+def look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2"]) -> Float32[ndarray, "n"]:
     """Bilinear interpolation; outside, the value at the border."""
     rows, columns = pattern.shape
     x, y = np.clip(uv[:, 0] - 0.5, 0, columns - 1), np.clip(uv[:, 1] - 0.5, 0, rows - 1)
