@@ -13,7 +13,6 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth
 from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
-_LEAST_METRES, _MOST_METRES = 1e-9, 1e9  # nothing that a camera sees is smaller or larger
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 _NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
@@ -57,8 +56,9 @@ def parse_known_length(text: str) -> KnownLength:
     if unit not in _METRES:
         raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
     metres = length * _METRES[unit]
-    if not _LEAST_METRES <= metres <= _MOST_METRES:
-        least, most = _LEAST_METRES / _METRES[unit], _MOST_METRES / _METRES[unit]
+    limits = KNOWN_LENGTH_DEFAULTS
+    if not limits.least_metres <= metres <= limits.most_metres:
+        least, most = limits.least_metres / _METRES[unit], limits.most_metres / _METRES[unit]
         problem = "above zero" if length <= 0 else f"between {least:g} and {most:g} {unit}"
         raise UserError(f'known length "{text}": a length must be {problem}')
     return KnownLength(metres, unit, frames, pixels)

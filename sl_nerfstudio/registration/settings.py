@@ -298,6 +298,10 @@ class KnownLengthSettings:
 
     picking_radius_px: float = 3.0
     """pixels around a picked one of whose depths the median is taken"""
+    least_metres: float = 1e-9
+    """shortest known length, in metres: nothing that a camera sees is smaller"""
+    most_metres: float = 1e9
+    """longest known length, in metres"""
 
 
 @dataclass(frozen=True)

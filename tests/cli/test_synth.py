@@ -60,7 +60,7 @@ def test_help_is_there_without_slow_imports():
     [
         (["--frames", "1"], "error: --frames 1: a scan needs at least 2 frames"),
         (["--scene", "no.ply"], "error: --scene no.ply: there is no such file"),
-        (["--pattern", "no.json"], "error: no.json: cannot be read as a pattern description"),
+        (["--pattern", "no.json"], "error: no.json: is missing"),
         (["--missing", "15"], "error: --missing 15.0: it is a fraction"),
     ],
 )

@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
+from scipy.ndimage import uniform_filter
 
 from sl_nerfstudio.scan.check.interpretations import Interpretation
 from sl_nerfstudio.scan.check.pattern_shift import look_up
@@ -22,6 +23,7 @@ _OTHER_AXES = tuple(
     for swapped, x, y in product((False, True), (False, True), (False, True))
     if swapped or x or y
 )
+_DETAILS = 10  # of a pattern's width: what is larger is no detail
 _WINDOW = 256  # side of the square, around the middle of the decoded pixels, in which a move is looked for
 
 
@@ -65,6 +67,12 @@ class ImageMatch:
     prediction: Prediction  # at a few pixels: it is kept of every frame
 
 
+def has_detail(pattern: Float32[ndarray, "rows columns"]) -> bool:
+    """Whether lines or dots make most of a pattern's contrast: shading, and local normalisation, hide the rest."""
+    smooth = uniform_filter(pattern, max(pattern.shape) // _DETAILS)
+    return bool((pattern - smooth).var() > pattern.var() / 2)
+
+
 def match_image(
     coords: Float32[ndarray, "h w 2"],
     where: Bool[ndarray, "h w"],
@@ -74,10 +82,10 @@ def match_image(
 ) -> ImageMatch | None:
     """Compare the pattern at the `coords` of the pixels `where` with what is `shown` at the pixels `allowed`.
 
-    None if too little is decoded, or there is nothing in the image.
+    None if too little is decoded, or there is nothing in the image, or no detail in the pattern.
     """
     chosen = np.flatnonzero(where)
-    if len(chosen) < _FEWEST or not allowed.any() or np.ptp(shown[where]) == 0:
+    if len(chosen) < _FEWEST or not has_detail(pattern) or not allowed.any() or np.ptp(shown[where]) == 0:
         return None
     expected = np.zeros(where.shape, dtype=np.float32)
     expected[where] = look_up(pattern, coords[where])
