@@ -1,6 +1,8 @@
-"""Set-up of all tests: shapes and types are checked at run time, one thread, no deadlines."""
+"""Set-up of all tests: shapes and types are checked at run time, one thread, no deadlines, signals as in a terminal."""
 
 import os
+import signal
+from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -9,8 +11,18 @@ from jaxtyping import install_import_hook
 install_import_hook("sl_nerfstudio", "beartype.beartype")
 
 import hypothesis  # noqa: E402
+import pytest  # noqa: E402
 import torch  # noqa: E402
 
 torch.set_num_threads(1)
 hypothesis.settings.register_profile("project", deadline=None, derandomize=True, max_examples=50, print_blob=True)
 hypothesis.settings.load_profile("project")
+
+
+@pytest.fixture(autouse=True)
+def signals_as_in_a_terminal() -> Iterator[None]:
+    """Commands that a test starts inherit ignored signals: from the shell (jobs in the background), or from a test
+    that called `cli.run.run` in this process, which ignores them once a command was interrupted."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
