@@ -1,0 +1,174 @@
+"""Bundle adjustment of both devices and all boards: Levenberg-Marquardt with a robust kernel.
+
+Corners in the camera and in the projector have noise of different size, which is estimated from the residuals. Boards
+are eliminated from the normal equations (Schur complement), so many of them cost little.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.calibration.board.residuals import Sightings, linearised, residuals
+from sl_nerfstudio.calibration.board.rig import BoardRig, FreeIntrinsics, numbers, with_numbers
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
+from sl_nerfstudio.geometry.se3 import exp_se3
+
+_KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
+_LEAST_SIGMA = 1e-6  # pixels: noise-free corners
+_ROUNDS = 4  # of estimating the noise
+_SETTLED = 0.02  # relative change of the noise
+_MOST_STEPS = 50
+_CONVERGED = 1e-9  # relative decrease of the cost
+_LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-3, 1e10
+_SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
+
+Free = tuple[FreeIntrinsics, ...]
+"""Of the camera, and of the projector if there is one."""
+Seen = tuple[Sightings, ...]
+Sigma = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """The solution, its noise, and the normal equations without the boards."""
+
+    rig: BoardRig
+    free: Free
+    sigma_px: Sigma  # of a coordinate of a corner in each device
+    information: Float64[ndarray, "s s"]  # of the fitted intrinsics of each device, then of the rig's twist
+
+    @property
+    def covariance(self) -> Float64[ndarray, "s s"]:
+        """Of the fitted numbers, by the noise of the corners alone; huge where they do not determine them."""
+        scale = 1 / np.sqrt(np.diag(self.information).clip(1e-300))
+        values, vectors = np.linalg.eigh(self.information * scale[:, None] * scale)
+        inverse = (vectors / values.clip(_SINGULAR * values.max())) @ vectors.T
+        return inverse * scale[:, None] * scale
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations: shared numbers, and those of each board with what couples them to the shared ones."""
+
+    cost: float
+    H: Float64[ndarray, "s s"]
+    g: Float64[ndarray, "s"]
+    H_board: Float64[ndarray, "b 6 6"]
+    coupling: Float64[ndarray, "b s 6"]
+    g_board: Float64[ndarray, "b 6"]
+
+    def reduced(self, damping: float) -> tuple[Float64[ndarray, "s s"], Float64[ndarray, "s"]]:
+        """Without the boards."""
+        solved = np.linalg.solve(self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_board[..., None]], -1))
+        H = self.H + damping * np.diag(np.diag(self.H)) - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1])
+        return H, self.g - np.einsum("bsk,bk->s", self.coupling, solved[..., -1])
+
+    def step(self, damping: float) -> tuple[Float64[ndarray, "s"], Float64[ndarray, "b 6"]]:
+        """Of the shared numbers, and of the boards."""
+        H, g = self.reduced(damping)
+        scale = 1 / np.sqrt(np.diag(self.H).clip(1e-300))
+        shared = scale * np.linalg.lstsq(H * scale[:, None] * scale, g * scale, rcond=_SINGULAR)[0]
+        rest = self.g_board - np.einsum("bsk,s->bk", self.coupling, shared)
+        return shared, np.linalg.solve(self._damped(damping), rest[..., None])[..., 0]
+
+    def _damped(self, damping: float) -> Float64[ndarray, "b 6 6"]:
+        diagonal = np.diagonal(self.H_board, axis1=1, axis2=2)
+        least = _SINGULAR * diagonal.max(1, keepdims=True).clip(1e-300)
+        return self.H_board + (damping * diagonal + least)[..., None] * np.eye(6)
+
+
+def adjust(start: BoardRig, free: Free, seen: Seen, sigma_px: Sigma | None = None) -> Adjusted:
+    """The rig that explains the corners best. `sigma_px` holds the noise fixed; default: it is estimated."""
+    rig = start
+    sigma = sigma_px or noise(rig, free, seen)
+    for _ in range(1 if sigma_px else _ROUNDS):
+        rig, normal = _minimised(rig, free, seen, sigma)
+        before, sigma = sigma, sigma_px or noise(rig, free, seen)
+        if np.allclose(before, sigma, rtol=_SETTLED):
+            break
+    return Adjusted(rig, free, sigma, normal.reduced(0.0)[0])
+
+
+def noise(rig: BoardRig, free: Free, seen: Seen) -> Sigma:
+    """Robust standard deviation of a coordinate in each device, with the degrees of freedom of the whole fit."""
+    fitted = sum(one.columns().shape[1] for one in free) + 6 * (len(free) - 1 + len(rig.T_camera_board))
+    total = 2 * sum(len(one.view) for one in seen)
+    freedom = np.sqrt(max(total - fitted, 1) / total)
+    medians = [float(np.median(np.abs(residuals(rig, k, one)))) for k, one in enumerate(seen)]
+    return tuple(max(MAD_TO_SIGMA * median / freedom, _LEAST_SIGMA) for median in medians)
+
+
+def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[BoardRig, _Normal]:
+    normal, damping = _normal_equations(rig, free, seen, sigma), _FIRST_DAMPING
+    for _ in range(_MOST_STEPS):
+        moved = _moved(rig, free, *normal.step(damping))
+        cost = _cost(moved, seen, sigma)
+        if cost < normal.cost:
+            decrease = (normal.cost - cost) / normal.cost
+            rig, damping = moved, max(damping / 10, _LEAST_DAMPING)
+            normal = _normal_equations(rig, free, seen, sigma)
+            if decrease < _CONVERGED:
+                break
+        else:
+            damping *= 10
+            if damping > _LARGEST_DAMPING:
+                break
+    return rig, normal
+
+
+def _cost(rig: BoardRig, seen: Seen, sigma: Sigma) -> float:
+    return sum(
+        float(_kernel(residuals(rig, k, one) / s)[0].sum()) for k, (one, s) in enumerate(zip(seen, sigma, strict=True))
+    )
+
+
+def _kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
+    """Geman-McClure cost of corners, and their weights."""
+    x = (whitened**2).sum(-1) / _KERNEL**2
+    return _KERNEL**2 * x / (1 + x), 1 / (1 + x) ** 2
+
+
+def _normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> _Normal:
+    begin = np.cumsum([0, *(one.columns().shape[1] for one in free)])
+    size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
+    H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    Hb, C, gb = np.zeros((boards, 6, 6)), np.zeros((boards, size, 6)), np.zeros((boards, 6))
+    for k, of_device in enumerate(seen):
+        one = linearised(rig, k, free[k], of_device)
+        costs, weights = _kernel(one.residual / sigma[k])
+        cost += float(costs.sum())
+        root = np.sqrt(weights)[:, None] / sigma[k]
+        shared = np.zeros((*one.residual.shape, size))
+        shared[..., begin[k] : begin[k + 1]] = one.by_intrinsics
+        if k:
+            shared[..., -6:] = one.by_rig
+        S, B, e = shared * root[..., None], one.by_board * root[..., None], one.residual * root
+        H += np.einsum("nis,nit->st", S, S, optimize=True)
+        g += np.einsum("nis,ni->s", S, e)
+        for b in np.unique(of_device.view):
+            own = of_device.view == b
+            Sb, Bb, eb = S[own].reshape(-1, size), B[own].reshape(-1, 6), e[own].ravel()
+            Hb[b] += Bb.T @ Bb
+            C[b] += Sb.T @ Bb
+            gb[b] += Bb.T @ eb
+    return _Normal(cost, H, g, Hb, C, gb)
+
+
+def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:
+    devices, place = [], 0
+    for device, one in zip(rig.devices, free, strict=True):
+        columns = one.columns()
+        devices.append(with_numbers(device, numbers(device) + columns @ shared[place : place + columns.shape[1]]))
+        place += columns.shape[1]
+    T_projector_camera = rig.T_projector_camera
+    if len(free) == 2:
+        T_projector_camera = _exp(shared[None, -6:])[0] @ T_projector_camera
+    T_camera_board = _exp(boards) @ rig.T_camera_board
+    return replace(rig.with_devices(devices), T_camera_board=T_camera_board, T_projector_camera=T_projector_camera)
+
+
+def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:
+    return exp_se3(torch.from_numpy(twists)).numpy()
