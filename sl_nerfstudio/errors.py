@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 _SHOWN = 3  # faults of one kind that are written out; of more, only the first is, and some of the others are named
 _NAMED = 4
+_LONGEST = 200  # characters of a line of another library
 
 
 class UserError(Exception):
@@ -40,6 +41,16 @@ class Fault:
         place = self.field if self.frame is not None else None  # without frames, it is the fields that differ
         file = self.file if self.frame is None else self.file.rpartition("/")[0]
         return (file, place, *(re.sub(r"\d[\d.]*", "#", text) for text in (self.problem, self.cause, self.remedy)))
+
+
+def first_line(error: Exception) -> str:
+    """The first line of what another library says, or the error's kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:_LONGEST]
+
+
+def last_line(error: Exception) -> str:
+    """The last line of what another library says, or the error's kind if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()[:_LONGEST]
 
 
 class ScanError(UserError):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan.file_error import FileError, check_file
@@ -85,7 +85,7 @@ def read_mesh(path: Path) -> Mesh:
             path, "does not fit into memory", "a huge or damaged mesh", "decimate or export it again"
         ) from error
     except Exception as error:  # every loader fails in its own way on a damaged file
-        problem = f"cannot be read as {suffix[1:].upper()} ({_first_line(error)})"
+        problem = f"cannot be read as {suffix[1:].upper()} ({first_line(error)})"
         cause = "the file is truncated, damaged or of another kind"
         raise FileError(path, problem, cause, "export or copy it again") from error
     if suffix == ".ply":
@@ -148,7 +148,3 @@ def _checked(path: Path, vertices: ndarray, faces: ndarray) -> Mesh:
     if not mesh.face_areas().any():
         raise FileError(path, "has no triangle with an area", "a scale of 0, or an empty result", again)
     return mesh
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0][:200]

@@ -6,7 +6,7 @@ its own once components have grown, and a weak cut between two blocks is judged 
 stays undecided remain apart.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -148,13 +148,11 @@ class Assembly:
         inside = np.array([_cosine(component[i], component[j]) for i, j in pairs])
         if not len(cosines) or not (inside > self._least_cosine).any():
             return 0.0
-        agreeing = contradicting = 0.0
-        for k in {int(np.abs(inside - cosine).argmin()) for cosine in cosines}:
-            i, j = pairs[k]
-            S_i_j = component[i].inverse() @ component[j]
-            sums = self._agreement(i, j, S_i_j, self._settings.assembly.tolerance_sigmas)
-            agreeing += float(sums.agreeing[0])
-            contradicting += self._contradicting(sums)
+        alike = [pairs[k] for k in {int(np.abs(inside - cosine).argmin()) for cosine in cosines}]
+        sigmas = self._settings.assembly.tolerance_sigmas
+        agreeing, contradicting = self._totals(
+            self._agreement(i, j, component[i].inverse() @ component[j], sigmas) for i, j in alike
+        )
         return contradicting / max(agreeing + contradicting, 1e-9)
 
     def _joints(self, first: Component, second: Component) -> list[Joint]:
@@ -207,11 +205,8 @@ class Assembly:
             near = [link for link in of_pair if self._same(link, S, first, second)]
             votes += max((link.quality for link in near), default=0.0)
             same += any(link.best for link in near)
-        agreeing = contradicting = 0.0
-        for sums in self._agreements(first, second, S, self._settings.assembly.tolerance_sigmas):
-            agreeing += float(sums.agreeing[0])
-            contradicting += self._contradicting(sums)
-        return Joint(S, votes, same, agreeing, contradicting)
+        across = self._agreements(first, second, S, self._settings.assembly.tolerance_sigmas)
+        return Joint(S, votes, same, *self._totals(across))
 
     def _agreements(self, first: Component, second: Component, S: Similarity, sigmas: float) -> Iterator[Agreement]:
         """Each pair of frames across that see the same side, within some standard deviations of their surfaces."""
@@ -223,8 +218,14 @@ class Assembly:
         sides = self._sides[j], self._sides[i]
         return agreement(*sides, Hypotheses.of(S_i_j), width, width, self._settings.pair.agreement)
 
-    def _contradicting(self, sums: Agreement) -> float:
-        return float(sums.in_front[0] + self._settings.pair.agreement.behind * sums.behind[0])
+    def _totals(self, pairs: Iterable[Agreement]) -> tuple[float, float]:
+        """Points that agree, and those that contradict, of all pairs."""
+        behind = self._settings.pair.agreement.behind
+        agreeing = contradicting = 0.0
+        for sums in pairs:
+            agreeing += float(sums.agreeing[0])
+            contradicting += float(sums.in_front[0] + behind * sums.behind[0])
+        return agreeing, contradicting
 
     def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
         """Whether all frames across together do not notice the motion along which one pair of them slips."""

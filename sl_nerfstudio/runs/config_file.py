@@ -15,7 +15,7 @@ from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hin
 import yaml
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
@@ -64,7 +64,7 @@ def _line(error: Exception) -> str:
 def _reason(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return "nested too deeply"
-    words = getattr(error, "problem", None) or (str(error).strip().splitlines() or [type(error).__name__])[0]
+    words = getattr(error, "problem", None) or first_line(error)
     return str(words)[:200]
 
 

@@ -15,7 +15,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model.training.checkpoints import checkpoints_in, read_checkpoint
@@ -101,7 +101,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
         pipeline.load_pipeline(checkpoint.weights, checkpoint.step)
     except RuntimeError as error:
         raise UserError(
-            f"{checkpoint.path}: does not fit the settings in {path} ({_last_line(error)})\n"
+            f"{checkpoint.path}: does not fit the settings in {path} ({last_line(error)})\n"
             "    cause:  another version of this package was used\n"
             "    remedy: use the version that trained it, or train again"
         ) from error
@@ -184,7 +184,3 @@ def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
 
 def _plain(key: str) -> str:
     return key.replace("module.", "")  # added by training on several GPUs
-
-
-def _last_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [""])[-1].strip()[:200]

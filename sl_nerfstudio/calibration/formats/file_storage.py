@@ -13,7 +13,7 @@ import yaml
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.scan.file_error import FileError, read_bytes
 
 MAX_BYTES = 512 << 10  # a calibration with all of its image points is smaller
@@ -41,7 +41,7 @@ def read_file_storage(path: Path) -> dict[str, Any]:
     except (_NotAStorageError, ElementTree.ParseError, yaml.YAMLError, UnicodeError, ValueError) as error:
         raise FileError(
             path,
-            f"cannot be read as an OpenCV file ({_first_line(error)})",
+            f"cannot be read as an OpenCV file ({first_line(error)})",
             "it is damaged, or was written by another program (OpenCV's YAML starts with %YAML:1.0)",
             "write it again with cv2.FileStorage, or give plain JSON",
         ) from error
@@ -150,7 +150,3 @@ def _number(word: str) -> float | None:
     if word.lower() in _NOT_FINITE:
         return _NOT_FINITE[word.lower()]
     return float(word) if _NUMBER.fullmatch(word) else None
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

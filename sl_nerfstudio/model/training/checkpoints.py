@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.model.training.fingerprints import as_text
 
@@ -151,7 +151,7 @@ def write_checkpoint(path: Path, state: dict[str, Any], partial: Path) -> None:
     except (OSError, RuntimeError) as error:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise UserError(
             f"{path}: cannot be written ({reason})\n"
             "    cause:  the disk is full, or the folder is read-only or was removed\n"

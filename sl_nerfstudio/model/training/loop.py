@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.model.training.checkpoints import SCHEDULE_KEY, checkpoint_name, checkpoints_in, write_checkpoint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
@@ -97,7 +97,7 @@ class SLTrainer(Trainer):
         except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise UserError(
                 f"{self.config.load_checkpoint}: does not fit this training "
-                f"({(str(error).strip().splitlines() or [''])[-1].strip()[:200]})\n"
+                f"({last_line(error)})\n"
                 "    cause:  it was written with other settings, or by another version of this package\n"
                 "    remedy: give the settings of the run that wrote it, or train again"
             ) from error

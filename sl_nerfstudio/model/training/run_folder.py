@@ -1,14 +1,13 @@
 """The folder of a run: one process at a time writes to it, and nothing that is there is overwritten."""
 
-import fcntl
 import os
 import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.lock_file import open_alone, write_all
 from sl_nerfstudio.model.training.checkpoints import checkpoints_in
 
 LOCK, PARTIAL = ".lock", ".checkpoint.partial"
@@ -23,41 +22,35 @@ class RunFolder:
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)
-            self._lock: BinaryIO = (path / LOCK).open("a+b")
+            self._lock, locked = open_alone(path / LOCK)
+            os.ftruncate(self._lock, 0)
+            write_all(self._lock, str(os.getpid()).encode())
+        except BlockingIOError as error:
+            raise UserError(
+                f"{path}: another ns-train is writing there (process {_number_in(path / LOCK)})\n"
+                "    cause:  two trainings were started with the same --output-dir, --experiment-name and --timestamp\n"
+                "    remedy: wait until it has ended, or choose another --timestamp"
+            ) from error
         except OSError as error:
             raise UserError(
                 f"{path}: cannot be written ({error.strerror})\n"
                 "    cause:  missing permissions, a read-only disk, or a file where a folder is needed\n"
                 "    remedy: choose another place with --output-dir"
             ) from error
-        try:
-            self._take()
-        except UserError:
-            self._lock.close()
-            raise
+        if not locked:
+            print(f"note: {path} is on a disk that knows no locks; start no second run there", file=sys.stderr)
         with suppress(OSError):
             (path / PARTIAL).unlink()  # left by a process that was killed while it wrote
 
-    def _take(self) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            self._lock.seek(0)
-            number = self._lock.read(20).decode("ascii", "replace") or "unknown"
-            raise UserError(
-                f"{self.path}: another ns-train is writing there (process {number})\n"
-                "    cause:  two trainings were started with the same --output-dir, --experiment-name and --timestamp\n"
-                "    remedy: wait until it has ended, or choose another --timestamp"
-            ) from error
-        except OSError as error:
-            print(f"note: {self.path} cannot be locked ({error.strerror}); start no second run there", file=sys.stderr)
-        self._lock.truncate(0)
-        self._lock.write(str(os.getpid()).encode())
-        self._lock.flush()
-
     def leave(self) -> None:
         """Let other processes have the folder."""
-        self._lock.close()
+        os.close(self._lock)
+
+
+def _number_in(lock: Path) -> str:
+    with suppress(OSError):
+        return lock.read_bytes()[:20].decode("ascii", "replace") or "unknown"
+    return "unknown"
 
 
 def require_unused(folder: Path, models: Path, method: str) -> None:

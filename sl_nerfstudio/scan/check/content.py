@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.scan.check.coordinate_problems import coordinate_problems
 from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
-from sl_nerfstudio.scan.check.image_match import ImageMatch, match_image
+from sl_nerfstudio.scan.check.image_match import ImageMatch, has_detail, match_image
 from sl_nerfstudio.scan.check.image_problems import Shown
 from sl_nerfstudio.scan.check.pattern_shift import pattern_shift
 from sl_nerfstudio.scan.coordinates import read_coords
@@ -36,8 +36,16 @@ class FrameContent:
     image_match: ImageMatch | None  # of coordinates and captured image, where the frame has both images
 
 
-def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Float32[ndarray, "rows columns"] | None:
-    """The projected pattern in [0, 1]; None after adding a fault."""
+@dataclass(frozen=True)
+class PatternImage:
+    """The projected pattern, in [0, 1]."""
+
+    grey: Float32[ndarray, "rows columns"]
+    detailed: bool  # so that frames can be told by what they show of it
+
+
+def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> PatternImage | None:
+    """The projected pattern; None after adding a fault."""
     if partial.pattern_path is None or partial.pattern_path not in good:
         return None
     pattern = _read_image(partial.pattern_path, partial, None, faults)
@@ -46,13 +54,14 @@ def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Floa
     if pattern.min() == pattern.max():
         faults.add(_nothing_in_it("the pattern"), relative(partial.pattern_path, partial.root))
         return None
-    return as_grey(pattern)
+    grey = as_grey(pattern)
+    return PatternImage(grey, has_detail(grey))
 
 
 def check_content(
     frame: PartialFrame,
     partial: PartialScan,
-    pattern: Float32[ndarray, "rows columns"] | None,
+    pattern: PatternImage | None,
     good: set[Path],
     faults: Faults,
 ) -> FrameContent:
@@ -83,10 +92,11 @@ def check_content(
     shift = match = image_match = None
     if coords is not None and both is not None and where is not None and shown is not None and pattern is not None:
         grey = as_grey(shown)
-        shift = pattern_shift(coords, both, grey, pattern)
-        match = match_image(coords, both, pattern, grey, where)
-        if image is not None and shown is not image and image.shape[:2] == both.shape:
-            image_match = match_image(coords, both, pattern, as_grey(image), where)
+        shift = pattern_shift(coords, both, grey, pattern.grey)
+        if pattern.detailed:
+            match = match_image(coords, both, pattern.grey, grey, where)
+            if image is not None and shown is not image and image.shape[:2] == both.shape:
+                image_match = match_image(coords, both, pattern.grey, as_grey(image), where)
     return FrameContent(
         frame.name,
         digest,

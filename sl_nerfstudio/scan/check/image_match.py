@@ -82,10 +82,10 @@ def match_image(
 ) -> ImageMatch | None:
     """Compare the pattern at the `coords` of the pixels `where` with what is `shown` at the pixels `allowed`.
 
-    None if too little is decoded, or there is nothing in the image, or no detail in the pattern.
+    The pattern must have detail. None if too little is decoded, or there is nothing in the image.
     """
     chosen = np.flatnonzero(where)
-    if len(chosen) < _FEWEST or not has_detail(pattern) or not allowed.any() or np.ptp(shown[where]) == 0:
+    if len(chosen) < _FEWEST or not allowed.any() or np.ptp(shown[where]) == 0:
         return None
     expected = np.zeros(where.shape, dtype=np.float32)
     expected[where] = look_up(pattern, coords[where])
