@@ -21,8 +21,9 @@ _LEAST_SIGMA = 1e-6  # pixels: noise-free corners
 _ROUNDS = 4  # of estimating the noise
 _SETTLED = 0.02  # relative change of the noise
 _MOST_STEPS = 50
-_CONVERGED = 1e-9  # relative decrease of the cost
+_CONVERGED = 1e-7  # relative decrease of the cost
 _LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-3, 1e10
+_PLACING_STEPS = 4
 _SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
 
 Free = tuple[FreeIntrinsics, ...]
@@ -40,17 +41,9 @@ class Adjusted:
     sigma_px: Sigma  # of a coordinate of a corner in each device
     information: Float64[ndarray, "s s"]  # of the fitted intrinsics of each device, then of the rig's twist
 
-    @property
-    def covariance(self) -> Float64[ndarray, "s s"]:
-        """Of the fitted numbers, by the noise of the corners alone; huge where they do not determine them."""
-        scale = 1 / np.sqrt(np.diag(self.information).clip(1e-300))
-        values, vectors = np.linalg.eigh(self.information * scale[:, None] * scale)
-        inverse = (vectors / values.clip(_SINGULAR * values.max())) @ vectors.T
-        return inverse * scale[:, None] * scale
-
 
 @dataclass(frozen=True)
-class _Normal:
+class Normal:
     """Normal equations: shared numbers, and those of each board with what couples them to the shared ones."""
 
     cost: float
@@ -62,7 +55,9 @@ class _Normal:
 
     def reduced(self, damping: float) -> tuple[Float64[ndarray, "s s"], Float64[ndarray, "s"]]:
         """Without the boards."""
-        solved = np.linalg.solve(self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_board[..., None]], -1))
+        solved = np.linalg.solve(
+            self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_board[..., None]], -1)
+        )
         H = self.H + damping * np.diag(np.diag(self.H)) - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1])
         return H, self.g - np.einsum("bsk,bk->s", self.coupling, solved[..., -1])
 
@@ -92,6 +87,28 @@ def adjust(start: BoardRig, free: Free, seen: Seen, sigma_px: Sigma | None = Non
     return Adjusted(rig, free, sigma, normal.reduced(0.0)[0])
 
 
+def covariance(information: Float64[ndarray, "s s"]) -> Float64[ndarray, "s s"]:
+    """Of the fitted numbers, by the noise of the corners alone; huge where they do not determine them."""
+    scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    inverse = (vectors / values.clip(_SINGULAR * values.max())) @ vectors.T
+    return inverse * scale[:, None] * scale
+
+
+def place_boards(rig: BoardRig, seen: Sightings, sigma_px: float) -> BoardRig:
+    """Every board where its corners in the camera put it; the rest of the rig stays."""
+    for _ in range(_PLACING_STEPS):
+        one = linearised(rig, 0, FreeIntrinsics(), seen)
+        root = np.sqrt(kernel(one.residual / sigma_px)[1])[:, None]
+        steps = np.zeros((len(rig.T_camera_board), 6))
+        for b in range(len(steps)):
+            own = seen.view == b
+            B, e = (one.by_board * root[..., None])[own].reshape(-1, 6), (one.residual * root)[own].ravel()
+            steps[b] = np.linalg.lstsq(B, e, rcond=_SINGULAR)[0]
+        rig = replace(rig, T_camera_board=_exp(steps) @ rig.T_camera_board)
+    return rig
+
+
 def noise(rig: BoardRig, free: Free, seen: Seen) -> Sigma:
     """Robust standard deviation of a coordinate in each device, with the degrees of freedom of the whole fit."""
     fitted = sum(one.columns().shape[1] for one in free) + 6 * (len(free) - 1 + len(rig.T_camera_board))
@@ -101,15 +118,15 @@ def noise(rig: BoardRig, free: Free, seen: Seen) -> Sigma:
     return tuple(max(MAD_TO_SIGMA * median / freedom, _LEAST_SIGMA) for median in medians)
 
 
-def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[BoardRig, _Normal]:
-    normal, damping = _normal_equations(rig, free, seen, sigma), _FIRST_DAMPING
+def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[BoardRig, Normal]:
+    normal, damping = normal_equations(rig, free, seen, sigma), _FIRST_DAMPING
     for _ in range(_MOST_STEPS):
         moved = _moved(rig, free, *normal.step(damping))
         cost = _cost(moved, seen, sigma)
         if cost < normal.cost:
             decrease = (normal.cost - cost) / normal.cost
             rig, damping = moved, max(damping / 10, _LEAST_DAMPING)
-            normal = _normal_equations(rig, free, seen, sigma)
+            normal = normal_equations(rig, free, seen, sigma)
             if decrease < _CONVERGED:
                 break
         else:
@@ -121,24 +138,25 @@ def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[Boa
 
 def _cost(rig: BoardRig, seen: Seen, sigma: Sigma) -> float:
     return sum(
-        float(_kernel(residuals(rig, k, one) / s)[0].sum()) for k, (one, s) in enumerate(zip(seen, sigma, strict=True))
+        float(kernel(residuals(rig, k, one) / s)[0].sum()) for k, (one, s) in enumerate(zip(seen, sigma, strict=True))
     )
 
 
-def _kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
-    """Geman-McClure cost of corners, and their weights."""
+def kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
+    """Geman-McClure cost of corners, and their weights, from residuals in standard deviations."""
     x = (whitened**2).sum(-1) / _KERNEL**2
     return _KERNEL**2 * x / (1 + x), 1 / (1 + x) ** 2
 
 
-def _normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> _Normal:
+def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Normal:
+    """Of all corners at a rig."""
     begin = np.cumsum([0, *(one.columns().shape[1] for one in free)])
     size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
     H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
     Hb, C, gb = np.zeros((boards, 6, 6)), np.zeros((boards, size, 6)), np.zeros((boards, 6))
     for k, of_device in enumerate(seen):
         one = linearised(rig, k, free[k], of_device)
-        costs, weights = _kernel(one.residual / sigma[k])
+        costs, weights = kernel(one.residual / sigma[k])
         cost += float(costs.sum())
         root = np.sqrt(weights)[:, None] / sigma[k]
         shared = np.zeros((*one.residual.shape, size))
@@ -154,7 +172,7 @@ def _normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> _N
             Hb[b] += Bb.T @ Bb
             C[b] += Sb.T @ Bb
             gb[b] += Bb.T @ eb
-    return _Normal(cost, H, g, Hb, C, gb)
+    return Normal(cost, H, g, Hb, C, gb)
 
 
 def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:

@@ -24,8 +24,9 @@ class Corners:
 
 
 def find_corners(image: Float32[ndarray, "h w"], board: Board) -> Corners | None:
-    """The corners of a board in an image with values in [0, 1]; None where it is not seen (or, for a ChArUco board,
-    less than eight corners of it). A chessboard must be seen whole.
+    """The corners of a board in an image with values in [0, 1]; None where it is not seen.
+
+    A chessboard must be seen whole, a ChArUco board with eight corners or more.
     """
     grey = _stretched(image)
     return _find_charuco(grey, board) if isinstance(board, CharucoBoard) else _find_chessboard(grey, board)

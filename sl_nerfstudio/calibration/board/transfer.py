@@ -1,14 +1,14 @@
 """Corners of a board in the pattern: the homography of a corner's surroundings carries it into the projector.
 
-Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration" (3DIMPVT 2012): a board is flat, so close
-to a corner camera and projector pixels are related by a homography, which lens distortion hardly bends there. No decoded
-pixel at the corner itself is needed, where black and white meet.
+Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration" (3DIMPVT 2012): a board is flat, so
+close to a corner camera and projector pixels are related by a homography, which lens distortion hardly bends there.
+No pixel needs to be decoded at the corner itself, where black and white meet.
 """
 
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sl_nerfstudio.calibration.board.detection import Corners
 
@@ -22,7 +22,7 @@ _KERNEL = 3.0  # robust standard deviations
 
 def corners_in_pattern(corners: Corners, coords: Float32[ndarray, "h w 2"]) -> Corners:
     """The corners whose surroundings are decoded, in pattern pixels. `coords` is NaN where nothing is decoded."""
-    distance = cKDTree(corners.uv).query(corners.uv, k=2)[0][:, 1]
+    distance = KDTree(corners.uv).query(corners.uv, k=2)[0][:, 1]
     found = [_carried(uv, reach, coords) for uv, reach in zip(corners.uv, _REACH * distance, strict=True)]
     known = np.array([uv is not None for uv in found], dtype=bool)
     uv = np.array([uv for uv in found if uv is not None], dtype=np.float64).reshape(-1, 2)
