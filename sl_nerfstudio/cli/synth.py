@@ -30,8 +30,14 @@ def main() -> None:
 def _synthesise() -> None:
     arguments = tyro.cli(Arguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
     arguments.config.check()
-    from sl_nerfstudio.synthesis.synthesise import synthesise  # slow to import: torch, open3d
+    # slow to import: torch, open3d
+    from sl_nerfstudio.synthesis.boards.captures import BOARDS, write_board_captures
+    from sl_nerfstudio.synthesis.synthesise import synthesise
 
+    if arguments.config.scene in BOARDS:
+        write_board_captures(arguments.config, arguments.output)
+        print(f"wrote {arguments.config.frames} poses of a board to {arguments.output}")
+        return
     synthesise(arguments.config, arguments.output)
     print(f"wrote {arguments.config.frames} frames to {arguments.output}")
 
