@@ -6,6 +6,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.grid import MAX_NODES, MAX_PIXELS, GridPattern
 
 Preset = Literal["800x800", "1280x720", "doe"]
+DEFAULT_PRESET: Preset = "800x800"
 
 # Size and period in pattern pixels. Lines and gaps keep their share of the period: the networks were trained on it.
 PRESETS: dict[str, tuple[int, int, float]] = {
@@ -21,7 +22,7 @@ LINE_SHARE, GAP_SHARE = 0.2, 0.3  # of the period
 
 
 def make_grid(
-    preset: Preset = "800x800",
+    preset: Preset = DEFAULT_PRESET,
     w: int | None = None,
     h: int | None = None,
     period: float | None = None,

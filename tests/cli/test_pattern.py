@@ -66,7 +66,9 @@ def test_gray_code(monkeypatch, tmp_path, capsys):
         (["--width", "100000"], "too large: give at most 200 nodes a side"),
         (["--seed", "-1"], "--seed -1: seeds are at least 0"),
         (["--print-width", "0"], "--print-width 0: give a width in millimetres above 0"),
-        (["--kind", "gray-code", "--gap", "3"], "--gap: Gray code has none; set its squares with --cell"),
+        (["--kind", "gray-code", "--gap", "3"], "--gap: has no meaning for --kind gray-code"),
+        (["--cell", "3"], "--cell: has no meaning for --kind grid"),
+        (["--square", "3 mm"], "flags are --preset, --width, --height, --period, --line-width, --gap, --seed"),
         (["--kind", "gray-code", "--cell", "0"], "at least 2 x 2 cells"),
     ],
 )
