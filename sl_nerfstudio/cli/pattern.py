@@ -33,8 +33,9 @@ class Arguments:
     kind: Literal["grid", "gray-code", "chessboard", "charuco"] = "grid"
     """grid: one static pattern, for devices moved by hand; gray-code: a sequence, for devices that stand still while
     each frame is captured; chessboard, charuco: boards for calibration"""
-    preset: Literal["800x800", "1280x720", "doe"] | None = None
-    """size and period for a square projector, a 16:9 projector, or a diffractive element; default: 800x800"""
+    preset: Literal["800x800", "1280x720", "1920x1080", "3840x2160", "doe"] | None = None
+    """size and period for a square projector, for 16:9 projectors (720p, 1080p, 4K), or for a diffractive element;
+    default: 800x800"""
     width: int | None = None
     """width of the pattern; default: the preset's"""
     height: int | None = None

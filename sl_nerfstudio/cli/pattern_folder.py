@@ -13,10 +13,11 @@ from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.pattern.board_page import description, encode_board, lay_out
 from sl_nerfstudio.pattern.board_values import counts, millimetres
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
-from sl_nerfstudio.pattern.codes import hamming_margin
+from sl_nerfstudio.pattern.codes import FULL_MARGINS
 from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import PatternLayout
-from sl_nerfstudio.pattern.presets import DEFAULT_PRESET, PRESETS, Preset, make_grid
+from sl_nerfstudio.pattern.presets import DEFAULT_PRESET, PRESETS, Preset, longer_period, make_grid
 
 _SUPERSAMPLING = 4  # of pattern.png
 _DEFAULT_COUNTS = {"chessboard": "9x6", "charuco": "11x8"}
@@ -40,11 +41,26 @@ def write_grid(
     with NewFolder(output) as folder:
         grid = make_grid(preset or DEFAULT_PRESET, w, h, period, line_width, gap, seed)
         _write_layout(folder, grid, print_width)
-        codes = np.asarray(grid.codes)
-        return (
-            f"wrote a grid of {grid.columns} x {grid.rows} nodes to {output}: 3 x 3 windows differ in at least "
-            f"{hamming_margin(codes, False)} of 9 symbols, in {hamming_margin(codes, True)} where the camera may roll"
-        )
+    upright, rolled = grid.margins
+    return (
+        f"wrote a grid of {grid.columns} x {grid.rows} nodes to {output}: 3 x 3 windows differ in at least "
+        f"{upright} of 9 symbols, in {rolled} where the camera may roll{margin_warning(grid)}"
+    )
+
+
+def margin_warning(grid: GridPattern) -> str:
+    """What to say about codes that are more alike than those of the presets; "" if they are not."""
+    if grid.margins >= FULL_MARGINS:
+        return ""
+    period = longer_period(grid.w, grid.h)
+    suits = [name for name, (w, h, _) in PRESETS.items() if (w, h) == (grid.w, grid.h)]
+    presets = f", as --preset {suits[0]} does" if suits else ""
+    return (
+        f"\nwarning: misread symbols are mistaken for other places more easily than with the presets, whose windows "
+        f"differ in {FULL_MARGINS[0]} symbols, in {FULL_MARGINS[1]} where the camera may roll\n"
+        f"    cause:  {grid.columns} x {grid.rows} nodes are too many for five symbols\n"
+        f"    remedy: give --period {period} or more{presets}"
+    )
 
 
 def write_gray_code(
