@@ -1,38 +1,41 @@
 """sl-pattern: write a pattern to project or to print, and its description."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 
-if TYPE_CHECKING:
-    from numpy import ndarray
-
-    from sl_nerfstudio.files.new_folder import NewFolder
-    from sl_nerfstudio.pattern.layout import PatternLayout
-
-_SUPERSAMPLING = 4  # of pattern.png
-_GRID_FLAGS = ("period", "line_width", "gap")
+_GRID_FLAGS = ("preset", "width", "height", "period", "line_width", "gap", "seed", "print_width")
+_BOARD_FLAGS = ("print_width", "square")
+_FLAGS = {
+    "grid": _GRID_FLAGS,
+    "gray-code": ("preset", "width", "height", "cell", "print_width"),
+    "chessboard": (*_BOARD_FLAGS, "corners"),
+    "charuco": (*_BOARD_FLAGS, "squares", "marker", "dictionary"),
+}
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write pattern.png, to project or to print, and pattern.json, which sl-process needs to decode captures.
+    """Write a pattern to project, or a board to print.
 
-    Lengths are in pattern pixels. For Gray code, all images of the sequence are written to sequence/.
+    grid and gray-code: pattern.png and pattern.json, which sl-process needs to decode captures; for Gray code, all
+    images of the sequence, too, in sequence/. Lengths are in pattern pixels. chessboard and charuco: board.pdf and
+    board.png in true size, for sl-calibrate, and board.json, which says what the board is.
     """
 
     output: Path
     """folder to write; it must be new or empty"""
-    kind: Literal["grid", "gray-code"] = "grid"
+    kind: Literal["grid", "gray-code", "chessboard", "charuco"] = "grid"
     """grid: one static pattern, for devices moved by hand; gray-code: a sequence, for devices that stand still while
-    each frame is captured"""
-    preset: Literal["800x800", "1280x720", "doe"] = "800x800"
-    """size and period for a square projector, a 16:9 projector, or a diffractive element"""
+    each frame is captured; chessboard, charuco: boards for calibration"""
+    preset: Literal["800x800", "1280x720", "1920x1080", "3840x2160", "doe"] | None = None
+    """size and period for a square projector, for 16:9 projectors (720p, 1080p, 4K), or for a diffractive element;
+    default: 800x800"""
     width: int | None = None
     """width of the pattern; default: the preset's"""
     height: int | None = None
@@ -43,12 +46,22 @@ class Arguments:
     """width of the lines; default: a fifth of the period"""
     gap: float | None = None
     """how far line segments are shifted against each other at a crossing; default: three tenths of the period"""
-    seed: int = 0
-    """selects one of the possible code arrays"""
-    cell: int = 2
-    """side of the squares that Gray code numbers"""
+    seed: int | None = None
+    """selects one of the possible code arrays; default: 0"""
+    cell: int | None = None
+    """side of the squares that Gray code numbers; default: 2"""
     print_width: float | None = None
-    """width on paper or slide in millimetres; it is stored in pattern.png for printing programs"""
+    """width on paper or slide in millimetres: of a pattern, for printing programs, or of all squares of a board"""
+    corners: str | None = None
+    """inner corners of a chessboard, where four squares meet, from left to right x from top to bottom; default: 9x6"""
+    squares: str | None = None
+    """squares of a ChArUco board, from left to right x from top to bottom; default: 11x8"""
+    square: str | None = None
+    """side of a board's squares with its unit, such as "20 mm", instead of --print-width"""
+    marker: str | None = None
+    """side of a ChArUco board's markers with its unit; default: three quarters of a square"""
+    dictionary: str | None = None
+    """OpenCV's name of the set of markers; default: 5X5_1000"""
 
 
 def main() -> None:
@@ -58,75 +71,38 @@ def main() -> None:
 
 def _write() -> None:
     arguments = tyro.cli(Arguments, prog="sl-pattern")
-    if arguments.seed < 0:
-        raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
-    if arguments.print_width is not None and not arguments.print_width > 0:
-        raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
-    from sl_nerfstudio.files.new_folder import NewFolder
+    _check(arguments)
+    from sl_nerfstudio.cli.pattern_folder import write_board, write_gray_code, write_grid  # numpy, OpenCV
 
-    with NewFolder(arguments.output) as folder:
-        said = _write_grid(arguments, folder) if arguments.kind == "grid" else _write_gray_code(arguments, folder)
+    a = arguments
+    if a.kind == "grid":
+        lengths = a.width, a.height, a.period, a.line_width, a.gap
+        said = write_grid(a.output, a.print_width, a.preset, *lengths, a.seed or 0)
+    elif a.kind == "gray-code":
+        said = write_gray_code(a.output, a.print_width, a.preset, a.width, a.height, 2 if a.cell is None else a.cell)
+    else:
+        said = write_board(a.output, a.print_width, a.kind, a.corners or a.squares, a.square, a.marker, a.dictionary)
     print(said)
 
 
-def _write_grid(arguments: Arguments, folder: "NewFolder") -> str:
-    import numpy as np
-
-    from sl_nerfstudio.pattern.codes import hamming_margin
-    from sl_nerfstudio.pattern.presets import make_grid
-
-    grid = make_grid(
-        arguments.preset, arguments.width, arguments.height, arguments.period, arguments.line_width, arguments.gap,
-        arguments.seed,
-    )  # fmt: skip
-    _write_layout(arguments, grid, folder)
-    codes = np.asarray(grid.codes)
-    return (
-        f"wrote a grid of {grid.columns} x {grid.rows} nodes to {arguments.output}: 3 x 3 windows differ in at least "
-        f"{hamming_margin(codes, False)} of 9 symbols, in {hamming_margin(codes, True)} where the camera may roll"
-    )
+def _check(arguments: Arguments) -> None:
+    """Raise UserError for flags that the kind of pattern has not, and for numbers that mean nothing."""
+    fitting = ("output", "kind", *_FLAGS[arguments.kind])
+    for field in fields(arguments):
+        if field.name not in fitting and getattr(arguments, field.name) is not None:
+            own = ", ".join(_flag(name) for name in _FLAGS[arguments.kind])
+            raise UserError(
+                f"{_flag(field.name)}: has no meaning for --kind {arguments.kind}\n"
+                f"    cause:  the flag belongs to another kind of pattern\n    remedy: leave it out; flags are {own}"
+            )
+    if arguments.seed is not None and arguments.seed < 0:
+        raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
+    if arguments.print_width is not None and not 0 < arguments.print_width < float("inf"):
+        raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
 
 
-def _write_gray_code(arguments: Arguments, folder: "NewFolder") -> str:
-    from sl_nerfstudio.pattern.graycode import GrayCode
-    from sl_nerfstudio.pattern.presets import PRESETS
-
-    for field in _GRID_FLAGS:
-        if getattr(arguments, field) is not None:
-            raise UserError(f"--{field.replace('_', '-')}: Gray code has none; set its squares with --cell")
-    w, h, _ = PRESETS[arguments.preset]
-    try:
-        layout = GrayCode(arguments.width or w, arguments.height or h, arguments.cell)
-    except ValueError as error:
-        raise UserError(f"--width, --height, --cell: {error}") from error
-    for index, image in enumerate(layout.sequence()):
-        folder.write(f"sequence/{index:02d}.png", _image_file(arguments, image))
-    _write_layout(arguments, layout, folder)
-    return (
-        f"wrote a Gray-code sequence of {layout.images} images to {arguments.output}: show them in the order of their "
-        "names"
-    )
-
-
-def _write_layout(arguments: Arguments, layout: "PatternLayout", folder: "NewFolder") -> None:
-    """pattern.png and pattern.json."""
-    import numpy as np
-
-    picture = np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8)
-    folder.write("pattern.png", _image_file(arguments, picture))
-    folder.write("pattern.json", layout.encode(), last=True)
-
-
-def _image_file(arguments: Arguments, image: "ndarray") -> bytes:
-    """A PNG file that says how wide to print it."""
-    import io
-
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    per_inch = None if arguments.print_width is None else image.shape[1] / arguments.print_width * 25.4
-    Image.fromarray(image).save(buffer, "PNG", **({} if per_inch is None else {"dpi": (per_inch, per_inch)}))
-    return buffer.getvalue()
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ Turning the pattern by 90 degrees exchanges 1 with 3 and 2 with 4; turning it by
 windows can be compared for every roll of the camera, in quarter turns.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Float32, Int
 from numpy import ndarray
@@ -20,6 +18,8 @@ from sl_nerfstudio.pattern.code_search import resolve_conflicts
 
 SYMBOLS = 5
 WINDOW = 3
+FULL_MARGINS = (3, 2)  # upright one misread cell of nine can be corrected; turned, one is noticed
+_BLOCK = 512  # windows compared with all others at a time
 SYMBOL_NAMES = (
     "no gap",
     "horizontal line: left side higher",
@@ -36,26 +36,33 @@ def rotate_codes(codes: Int[ndarray, "*batch rows columns"], quarter_turns: int)
     return _QUARTER_TURN[turned] if quarter_turns % 2 else np.ascontiguousarray(turned)
 
 
-def windows(codes: Int[ndarray, "rows columns"], size: int = WINDOW) -> Int[ndarray, "n cells"]:
-    """All `size` x `size` windows, row by row, each flattened row by row."""
-    view = np.lib.stride_tricks.sliding_window_view(codes, (size, size))
-    return view.reshape(-1, size * size)
+def windows(codes: Int[ndarray, "rows columns"]) -> Int[ndarray, "n cells"]:
+    """All 3 x 3 windows, row by row, each flattened row by row."""
+    view = np.lib.stride_tricks.sliding_window_view(codes, (WINDOW, WINDOW))
+    return view.reshape(-1, WINDOW * WINDOW)
 
 
-def hamming_margin(codes: Int[ndarray, "rows columns"], rotations: bool = True, size: int = WINDOW) -> int:
-    """Smallest number of cells in which two different windows differ.
+def hamming_margins(codes: Int[ndarray, "rows columns"]) -> tuple[int, int]:
+    """Smallest number of cells in which two different windows differ: upright, and where the camera may roll.
 
-    With `rotations`, windows are also compared with all windows (themselves included) of the pattern turned by 90, 180
-    and 270 degrees, as a camera with unknown roll sees them.
+    For the second, windows are also compared with all windows (themselves included) of the pattern turned by 90, 180
+    and 270 degrees.
     """
-    plain = windows(codes, size)
-    most_alike = 0
-    for turns in range(4 if rotations else 1):
-        alike = _one_hot(plain) @ _one_hot(windows_turned(plain, turns, size)).T  # cells in which two windows agree
-        if turns == 0:
-            np.fill_diagonal(alike, 0)
-        most_alike = max(most_alike, int(alike.max()))
-    return size * size - most_alike
+    plain = windows(codes)
+    upright, *turned = (_most_alike(plain, windows_turned(plain, turns), turns > 0) for turns in range(4))
+    return WINDOW**2 - upright, WINDOW**2 - max(upright, *turned)
+
+
+def _most_alike(a: Int[ndarray, "n cells"], b: Int[ndarray, "m cells"], with_itself: bool) -> int:
+    """In how many cells a window of `a` and one of `b` agree at most; `with_itself`: also those of the same index."""
+    most = 0
+    there = _one_hot(b).T
+    for start in range(0, len(a), _BLOCK):  # all pairs at once would take gigabytes
+        alike = _one_hot(a[start : start + _BLOCK]) @ there
+        if not with_itself:
+            np.fill_diagonal(alike[:, start:], 0)
+        most = max(most, int(alike.max()))
+    return most
 
 
 def _one_hot(plain: Int[ndarray, "n cells"]) -> Float32[ndarray, "n symbols"]:
@@ -68,13 +75,13 @@ def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int
 
 
 def code_array(
-    rows: int, columns: int, seed: int = 0, margin: int = 3, turned_margin: int = 2
+    rows: int, columns: int, seed: int = 0, margin: int = FULL_MARGINS[0], turned_margin: int = FULL_MARGINS[1]
 ) -> Int[ndarray, "rows columns"]:
     """Random symbols whose 3x3 windows differ in `margin` cells, or `turned_margin` when one of the two is turned.
 
     Starts from random symbols and re-samples cells of windows that are too similar to others. If an array of this size
-    cannot reach the margins, lower ones are tried; `hamming_margin` measures what was reached (3 and 2 for 40 x 40
-    cells: in an upright window, one misread cell of nine can be corrected).
+    cannot reach the margins, lower ones are tried; `hamming_margins` measures what was reached (3 and 2 up to about
+    64 x 36 cells: in an upright window, one misread cell of nine can be corrected).
     """
     for now, turned in _attempts(margin, turned_margin):
         codes = _attempt(rows, columns, seed, now, turned)
@@ -88,7 +95,7 @@ def is_generated(codes: Int[ndarray, "rows columns"], seed: int, margin: int, tu
 
     Margins that were not reached are not tried again, which takes much of the time of `code_array`.
     """
-    attempts = [a for a in _attempts(3, 2) if a[0] <= margin and a[1] <= turned_margin]
+    attempts = [a for a in _attempts(*FULL_MARGINS) if a[0] <= margin and a[1] <= turned_margin]
     for now, turned in attempts or [(1, 0)]:
         generated = _attempt(codes.shape[0], codes.shape[1], seed, now, turned)
         if generated is not None and np.array_equal(codes, generated):
@@ -96,12 +103,13 @@ def is_generated(codes: Int[ndarray, "rows columns"], seed: int, margin: int, tu
     return False
 
 
-def _attempts(margin: int, turned_margin: int) -> Iterator[tuple[int, int]]:
-    """Pairs of margins to try, the last of which any array has."""
-    yield margin, turned_margin
-    while margin > 1 or turned_margin > 0:
-        turned_margin, margin = (turned_margin - 1, margin) if turned_margin > 0 else (turned_margin, margin - 1)
-        yield margin, turned_margin
+def _attempts(margin: int, turned_margin: int) -> list[tuple[int, int]]:
+    """Pairs of margins to try, the last of which any array has.
+
+    The smaller one of a pair counts first: a camera that rolls needs both.
+    """
+    pairs = [(now, turned) for now in range(1, margin + 1) for turned in range(min(now, turned_margin) + 1)]
+    return sorted(pairs, key=lambda pair: (min(pair), sum(pair)), reverse=True)
 
 
 def _attempt(rows: int, columns: int, seed: int, margin: int, turned_margin: int) -> Int[ndarray, "r c"] | None:

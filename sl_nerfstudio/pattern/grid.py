@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
 
-from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margin, is_generated
+from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margins, is_generated
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout, number, whole_number
 
 # Offsets, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right).
@@ -23,6 +23,7 @@ _OFFSETS = np.array(
 )
 MAX_NODES = 200  # a side
 MAX_PIXELS = 100_000_000
+_BAND = 16  # rows that are drawn at a time: they fit into the processor's cache
 _LENGTHS = ("period", "line_width", "gap", "dark")
 
 
@@ -80,6 +81,11 @@ class GridPattern(PatternLayout):
         """y of the topmost nodes."""
         return (self.h - (self.rows - 1) * self.period) / 2
 
+    @cached_property
+    def margins(self) -> tuple[int, int]:
+        """In how many of 9 symbols 3 x 3 windows differ at least: upright, and where the camera may roll."""
+        return hamming_margins(np.asarray(self.codes))
+
     @property
     def lattice(self) -> Lattice:
         """The nodes of the grid."""
@@ -106,22 +112,23 @@ class GridPattern(PatternLayout):
         """The pattern as an image in [0, 1]; each pixel is the mean of `supersampling`^2 samples."""
         step = (np.arange(supersampling) + 0.5) / supersampling
         image = np.zeros((self.h, self.w))
-        for dy in step:
-            for dx in step:
-                uv = np.stack(np.meshgrid(np.arange(self.w) + dx, np.arange(self.h) + dy), -1)
-                image += self.intensity(uv)
+        for top in range(0, self.h, _BAND):
+            band = image[top : top + _BAND]
+            y = top + np.arange(len(band))
+            for dy in step:
+                for dx in step:
+                    band += self.intensity(np.stack(np.meshgrid(np.arange(self.w) + dx, y + dy), -1))
         return (image / supersampling**2).astype(np.float32)
 
     def fields(self) -> dict[str, Any]:
         """Lengths, codes, and what the codes can correct."""
-        codes = np.asarray(self.codes)
         return {
             **{key: getattr(self, key) for key in (*_LENGTHS, "seed", "x0", "y0", "rows", "columns")},
             "symbols": list(SYMBOL_NAMES),
             "window": WINDOW,
-            "hamming_margin": hamming_margin(codes, rotations=False),
-            "hamming_margin_turned": hamming_margin(codes, rotations=True),
-            "codes": codes.tolist(),
+            "hamming_margin": self.margins[0],
+            "hamming_margin_turned": self.margins[1],
+            "codes": np.asarray(self.codes).tolist(),
         }
 
     @classmethod

@@ -1,16 +1,20 @@
 """Coded grids for common projectors."""
 
+import math
 from typing import Literal
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.grid import MAX_NODES, MAX_PIXELS, GridPattern
 
-Preset = Literal["800x800", "1280x720", "doe"]
+Preset = Literal["800x800", "1280x720", "1920x1080", "3840x2160", "doe"]
+DEFAULT_PRESET: Preset = "800x800"
 
 # Size and period in pattern pixels. Lines and gaps keep their share of the period: the networks were trained on it.
 PRESETS: dict[str, tuple[int, int, float]] = {
     "800x800": (800, 800, 20.0),
     "1280x720": (1280, 720, 20.0),  # a 16:9 projector: about 11 periods across a fifth of the image's width
+    "1920x1080": (1920, 1080, 30.0),  # as many nodes: with more of them, codes do not stay far enough apart
+    "3840x2160": (3840, 2160, 60.0),
     "doe": (
         800,
         800,
@@ -18,10 +22,12 @@ PRESETS: dict[str, tuple[int, int, float]] = {
     ),  # a diffractive element blurs: wider lines, and fewer nodes
 }
 LINE_SHARE, GAP_SHARE = 0.2, 0.3  # of the period
+MOST_NODES = 64 * 36
+"""An array with more nodes hardly reaches `codes.FULL_MARGINS`."""
 
 
 def make_grid(
-    preset: Preset = "800x800",
+    preset: Preset = DEFAULT_PRESET,
     w: int | None = None,
     h: int | None = None,
     period: float | None = None,
@@ -48,3 +54,11 @@ def make_grid(
         )
     except ValueError as error:
         raise UserError(f"--width, --height, --period, --line-width, --gap: {error}") from error
+
+
+def longer_period(w: int, h: int) -> int:
+    """The shortest whole period, in pixels, with which a pattern of this size has no more than MOST_NODES."""
+    period = math.ceil(math.sqrt(w * h / MOST_NODES))
+    while (w // period) * (h // period) > MOST_NODES:
+        period += 1
+    return period

@@ -1,5 +1,6 @@
 """sl-pattern: what it writes is complete, and bad flags are named."""
 
+import re
 import sys
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 from PIL import Image
 
 from sl_nerfstudio.cli.pattern import main
-from sl_nerfstudio.pattern.codes import hamming_margin
+from sl_nerfstudio.cli.pattern_folder import margin_warning
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.presets import PRESETS
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.presets import PRESETS, make_grid
 from sl_nerfstudio.scan.images import read_image
 
 
@@ -20,18 +22,40 @@ def _run(monkeypatch, *flags):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_presets(monkeypatch, tmp_path, capsys, preset):
+def test_presets_tell_places_apart_whatever_the_roll_of_the_camera(preset):
+    grid = make_grid(preset)
+    assert (grid.w, grid.h, grid.period) == PRESETS[preset] and grid.margins == (3, 2)
+
+
+def test_a_folder_with_a_grid(monkeypatch, tmp_path, capsys):
     out = tmp_path / "müster"
-    _run(monkeypatch, "--output", out, "--preset", preset)
+    _run(monkeypatch, "--output", out, "--preset", "doe")
     grid = read_layout(out / "pattern.json")
-    assert (grid.w, grid.h, grid.period) == PRESETS[preset]
-    codes = np.asarray(grid.codes)
-    assert hamming_margin(codes, rotations=False) == 3 and hamming_margin(codes, rotations=True) == 2
+    assert (grid.w, grid.h, grid.period) == PRESETS["doe"]
     image = read_image(out / "pattern.png")
     assert image.shape == (grid.h, grid.w)
     # the description alone gives the same picture
     assert np.abs(image / 255 - grid.render(4)).max() < 0.5 / 255 + 1e-6
-    assert "differ in at least 3 of 9 symbols, in 2 where the camera may roll" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "differ in at least 3 of 9 symbols, in 2 where the camera may roll" in said and "warning" not in said
+
+
+def test_too_many_nodes_are_warned_of_and_the_remedy_helps(monkeypatch, tmp_path, capsys):
+    """Where (3, 2) cannot be had, the roll of the camera counts before the second misread symbol."""
+    flags = ["--width", 480, "--height", 270]
+    _run(monkeypatch, "--output", tmp_path / "a", *flags, "--period", 5)
+    said = capsys.readouterr().out
+    assert "differ in at least 2 of 9 symbols, in 2 where the camera may roll" in said
+    assert "warning: misread symbols are mistaken" in said and "96 x 54 nodes are too many" in said
+    period = re.search(r"--period (\d+) or more", said)[1]
+    _run(monkeypatch, "--output", tmp_path / "b", *flags, "--period", period)
+    said = capsys.readouterr().out
+    assert "in at least 3 of 9 symbols, in 2 where" in said and "warning" not in said
+
+
+def test_the_warning_names_the_preset_of_the_size():
+    grid = GridPattern(w=1920, h=1080, period=20.0, codes=np.zeros((54, 96), dtype=np.int8))
+    assert "--period 30 or more, as --preset 1920x1080 does" in margin_warning(grid)
 
 
 def test_flags_override_the_preset(monkeypatch, tmp_path):
@@ -66,7 +90,9 @@ def test_gray_code(monkeypatch, tmp_path, capsys):
         (["--width", "100000"], "too large: give at most 200 nodes a side"),
         (["--seed", "-1"], "--seed -1: seeds are at least 0"),
         (["--print-width", "0"], "--print-width 0: give a width in millimetres above 0"),
-        (["--kind", "gray-code", "--gap", "3"], "--gap: Gray code has none; set its squares with --cell"),
+        (["--kind", "gray-code", "--gap", "3"], "--gap: has no meaning for --kind gray-code"),
+        (["--cell", "3"], "--cell: has no meaning for --kind grid"),
+        (["--square", "3 mm"], "flags are --preset, --width, --height, --period, --line-width, --gap, --seed"),
         (["--kind", "gray-code", "--cell", "0"], "at least 2 x 2 cells"),
     ],
 )

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sl_nerfstudio.pattern.codes import code_array, hamming_margin, rotate_codes, windows
+from sl_nerfstudio.pattern.codes import code_array, hamming_margins, is_generated, rotate_codes, windows
 
 _AFTER_A_QUARTER_TURN = {0: 0, 1: 3, 2: 4, 3: 1, 4: 2}
 
@@ -37,15 +37,12 @@ def _smallest_distances(codes):
 
 def test_margins_agree_with_a_comparison_of_all_pairs():
     codes = code_array(11, 9, seed=5)
-    assert _smallest_distances(codes) == (
-        hamming_margin(codes, rotations=False),
-        hamming_margin(codes, rotations=True),
-    )
+    assert _smallest_distances(codes) == hamming_margins(codes)
 
 
 def test_margins_of_a_bad_array_agree_too():
     codes = np.random.default_rng(0).integers(0, 2, (9, 9)).astype(np.int8)
-    assert _smallest_distances(codes) == (hamming_margin(codes, False), hamming_margin(codes, True))
+    assert _smallest_distances(codes) == hamming_margins(codes)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 7])
@@ -53,8 +50,7 @@ def test_the_default_size_corrects_one_misread_cell(seed):
     codes = code_array(40, 40, seed)
     assert codes.shape == (40, 40)
     assert set(np.unique(codes)) == {0, 1, 2, 3, 4}
-    assert hamming_margin(codes, rotations=False) == 3
-    assert hamming_margin(codes, rotations=True) == 2
+    assert hamming_margins(codes) == (3, 2)
 
 
 def test_symbols_are_about_equally_frequent():
@@ -69,7 +65,23 @@ def test_same_seed_same_array_and_other_seed_another():
 
 def test_an_array_too_large_for_the_margin_gets_a_lower_one():
     codes = code_array(12, 12, margin=3, turned_margin=3)
-    assert hamming_margin(codes, rotations=False) == 3
+    assert hamming_margins(codes)[0] == 3
+
+
+def test_arrays_of_older_files_are_recognised():
+    """They had been made with other margins first, and say which they reached."""
+    codes = code_array(20, 24, 5, margin=3, turned_margin=0)
+    assert hamming_margins(codes)[0] == 3 and is_generated(codes, 5, 3, hamming_margins(codes)[1])
+    assert not is_generated(codes, 6, 3, hamming_margins(codes)[1])
+
+
+def test_margins_of_arrays_with_more_windows_than_are_compared_at_a_time():
+    codes = code_array(40, 60, 0, margin=2, turned_margin=2)
+    assert hamming_margins(codes) == (2, 2)
+    codes[35:38, 5:8] = codes[10:13, 40:43]
+    assert hamming_margins(codes) == (0, 0)
+    codes[36, 6] = (codes[36, 6] + 1) % 5
+    assert len(np.unique(windows(codes), axis=0)) == len(windows(codes)) and hamming_margins(codes)[0] == 1
 
 
 def test_smaller_than_a_window():
