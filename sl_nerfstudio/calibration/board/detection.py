@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 
 LEAST_CORNERS = 8  # of a ChArUco board of which only a part is in view
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _SEARCHED = 1600  # longest side of the image in which a chessboard is searched; it is measured in the full one
+_SMALLEST_WINDOW, _LARGEST_WINDOW = 2, 11  # half the side, pixels
 _OTHER_COUNTS = ((0, -1), (-1, 0), (0, 1), (1, 0), (-1, -1), (1, 1))
 
 
@@ -60,27 +62,29 @@ def _find_chessboard(grey: UInt8[ndarray, "h w"], board: Chessboard) -> Corners 
         found, uv = cv2.findChessboardCorners(small, size)
         if not found:
             return None
-        uv = _refined(small, uv.reshape(-1, 2), size)
+        uv = _refined(small, uv.reshape(-1, 2))
     uv = np.asarray(uv, np.float64).reshape(-1, 2)
     if factor != 1:
-        uv = _refined(grey, (uv + 0.5) / factor - 0.5, size)
+        uv = _refined(grey, (uv + 0.5) / factor - 0.5)
     return Corners(np.arange(len(uv)), np.asarray(uv, np.float64) + 0.5)
 
 
-def _refined(grey: UInt8[ndarray, "h w"], uv: ndarray, size: tuple[int, int]) -> ndarray:
-    """Corners moved to the saddle points of the brightness; the window is a quarter of a square."""
-    grid = uv.reshape(size[1], size[0], 2)
-    pitch = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
-    half = max(2, min(11, round(pitch / 4)))
+def _refined(grey: UInt8[ndarray, "h w"], uv: Float64[ndarray, "n 2"], share: float = 0.25) -> Float64[ndarray, "n 2"]:
+    """Corners moved to the saddle points of the brightness, in OpenCV's convention (first pixel centre at 0).
+
+    `share` is half the window, in distances to the next corner.
+    """
+    pitch = float(np.quantile(KDTree(uv).query(uv, k=2)[0][:, 1], 0.1))
+    half = int(np.clip(round(share * pitch), _SMALLEST_WINDOW, _LARGEST_WINDOW))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    return cv2.cornerSubPix(grey, uv.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop).reshape(-1, 2)
+    found = cv2.cornerSubPix(grey, uv.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop)
+    return found.reshape(-1, 2).astype(np.float64)
 
 
 def _find_charuco(grey: UInt8[ndarray, "h w"], board: CharucoBoard) -> Corners | None:
     """With the layout of either version of OpenCV: only one of them has the markers where they are."""
     found = [_charuco_corners(grey, board, legacy) for legacy in (False, True)]
-    best = max((corners for corners in found if corners is not None), key=lambda c: len(c.ids), default=None)
-    return best if best is not None and len(best.ids) >= LEAST_CORNERS else None
+    return max((corners for corners in found if corners is not None), key=lambda c: len(c.ids), default=None)
 
 
 def _charuco_corners(grey: UInt8[ndarray, "h w"], board: CharucoBoard, legacy: bool) -> Corners | None:
@@ -88,7 +92,10 @@ def _charuco_corners(grey: UInt8[ndarray, "h w"], board: CharucoBoard, legacy: b
     drawn = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, markers)
     drawn.setLegacyPattern(legacy)
     uv, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(grey)
-    if ids is None or uv is None or not len(ids):
+    if ids is None or uv is None or len(ids) < LEAST_CORNERS:
         return None
     order = np.argsort(ids.ravel())
-    return Corners(ids.ravel()[order].astype(np.int64), uv.reshape(-1, 2)[order].astype(np.float64) + 0.5)
+    # OpenCV counts these pixels from one or the other corner of a pixel, as its version goes: a saddle has one place.
+    share = min(0.25, 0.8 * (board.square - board.marker) / 2 / board.square)  # markers stay outside the window
+    refined = _refined(grey, uv.reshape(-1, 2)[order].astype(np.float64), share)
+    return Corners(ids.ravel()[order].astype(np.int64), refined + 0.5)
