@@ -1,13 +1,30 @@
 """A pattern on a display, until a key ends it: one image, or the images of a sequence by key or by timer."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
+import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.capture.windows import Key, Screen
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.scan.images import read_image
 
 Image = UInt8[ndarray, "h w"]
+
+
+def pattern_picture(path: Path, layout: PatternLayout) -> Image:
+    """pattern.png beside the pattern.json at `path`. Raises UserError if it is not the picture of this pattern."""
+    file = path.parent / "pattern.png"
+    image = read_image(file)
+    if image.shape != (layout.h, layout.w) or image.dtype != np.uint8:
+        raise UserError(
+            f"{file}: is no grey image of {layout.w} x {layout.h} pixels, as {path.name} says\n"
+            "    cause:  it was changed\n    remedy: write the pattern again with sl-pattern"
+        )
+    return image
 
 
 def show_still(screen: Screen, image: Image) -> None:

@@ -144,5 +144,36 @@ def next_key(pygame: ModuleType, seconds: float | None) -> Key | None:
             for key, codes in meanings.items():
                 if event.key in codes:
                     return key
-        if end is not None and time.monotonic() >= end:
+        if event.type == pygame.NOEVENT and end is not None and time.monotonic() >= end:
             return None
+
+
+class Window:
+    """A window for a picture in colour."""
+
+    def __init__(self, title: str) -> None:
+        """Raises UserError if there is no display."""
+        self._pygame = load_pygame()
+        self._title = title
+        self._window = None
+
+    def show(self, picture: UInt8[ndarray, "h w 3"]) -> None:
+        """Show a picture; the window gets its size."""
+        size = picture.shape[1], picture.shape[0]
+        if self._window is None:
+            self._window = self._pygame.Window(self._title, size)
+        if self._window.size != size:
+            self._window.size = size
+        surface = self._window.get_surface()
+        self._pygame.surfarray.blit_array(surface, picture.transpose(1, 0, 2))
+        self._window.flip()
+
+    def key(self, seconds: float | None) -> Key | None:
+        """The next key that means something; None if there is none within `seconds`."""
+        return next_key(self._pygame, seconds)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.destroy()
+            self._window = None

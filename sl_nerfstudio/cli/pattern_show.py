@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from sl_nerfstudio.capture.show import show_sequence, show_still
+from sl_nerfstudio.capture.show import pattern_picture, show_sequence, show_still
 from sl_nerfstudio.capture.windows import Screen, offset_on
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.scan.images import read_image
 
 
 def show_folder(folder: Path, display: int, every: float | None) -> None:
@@ -22,14 +21,7 @@ def show_folder(folder: Path, display: int, every: float | None) -> None:
             print("Space and the right key show the next image, the left key the one before", flush=True)
             show_sequence(screen, list(layout.sequence()), every, lambda k: print(f"  {k:02d}  {names[k]}", flush=True))
             return
-        path = folder / "pattern.png"
-        image = read_image(path)
-        if image.shape != (layout.h, layout.w) or image.dtype != "uint8":
-            raise UserError(
-                f"{path}: is no grey image of {layout.w} x {layout.h} pixels, as pattern.json says\n"
-                "    cause:  it was changed\n    remedy: write the pattern again with sl-pattern"
-            )
-        show_still(screen, image)
+        show_still(screen, pattern_picture(folder / "pattern.json", layout))
 
 
 def _words(display: int, screen: tuple[int, int], size: tuple[int, int]) -> str:

@@ -1,0 +1,69 @@
+"""Capturing by hand: images of one static pattern are judged as they come, and kept where they add something."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from sl_nerfstudio.capture.camera import Camera, Video
+from sl_nerfstudio.capture.folder import CaptureFolder
+from sl_nerfstudio.capture.grid_view import GridReader, GridView, PlainReader
+from sl_nerfstudio.capture.picture import draw_map, draw_nodes, reduced
+from sl_nerfstudio.capture.selection import Selection, Verdict
+from sl_nerfstudio.capture.watcher import Watcher
+from sl_nerfstudio.capture.windows import Key
+from sl_nerfstudio.progress import track
+from sl_nerfstudio.scan.images import read_image
+
+_RADIUS = 0.4  # of the discs in the preview, periods
+
+
+Reader = GridReader | PlainReader
+Words = Callable[[GridView, Verdict, Selection], list[str]]  # what to say of a view; the first line matters most
+
+
+def resume(folder: CaptureFolder, reader: Reader, selection: Selection) -> None:
+    """Take the frames of an earlier run as kept."""
+    for path in track(folder.frames, "reading the frames so far"):
+        selection.add(reader.read(read_image(path)))
+
+
+def capture_by_hand(
+    source: Camera | Video,
+    reader: Reader,
+    selection: Selection,
+    folder: CaptureFolder,
+    watcher: Watcher,
+    words: Words,
+    kept: Callable[[str, GridView], None],
+    rate: float,
+    most: int | None,
+) -> None:
+    """Judge up to `rate` images a second until a key ends it, a video ends, or the folder holds `most` frames.
+
+    `kept` is called with the name of each frame that was written.
+    """
+    for seconds, image in source.frames(rate):
+        view = reader.read(image)
+        verdict = selection.judge(view, seconds)
+        watcher.look(
+            lambda image=image, view=view: _picture(image, view),
+            lambda: [draw_map(selection.times_seen)] if selection.times_seen.size else [],
+            words(view, verdict, selection),
+        )
+        key = watcher.key()
+        if key is Key.END:
+            return
+        if verdict is Verdict.KEEP or key is Key.NEXT:
+            name = folder.add(image).name
+            selection.add(view, seconds)
+            kept(name, view)
+            if most is not None and len(selection.kept) >= most:
+                return
+
+
+def _picture(image: UInt8[ndarray, "h w 3"], view: GridView) -> UInt8[ndarray, "_h _w 3"]:
+    small, factor = reduced(image)
+    radius = _RADIUS * view.period * factor if np.isfinite(view.period) else 1.0
+    return draw_nodes(small, view.uv * np.float32(factor), radius)
