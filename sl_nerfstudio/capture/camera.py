@@ -110,15 +110,16 @@ class Camera:
 
     def _read(self) -> None:
         while not self._gone:
+            begun = time.monotonic()
             ok, image = self._capture.read()
             with self._changed:
                 self._gone = self._gone or not ok
                 if ok:
-                    self._image, self._time = image, time.monotonic()
+                    self._image, self._time = image, begun
                 self._changed.notify_all()
 
     def after(self, moment: float) -> tuple[float, Image]:
-        """Time and image of the first one read after a moment (of time.monotonic).
+        """Time and image of the first one whose reading began after a moment (of time.monotonic).
 
         Raises UserError if the camera gives none for some seconds.
         """

@@ -23,6 +23,7 @@ _VERDICTS = {
     Verdict.WAIT: "good; it is kept if you stay for a moment",
     Verdict.BY_KEY: "Space keeps this image",
 }
+_LEGEND = "map of the pattern: grey: not seen yet, red: in one frame, yellow: in two, green: in more"
 _USUAL_LEAST = 10  # frames of a scan
 _OFTEN = 3
 
@@ -38,12 +39,8 @@ def view_lines(view: GridView, verdict: Verdict, selection: Selection) -> list[s
         measured.append(f"blur {view.blur:.2f} periods")
     nodes = f"{int(view.seen.sum())} of {view.seen.size} nodes"
     seen = selection.times_seen
-    coverage = f"{len(selection.kept)} frames kept; of the pattern, they show {share_seen(seen):.0%}"
-    return [
-        _VERDICTS[verdict],
-        ", ".join([nodes, *measured]),
-        f"{coverage}, {share_seen(seen, _OFTEN):.0%} three times",
-    ]
+    share = f"they show {share_seen(seen):.0%} of the pattern, {share_seen(seen, _OFTEN):.0%} of it three times"
+    return [_VERDICTS[verdict], ", ".join([nodes, *measured]), f"{len(selection.kept)} frames kept; {share}", _LEGEND]
 
 
 def kept_words(say: Callable[[str], None], selection: Selection, name: str, view: GridView) -> None:
@@ -60,7 +57,8 @@ def sequence_lines(images: int, light: Light, progress: Progress) -> list[str]:
     return [
         f"Space captures the sequence of {images} images: nothing may move meanwhile",
         f"{_light_words(light)} (under white light)",
-        f"{progress.frames} frames; of the pattern, they show {share_seen(progress.times_seen):.0%}",
+        f"{progress.frames} frames; they show {share_seen(progress.times_seen):.0%} of the pattern",
+        _LEGEND,
     ]
 
 
