@@ -48,9 +48,10 @@ def capture_by_hand(
         view = reader.read(image)
         verdict = selection.judge(view, seconds)
         watcher.look(
-            lambda image=image, view=view: _picture(image, view),
+            lambda image=image, view=view: picture_of(image, view),
             lambda: [draw_map(selection.times_seen)] if selection.times_seen.size else [],
             words(view, verdict, selection),
+            quiet=verdict is Verdict.KEEP,
         )
         key = watcher.key()
         if key is Key.END:
@@ -63,7 +64,8 @@ def capture_by_hand(
                 return
 
 
-def _picture(image: UInt8[ndarray, "h w 3"], view: GridView) -> UInt8[ndarray, "_h _w 3"]:
+def picture_of(image: UInt8[ndarray, "h w 3"], view: GridView) -> UInt8[ndarray, "_h _w 3"]:
+    """The image at the size of the preview, with the nodes that were found in colour."""
     small, factor = reduced(image)
     radius = _RADIUS * view.period * factor if np.isfinite(view.period) else 1.0
     return draw_nodes(small, view.uv * np.float32(factor), radius)

@@ -19,15 +19,21 @@ class Watcher:
         self._window, self._screen = window, screen
         self._last = ""
 
-    def look(self, picture: Callable[[], Picture], beside: Callable[[], Sequence[Picture]], lines: list[str]) -> None:
+    def look(
+        self,
+        picture: Callable[[], Picture],
+        beside: Callable[[], Sequence[Picture]],
+        lines: list[str],
+        quiet: bool = False,
+    ) -> None:
         """Show what there is to see; pictures are only made if there is a window.
 
-        On the console, an empty first line says nothing.
+        `quiet`: what happened is said on the console in other words.
         """
         if self._window is not None:
             self._window.show(compose(picture(), beside(), lines))
             return
-        if lines[0] not in ("", self._last):
+        if not quiet and lines[0] != self._last:
             self.say(lines[0])
         self._last = lines[0]
 

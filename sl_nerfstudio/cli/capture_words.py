@@ -14,7 +14,7 @@ from sl_nerfstudio.capture.selection import Selection, Verdict
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 
 _VERDICTS = {
-    Verdict.KEEP: "",  # the line that says under which name comes at once
+    Verdict.KEEP: "kept",
     Verdict.NO_PATTERN: "the pattern is not seen: point the camera at what the projector lights, or go closer",
     Verdict.BLURRED: "blurred: move more slowly, or focus again",
     Verdict.SATURATED: "too bright: shorten the exposure",
