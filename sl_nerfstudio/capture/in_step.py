@@ -90,6 +90,9 @@ def capture_in_step(
     patterns = list(rig.layout.sequence())
     while most is None or progress.frames < most:
         rig.screen.show(patterns[0])
+        while (early := watcher.key()) is not None:  # pressed while the last sequence was decoded
+            if early is Key.END:
+                return
         if _watch(rig, progress, watcher, words) is Key.END:
             return
         images = []

@@ -146,7 +146,9 @@ def test_the_grid_can_be_shown_by_the_same_command(command, keyboard, video, pat
 
 def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
     flags = ["--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless"]
-    keyboard.press("", "SPACE", *[""] * GRAY.images, "SPACE", *[""] * GRAY.images)
+    sequence = ["SPACE", *[""] * GRAY.images]
+    early = ["SPACE", "SPACE", ""]  # pressed while the first sequence is decoded
+    keyboard.press("", *sequence, *early, *sequence)
     command(main, *flags, "--settle", "0.001", "--rate", "100", "--frames", "2")
     said = capsys.readouterr().out
     assert "Space captures the sequence of 18 images" in said and "kept frame_0001" in said
@@ -163,7 +165,7 @@ def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_scree
 
 def test_a_sequence_that_shows_nothing_is_not_kept(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
     filmed_screen.take = lambda: np.zeros((*WALL[::-1], 3), dtype=np.uint8)  # a lens cap
-    keyboard.press("SPACE", *[""] * GRAY.images, "ESCAPE")
+    keyboard.press("", "SPACE", *[""] * GRAY.images, "ESCAPE")
     command(
         main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless",
         "--settle", "0.001",
@@ -174,7 +176,7 @@ def test_a_sequence_that_shows_nothing_is_not_kept(command, keyboard, filmed_scr
 
 
 def test_escape_leaves_a_sequence_that_is_under_way(command, keyboard, filmed_screen, gray_pattern, tmp_path):
-    keyboard.press("SPACE", "", "", "ESCAPE")
+    keyboard.press("", "SPACE", "", "", "ESCAPE")
     command(
         main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--settle", "0.001"
     )

@@ -8,6 +8,7 @@ import pytest
 from sl_nerfstudio.cli.pattern import main
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.presets import MOST_NODES, longer_period
 from sl_nerfstudio.scan.images import read_image
 
 DISPLAY = (1024, 768)  # of SDL's dummy driver
@@ -29,11 +30,17 @@ def fails(capsys, call, message):
 
 
 def test_without_a_size_the_pattern_gets_that_of_the_display(show, keyboard, tmp_path):
-    show("--show", 0)
+    show("--show", 0, "--period", 64)
     layout = read_layout(tmp_path / "p" / "pattern.json")
-    assert (layout.w, layout.h) == DISPLAY and layout.margins == (3, 2)
+    assert (layout.w, layout.h, layout.period) == (*DISPLAY, 64)
     (screen,) = keyboard.different()
     assert np.array_equal(screen, np.repeat(read_image(tmp_path / "p" / "pattern.png")[..., None], 3, -1))
+
+
+@pytest.mark.parametrize("size", [(1024, 768), (1280, 720), (1920, 1080), (3840, 2160), (854, 480), (100, 1000)])
+def test_without_a_period_there_are_as_many_nodes_as_the_codes_allow(size):
+    period = longer_period(*size)
+    assert (size[0] // period) * (size[1] // period) <= MOST_NODES < size[0] * size[1] / (period - 1) ** 2
 
 
 def test_smaller_patterns_are_shown_in_the_middle_and_not_scaled(show, keyboard, tmp_path, capsys):
