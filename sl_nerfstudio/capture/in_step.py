@@ -23,6 +23,7 @@ from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.images import as_grey, read_image
 
 _CELLS = 48  # columns of the map of the pattern
+_BLACK, _WHITE = 0.1, 0.9  # of full scale
 _THUMBNAIL = 300  # width, pixels
 
 
@@ -77,6 +78,7 @@ class Captured:
 
     images: list[UInt8[ndarray, "h w 3"]]
     decoded: Decoded
+    drift: float  # brightness under white light at the end, relative to that at the beginning; 1 if nothing changed
 
 
 def capture_in_step(
@@ -96,13 +98,14 @@ def capture_in_step(
         if _watch(rig, progress, watcher, words) is Key.END:
             return
         images = []
-        for pattern in patterns:
+        for pattern in (*patterns, patterns[0]):
             rig.screen.show(pattern)
             images.append(rig.camera.after(time.monotonic() + rig.settle)[1])
             if watcher.key() is Key.END:
                 return
+        white_again = images.pop()
         try:
-            yield Captured(images, decode_gray_code(images, rig.layout))
+            yield Captured(images, decode_gray_code(images, rig.layout), _drift(images[0], white_again))
         except DecodingError as error:
             yield error
 
@@ -120,6 +123,16 @@ def _watch(rig: Rig, progress: Progress, watcher: Watcher, words: Callable[[Ligh
         if key in (Key.NEXT, Key.END):
             return key
     raise RuntimeError("a camera never ends")
+
+
+def _drift(first: UInt8[ndarray, "h w 3"], last: UInt8[ndarray, "h w 3"]) -> float:
+    """Brightness of the second image over that of the first, where that is neither black nor saturated.
+
+    1 if there is no such place.
+    """
+    before, after = as_grey(first), as_grey(last)
+    usable = (before > _BLACK) & (before < _WHITE)
+    return float(np.median(after[usable] / before[usable])) if usable.any() else 1.0
 
 
 def _cells_seen(decoded: Decoded, layout: GrayCode, shape: tuple[int, ...]) -> Int[ndarray, "rows columns"]:

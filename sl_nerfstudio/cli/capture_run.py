@@ -96,7 +96,7 @@ def _sequences(config: CaptureConfig, source: Camera | Video, layout: GrayCode) 
                 else:
                     path = folder.add_sequence(captured.images)
                     progress.add(captured.decoded, layout, captured.images[0])
-                    say(decoded_words(progress, path.name, captured.decoded))
+                    say(decoded_words(progress, path.name, captured))
         say(coverage_words(progress.frames, config.output, progress.times_seen))
 
 

@@ -7,11 +7,11 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from sl_nerfstudio.capture.grid_view import GridView
-from sl_nerfstudio.capture.in_step import Progress
+from sl_nerfstudio.capture.in_step import Captured, Progress
 from sl_nerfstudio.capture.light import Light
 from sl_nerfstudio.capture.picture import share_seen
 from sl_nerfstudio.capture.selection import Selection, Verdict
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.decoded import DecodingError
 
 _VERDICTS = {
     Verdict.KEEP: "kept",
@@ -24,6 +24,7 @@ _VERDICTS = {
     Verdict.BY_KEY: "Space keeps this image",
 }
 _LEGEND = "map of the pattern: grey: not seen yet, red: in one frame, yellow: in two, green: in more"
+_MOST_DRIFT = 0.1  # of the brightness during a sequence
 _USUAL_LEAST = 10  # frames of a scan
 _OFTEN = 3
 
@@ -62,10 +63,19 @@ def sequence_lines(images: int, light: Light, progress: Progress) -> list[str]:
     ]
 
 
-def decoded_words(progress: Progress, name: str, decoded: Decoded) -> str:
-    """A sequence was written."""
+def decoded_words(progress: Progress, name: str, captured: Captured) -> str:
+    """A sequence was written; a warning where the light was not the same throughout."""
+    decoded = captured.decoded
     lit = f"{decoded.decoded.mean():.0%} of the image are decoded, {decoded.rate:.0%} of what the pattern lights"
-    return f"  kept {name}: {lit}; all frames show {share_seen(progress.times_seen):.0%} of the pattern"
+    said = f"  kept {name}: {lit}; all frames show {share_seen(progress.times_seen):.0%} of the pattern"
+    if abs(captured.drift - 1) <= _MOST_DRIFT:
+        return said
+    changed = f"{abs(captured.drift - 1):.0%} {'brighter' if captured.drift > 1 else 'darker'}"
+    return (
+        f"{said}\n  warning: white was {changed} after the sequence than before it\n"
+        "    cause:  the camera sets its exposure by itself, or the room light changed\n"
+        "    remedy: give --exposure, remove this frame, and capture it again"
+    )
 
 
 def failed_words(error: DecodingError) -> str:

@@ -146,12 +146,12 @@ def test_the_grid_can_be_shown_by_the_same_command(command, keyboard, video, pat
 
 def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
     flags = ["--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless"]
-    sequence = ["SPACE", *[""] * GRAY.images]
+    sequence = ["SPACE", *[""] * (GRAY.images + 1)]
     early = ["SPACE", "SPACE", ""]  # pressed while the first sequence is decoded
     keyboard.press("", *sequence, *early, *sequence)
     command(main, *flags, "--settle", "0.001", "--rate", "100", "--frames", "2")
     said = capsys.readouterr().out
-    assert "Space captures the sequence of 18 images" in said and "kept frame_0001" in said
+    assert "Space captures the sequence of 18 images" in said and "kept frame_0001" in said and "warning" not in said
     assert re.search(r"all frames show 9\d %|all frames show (9\d|100)%", said)
     assert len(list((tmp_path / "c" / "frame_0001").iterdir())) == GRAY.images
     decoded = GrayCodeDecoder(GRAY).decode(sorted((tmp_path / "c" / "frame_0000").iterdir()))
@@ -163,9 +163,28 @@ def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_scree
     assert "sl-process --images" in said.strip().splitlines()[-1]
 
 
+def test_a_camera_that_changes_its_exposure_is_noticed(
+    command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys
+):
+    steady = filmed_screen.take
+
+    def brighter_and_brighter():
+        return np.clip(steady() * (0.8 + 0.2 * min(len(keyboard.waits), 20) / 20), 0, 255).astype(np.uint8)
+
+    filmed_screen.take = brighter_and_brighter
+    keyboard.press("", "SPACE", *[""] * (GRAY.images + 1), "ESCAPE")
+    command(
+        main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless",
+        "--settle", "0.001",
+    )  # fmt: skip
+    said = capsys.readouterr().out
+    drift = int(re.search(r"white was (\d+)% brighter after the sequence", said)[1])
+    assert 15 <= drift <= 26 and "kept frame_0000" in said and "give --exposure" in said
+
+
 def test_a_sequence_that_shows_nothing_is_not_kept(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
     filmed_screen.take = lambda: np.zeros((*WALL[::-1], 3), dtype=np.uint8)  # a lens cap
-    keyboard.press("", "SPACE", *[""] * GRAY.images, "ESCAPE")
+    keyboard.press("", "SPACE", *[""] * (GRAY.images + 1), "ESCAPE")
     command(
         main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless",
         "--settle", "0.001",
