@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import remove_partial, require_empty, write_atomic
+from sl_nerfstudio.files.atomic import remove_partial, write_atomic
 from sl_nerfstudio.files.lock import LOCK, locked
 from sl_nerfstudio.files.paths import cannot_write
 from sl_nerfstudio.pattern.layout import PatternLayout
@@ -38,20 +38,26 @@ class CaptureFolder:
         digest = None if pattern is None else hashlib.sha256(pattern.encode()).hexdigest()
         described = {"sl_capture": FORMAT, "pattern": digest, "w": size[0], "h": size[1]}
         content = f"{json.dumps(described, indent=1)}\n".encode()
-        if not (root / DESCRIPTION).exists() and not (root / LOCK).exists():
-            require_empty(root)
         self._lock = locked(root)
         self._lock.__enter__()
         try:
+            remove_partial(root)
             if (root / DESCRIPTION).exists():
                 self._check(described)
             else:
+                self._require_new()
                 write_atomic(root / DESCRIPTION, content)
-            remove_partial(root)
             shutil.rmtree(root / _UNFINISHED, ignore_errors=True)
         except BaseException as error:
             self._lock.__exit__(type(error), error, error.__traceback__)
             raise
+
+    def _require_new(self) -> None:
+        if any(path.name != LOCK for path in self.root.iterdir()):
+            raise UserError(
+                f"{self.root}: is not empty\n    cause:  it holds something else than captures of this command\n"
+                "    remedy: choose another output, or remove it first"
+            )
 
     def _check(self, described: dict[str, object]) -> None:
         found = read_document(self.root / DESCRIPTION)

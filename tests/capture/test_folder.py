@@ -1,10 +1,14 @@
 """The folder of captures: numbered on, nothing overwritten, one pattern and one image size."""
 
 import json
+import os
+import shutil
+import signal
 
 import numpy as np
 import pytest
 
+from benchmarks.attacks.dying import dying
 from sl_nerfstudio.capture.folder import CaptureFolder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.graycode import GrayCode
@@ -68,6 +72,31 @@ def _full_disk_at_the_second():
         return b"some bytes"
 
     return encode
+
+
+def test_what_a_killed_command_leaves_is_complete_and_is_continued(tmp_path):
+    for moment in range(40):
+        with dying(moment):
+            child = os.fork()
+            if child == 0:
+                try:
+                    with folder(tmp_path) as captures:
+                        captures.add(IMAGE)
+                        captures.add_sequence([IMAGE, 255 - IMAGE])
+                finally:
+                    os._exit(0)
+        was_killed = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+        with folder(tmp_path) as captures:
+            for path in captures.frames:
+                files = [path] if path.suffix else sorted(path.iterdir())
+                assert len(files) == (1 if path.suffix else 2)
+                assert all(read_image(file).shape == IMAGE.shape for file in files)
+            frames = [path.name for path in captures.frames]
+            assert set(names(tmp_path)) == {"capture.json", ".sl-lock", *frames}
+        if not was_killed:
+            break
+        shutil.rmtree(tmp_path, ignore_errors=True)
+    assert moment > 8 and not was_killed and frames == ["frame_0000.png", "frame_0001"]
 
 
 def test_a_folder_without_a_frame_is_removed(tmp_path):
