@@ -132,6 +132,12 @@ class Camera:
                 )
             return self._time, _rgb(self._image)
 
+    @property
+    def newest(self) -> Image:
+        """The last image that was read."""
+        with self._changed:
+            return _rgb(self._image)
+
     def frames(self, rate: float) -> Iterator[tuple[float, Image]]:
         """Time in seconds and image: always the newest, at most `rate` a second."""
         moment = -1.0

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from sl_nerfstudio.errors import UserError
 
+_MOST = 1000.0  # images a second, or seconds
+
 
 @dataclass(frozen=True)
 class CaptureConfig:
@@ -43,8 +45,8 @@ class CaptureConfig:
         """Raise UserError for flags that mean nothing."""
         for name in ("rate", "settle"):
             value = getattr(self, name)
-            if not 0 < value < 1000:
-                raise UserError(f"--{name} {value:g}: give a number above 0")
+            if not 0 < value < _MOST:
+                raise UserError(f"--{name} {value:g}: give a number above 0 and below {_MOST:g}")
         if self.frames is not None and self.frames < 1:
             raise UserError(f"--frames {self.frames}: give a number of at least 1")
         if self.show is not None and self.pattern is None:

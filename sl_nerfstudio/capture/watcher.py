@@ -19,6 +19,11 @@ class Watcher:
         self._window, self._screen = window, screen
         self._last = ""
 
+    @property
+    def has_window(self) -> bool:
+        """Whether pictures are shown."""
+        return self._window is not None
+
     def look(
         self,
         picture: Callable[[], Picture],

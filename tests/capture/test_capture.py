@@ -2,12 +2,15 @@
 
 import re
 import shlex
+import time
 
 import cv2
 import numpy as np
 import pytest
 
 from sl_nerfstudio.capture import camera as camera_module
+from sl_nerfstudio.capture.grid_view import GridReader
+from sl_nerfstudio.capture.windows import Window
 from sl_nerfstudio.cli.capture import main
 from sl_nerfstudio.decoding.graycode.decoder import GrayCodeDecoder
 from sl_nerfstudio.pattern.graycode import GrayCode
@@ -94,6 +97,8 @@ def test_a_folder_is_continued_and_nothing_is_kept_twice(command, video, pattern
     command(main, *flags, "--frames", "2")
     files = {path: path.read_bytes() for path in (tmp_path / "c").glob("frame*")}
     assert len(files) == 2
+    command(main, *flags, "--frames", "2")  # there are two
+    assert len(list((tmp_path / "c").glob("frame*"))) == 2
     command(main, *flags)
     assert len(list((tmp_path / "c").glob("frame*"))) == 3
     assert all(path.read_bytes() == content for path, content in files.items())
@@ -119,8 +124,6 @@ def test_the_preview_shows_what_is_decoded_and_keys_keep_and_end(
 
 
 def _recording(pictures, pygame):
-    from sl_nerfstudio.capture.windows import Window
-
     show = Window.show
 
     def record(self, picture):
@@ -130,6 +133,27 @@ def _recording(pictures, pygame):
         pictures.append(picture)
 
     return record
+
+
+def test_the_preview_of_a_camera_goes_on_while_an_image_is_read(
+    command, keyboard, filmed_screen, pattern, tmp_path, monkeypatch
+):
+    reads, shown = [], []
+    read = GridReader.read
+
+    def slowly(self, image):
+        reads.append(len(shown))
+        while len(reads) == 2 and len(shown) < reads[1] + 3:  # until three more pictures were shown
+            time.sleep(0.001)
+        return read(self, image)
+
+    monkeypatch.setattr(GridReader, "read", slowly)
+    monkeypatch.setattr(Window, "show", lambda self, picture: shown.append(picture))
+    keyboard.press("", "", "SPACE", *[""] * 1000)  # pressed while the second image is read
+    filmed_screen.take = lambda: photograph(PATTERN.render(1), PLACES[0])
+    command(main, "--camera", 0, "--output", tmp_path / "c", "--pattern", pattern, "--frames", 2, "--rate", 500)
+    assert len(shown) >= len(reads) + 3
+    assert len(reads) == 2 and len(list((tmp_path / "c").glob("*.png"))) == 2  # the view was known, so the key kept it
 
 
 def test_the_grid_can_be_shown_by_the_same_command(command, keyboard, video, pattern, tmp_path):
