@@ -49,7 +49,8 @@ def _no_display(what: str) -> UserError:
     return UserError(
         f"there is no display to show anything on ({what})\n"
         "    cause:  the command runs outside a graphical session, for example over ssh\n"
-        "    remedy: run it in the graphical session of the computer to which the display is connected"
+        "    remedy: run it in the graphical session of the computer to which the display is connected; "
+        "sl-capture --headless needs none"
     )
 
 
