@@ -2,6 +2,7 @@
 
 .venv/bin/python docs/make_pictures.py architecture           # docs/pictures/architecture.png, from the code's imports
 .venv/bin/python docs/make_pictures.py demo [outputs/demo]    # docs/pictures/demo.png, from the output of `make demo`
+.venv/bin/python docs/make_pictures.py capture [captures]       # docs/pictures/capture.png, from sl-synth --images-only
 """
 
 import ast
@@ -32,6 +33,36 @@ from sl_nerfstudio.scan import read_ground_truth, read_scan
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
 INK, MUTED, PLAIN, NERFSTUDIO = "#1d2733", "#66727f", "#2563a8", "#c2571a"
+
+# ------------------------------------------------------------------ the preview of sl-capture
+
+
+def draw_capture(captures: Path) -> None:
+    """The preview after four frames, at the fifth."""
+    import cv2
+
+    from sl_nerfstudio.capture.free_hand import picture_of
+    from sl_nerfstudio.capture.grid_view import GridReader
+    from sl_nerfstudio.capture.picture import compose, draw_map
+    from sl_nerfstudio.capture.selection import Selection
+    from sl_nerfstudio.cli.capture_words import view_lines
+    from sl_nerfstudio.pattern.files import read_layout
+    from sl_nerfstudio.pattern.grid import GridPattern
+    from sl_nerfstudio.scan.images import read_image
+
+    layout = read_layout(captures / "pattern.json")
+    if not isinstance(layout, GridPattern):
+        raise SystemExit(f"{captures} were not captured under a coded grid")
+    reader = GridReader(layout)
+    selection = Selection((reader.pattern.rows, reader.pattern.columns))
+    images = [read_image(path) for path in sorted((captures / "images").iterdir())[:5]]
+    for image in images[:4]:
+        selection.add(reader.read(image))
+    view = reader.read(images[4])
+    lines = view_lines(view, selection.judge(view, 0.0), selection)
+    picture = compose(picture_of(images[4], view), [draw_map(selection.times_seen)], lines)
+    cv2.imwrite(str(PICTURES / "capture.png"), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
 
 # ------------------------------------------------------------------ the demo
 
@@ -219,6 +250,8 @@ def main(arguments: Sequence[str]) -> None:
     """Draw the picture that the first argument names."""
     if arguments[:1] == ["architecture"]:
         draw_architecture()
+    elif arguments[:1] == ["capture"]:
+        draw_capture(Path(arguments[1] if len(arguments) > 1 else "outputs/demo-images/captures"))
     elif arguments[:1] == ["demo"]:
         draw_demo(Path(arguments[1] if len(arguments) > 1 else "outputs/demo"))
     else:

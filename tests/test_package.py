@@ -26,7 +26,10 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SCRIPTS: dict[str, str] = PROJECT["scripts"]
 
 # Dependencies whose import name differs from the name of the distribution.
-IMPORTED_AS = {"opencv-python-headless": "cv2", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
+IMPORTED_AS = {
+    "opencv-python-headless": "cv2", "pillow": "PIL", "pygame-ce": "pygame", "pyyaml": "yaml",
+    "scikit-image": "skimage",
+}  # fmt: skip
 # Declared without being imported here, each with the reason.
 NOT_IMPORTED: dict[str, str] = {}
 
@@ -111,7 +114,8 @@ def test_exactly_one_opencv():
 def test_imported_packages_are_the_declared_dependencies():
     standard = sys.stdlib_module_names | {"sl_nerfstudio"}
     imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
-    declared = {distribution_name(text) for text in PROJECT["dependencies"]} - NOT_IMPORTED.keys()
+    extras = [text for name, texts in PROJECT["optional-dependencies"].items() if name != "dev" for text in texts]
+    declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras} - NOT_IMPORTED.keys()
     assert imported == {IMPORTED_AS.get(name, name) for name in declared}
 
 

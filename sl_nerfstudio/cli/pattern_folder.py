@@ -14,10 +14,11 @@ from sl_nerfstudio.pattern.board_page import description, encode_board, lay_out
 from sl_nerfstudio.pattern.board_values import counts, millimetres
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 from sl_nerfstudio.pattern.codes import FULL_MARGINS
+from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import PatternLayout
-from sl_nerfstudio.pattern.presets import DEFAULT_PRESET, PRESETS, Preset, longer_period, make_grid
+from sl_nerfstudio.pattern.presets import PRESETS, longer_period
 
 _SUPERSAMPLING = 4  # of pattern.png
 _DEFAULT_COUNTS = {"chessboard": "9x6", "charuco": "11x8"}
@@ -26,26 +27,37 @@ _MARKER = 0.75  # of a square
 _DIGITS = 6  # of lengths on boards: what is drawn is exactly what the text and the command say
 
 
-def write_grid(
-    output: Path,
-    print_width: float | None,
-    preset: Preset | None,
-    w: int | None,
-    h: int | None,
-    period: float | None,
-    line_width: float | None,
-    gap: float | None,
-    seed: int,
-) -> str:
-    """A coded grid; None: the preset's value. Returns what to say."""
+def write_pattern(output: Path, layout: PatternLayout, print_width: float | None) -> str:
+    """Write a pattern that is projected into a new folder; returns what to say."""
     with NewFolder(output) as folder:
-        grid = make_grid(preset or DEFAULT_PRESET, w, h, period, line_width, gap, seed)
-        _write_layout(folder, grid, print_width)
-    upright, rolled = grid.margins
+        for index, image in enumerate(layout.sequence() if isinstance(layout, GrayCode) else ()):
+            folder.write(f"sequence/{index:02d}.png", _image_file(image, print_width))
+        picture = np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8)
+        folder.write("pattern.png", _image_file(picture, print_width))
+        folder.write("pattern.json", layout.encode(), last=True)
+    if isinstance(layout, GrayCode):
+        return (
+            f"wrote a Gray-code sequence of {layout.images} images to {output}: show them in the order of their names"
+        )
+    if not isinstance(layout, GridPattern):
+        raise TypeError(f"{layout.description} is not written by this command")
+    upright, rolled = layout.margins
     return (
-        f"wrote a grid of {grid.columns} x {grid.rows} nodes to {output}: 3 x 3 windows differ in at least "
-        f"{upright} of 9 symbols, in {rolled} where the camera may roll{margin_warning(grid)}"
+        f"wrote a grid of {layout.columns} x {layout.rows} nodes to {output}: 3 x 3 windows differ in at least "
+        f"{upright} of 9 symbols, in {rolled} where the camera may roll{margin_warning(layout)}"
     )
+
+
+def require_pattern(folder: Path, layout: PatternLayout) -> None:
+    """Raise UserError unless the folder holds this very pattern."""
+    found = read_layout(folder / "pattern.json")
+    if found.encode() != layout.encode():
+        raise UserError(
+            f"{folder}: holds {found.description} of {found.w} x {found.h} pixels that is not the one of these flags\n"
+            "    cause:  it was written with other flags\n"
+            "    remedy: leave out all flags but --output, --show and --every to show what the folder holds, or choose "
+            "another output"
+        )
 
 
 def margin_warning(grid: GridPattern) -> str:
@@ -61,22 +73,6 @@ def margin_warning(grid: GridPattern) -> str:
         f"    cause:  {grid.columns} x {grid.rows} nodes are too many for five symbols\n"
         f"    remedy: give --period {period} or more{presets}"
     )
-
-
-def write_gray_code(
-    output: Path, print_width: float | None, preset: Preset | None, w: int | None, h: int | None, cell: int
-) -> str:
-    """A Gray-code sequence; None: the preset's value. Returns what to say."""
-    preset_w, preset_h, _ = PRESETS[preset or DEFAULT_PRESET]
-    with NewFolder(output) as folder:
-        try:
-            layout = GrayCode(preset_w if w is None else w, preset_h if h is None else h, cell)
-        except ValueError as error:
-            raise UserError(f"--width, --height, --cell: {error}") from error
-        for index, image in enumerate(layout.sequence()):
-            folder.write(f"sequence/{index:02d}.png", _image_file(image, print_width))
-        _write_layout(folder, layout, print_width)
-    return f"wrote a Gray-code sequence of {layout.images} images to {output}: show them in the order of their names"
 
 
 def write_board(
@@ -145,13 +141,6 @@ def _board(
 
 def _rounded(length: float) -> float:
     return float(f"{length:.{_DIGITS}g}")
-
-
-def _write_layout(folder: NewFolder, layout: PatternLayout, print_width: float | None) -> None:
-    """pattern.png and pattern.json."""
-    picture = np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8)
-    folder.write("pattern.png", _image_file(picture, print_width))
-    folder.write("pattern.json", layout.encode(), last=True)
 
 
 def _image_file(image: ndarray, print_width: float | None) -> bytes:

@@ -1,9 +1,10 @@
-"""Coded grids for common projectors."""
+"""Coded grids and Gray-code sequences for common projectors."""
 
 import math
 from typing import Literal
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import MAX_NODES, MAX_PIXELS, GridPattern
 
 Preset = Literal["800x800", "1280x720", "1920x1080", "3840x2160", "doe"]
@@ -54,6 +55,17 @@ def make_grid(
         )
     except ValueError as error:
         raise UserError(f"--width, --height, --period, --line-width, --gap: {error}") from error
+
+
+def make_gray_code(
+    preset: Preset = DEFAULT_PRESET, w: int | None = None, h: int | None = None, cell: int = 2
+) -> GrayCode:
+    """The Gray-code sequence of a preset's size, or of another. Raises UserError for one that cannot be."""
+    preset_w, preset_h, _ = PRESETS[preset]
+    try:
+        return GrayCode(preset_w if w is None else w, preset_h if h is None else h, cell)
+    except ValueError as error:
+        raise UserError(f"--width, --height, --cell: {error}") from error
 
 
 def longer_period(w: int, h: int) -> int:

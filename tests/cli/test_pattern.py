@@ -42,11 +42,11 @@ def test_a_folder_with_a_grid(monkeypatch, tmp_path, capsys):
 
 def test_too_many_nodes_are_warned_of_and_the_remedy_helps(monkeypatch, tmp_path, capsys):
     """Where (3, 2) cannot be had, the roll of the camera counts before the second misread symbol."""
-    flags = ["--width", 480, "--height", 270]
+    flags = ["--width", 355, "--height", 200]
     _run(monkeypatch, "--output", tmp_path / "a", *flags, "--period", 5)
     said = capsys.readouterr().out
     assert "differ in at least 2 of 9 symbols, in 2 where the camera may roll" in said
-    assert "warning: misread symbols are mistaken" in said and "96 x 54 nodes are too many" in said
+    assert "warning: misread symbols are mistaken" in said and "71 x 40 nodes are too many" in said
     period = re.search(r"--period (\d+) or more", said)[1]
     _run(monkeypatch, "--output", tmp_path / "b", *flags, "--period", period)
     said = capsys.readouterr().out

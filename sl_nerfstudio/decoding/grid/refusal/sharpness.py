@@ -1,5 +1,7 @@
 """Measurements of sharpness: of the edges of an image, and of the lines of a grid whose phases are known."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -61,8 +63,7 @@ def line_blur(
     measured = _overtone(contrast[where], x[where], y[where])
     if measured is None:
         return None
-    overtones = [_drawn_overtone(pattern, blur) for blur in _BLURS]
-    known = [overtone for overtone in overtones if overtone is not None]
+    known = [overtone for overtone in _drawn_overtones(pattern) if overtone is not None]
     return float(np.interp(-measured, -np.array(known), _BLURS[: len(known)]))  # overtones fall as the blur grows
 
 
@@ -77,14 +78,20 @@ def _overtone(contrast: Float[ndarray, "n"], x: Float[ndarray, "n"], y: Float[nd
     return second / first if first > _LEAST_FIRST else None
 
 
-def _drawn_overtone(pattern: GridPattern, blur: float) -> float | None:
-    """The same for the pattern as drawn with a blur in periods, at the scale of a rectified image."""
+@lru_cache(maxsize=4)
+def _drawn_overtones(pattern: GridPattern) -> tuple[float | None, ...]:
+    """The same for the pattern as drawn with each of the blurs, at the scale of a rectified image."""
     scale = RECTIFIED_PERIOD / pattern.period
-    picture = cv2.GaussianBlur(pattern.render(1), (0, 0), blur * pattern.period)
     size = (round(pattern.w * scale) // STRIDE * STRIDE, round(pattern.h * scale) // STRIDE * STRIDE)
-    image = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    contrast = cv2.resize(network_channels(image)[0], None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
-    h, w = contrast.shape
-    column, row = np.meshgrid((np.arange(w) + 0.5) / w * pattern.w, (np.arange(h) + 0.5) / h * pattern.h)
-    x, y = (column - pattern.x0) / pattern.period, (row - pattern.y0) / pattern.period
-    return _overtone(contrast.ravel(), (x - np.rint(x)).ravel(), (y - np.rint(y)).ravel())
+    column, row = np.meshgrid(*((np.arange(n // STRIDE) + 0.5) / (n // STRIDE) for n in size))
+    x, y = (column * pattern.w - pattern.x0) / pattern.period, (row * pattern.h - pattern.y0) / pattern.period
+    to_line = (x - np.rint(x)).ravel(), (y - np.rint(y)).ravel()
+    drawn = pattern.render(1)
+    found = []
+    for blur in _BLURS:
+        picture = cv2.GaussianBlur(drawn, (0, 0), blur * pattern.period)
+        image = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+        channel = network_channels(image)[0]
+        contrast = cv2.resize(channel, None, fx=1 / STRIDE, fy=1 / STRIDE, interpolation=cv2.INTER_AREA)
+        found.append(_overtone(contrast.ravel(), *to_line))
+    return tuple(found)

@@ -1,0 +1,145 @@
+"""sl-pattern --show: what the display shows is the pattern, pixel for pixel."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.cli.pattern import main
+from sl_nerfstudio.pattern.files import read_layout
+from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.presets import MOST_NODES, longer_period
+from sl_nerfstudio.scan.images import read_image
+
+DISPLAY = (1024, 768)  # of SDL's dummy driver
+SMALL = ["--width", 160, "--height", 120]
+GRAY = ["--kind", "gray-code", "--width", 64, "--height", 32, "--cell", 8]
+
+
+@pytest.fixture
+def show(keyboard, command, tmp_path):
+    return lambda *flags: command(main, "--output", tmp_path / "p", *flags)
+
+
+def fails(capsys, call, message):
+    with pytest.raises(SystemExit) as stop:
+        call()
+    said = capsys.readouterr().err
+    assert stop.value.code == 1 and message in said and "remedy:" in said
+    return said
+
+
+def test_without_a_size_the_pattern_gets_that_of_the_display(show, keyboard, tmp_path):
+    show("--show", 0, "--period", 64)
+    layout = read_layout(tmp_path / "p" / "pattern.json")
+    assert (layout.w, layout.h, layout.period) == (*DISPLAY, 64)
+    (screen,) = keyboard.different()
+    assert np.array_equal(screen, np.repeat(read_image(tmp_path / "p" / "pattern.png")[..., None], 3, -1))
+
+
+@pytest.mark.parametrize("size", [(1024, 768), (1280, 720), (1920, 1080), (3840, 2160), (854, 480), (100, 1000)])
+def test_without_a_period_there_are_as_many_nodes_as_the_codes_allow(size):
+    period = longer_period(*size)
+    assert (size[0] // period) * (size[1] // period) <= MOST_NODES < size[0] * size[1] / (period - 1) ** 2
+
+
+def test_smaller_patterns_are_shown_in_the_middle_and_not_scaled(show, keyboard, tmp_path, capsys):
+    show("--show", 0, *SMALL)
+    (screen,) = keyboard.different()
+    left, top = (1024 - 160) // 2, (768 - 120) // 2
+    image = read_image(tmp_path / "p" / "pattern.png")
+    assert np.array_equal(screen[top : top + 120, left : left + 160, 1], image)
+    assert screen.sum() == 3 * image.astype(int).sum()  # black around it
+    assert f"Pixel (0, 0) of the pattern is pixel ({left}, {top}) of the display" in capsys.readouterr().out
+
+
+def test_a_written_pattern_is_shown_again(show, keyboard, tmp_path, capsys):
+    show(*SMALL)
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "p").iterdir()}
+    show("--show", 0)  # whatever it is
+    show("--show", 0, *SMALL)  # this very pattern
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "p").iterdir()} == files
+    assert len(keyboard.different()) == 1
+    fails(capsys, lambda: show("--show", 0, *SMALL, "--seed", 3), "is not the one of these flags")
+    fails(capsys, lambda: show("--show", 0, *GRAY), "holds a coded grid of 160 x 120 pixels that is not")
+    fails(capsys, lambda: show(*SMALL), "is not empty")
+
+
+def test_keys_lead_through_a_sequence(show, keyboard, capsys):
+    keyboard.press("SPACE", "RIGHT", "a", "LEFT", "LEFT", "LEFT", "RETURN")
+    show("--show", 0, *GRAY)
+    patterns = list(GrayCode(64, 32, 8).sequence())
+    seen = [screen[368:400, 480:544, 0] for screen in keyboard.different()]
+    for screen, index in zip(seen, (0, 1, 2, 1, 0, 1), strict=True):
+        assert np.array_equal(screen, patterns[index])
+    assert "  02  x bit 2\n" in capsys.readouterr().out
+
+
+def test_after_the_last_image_of_a_sequence_comes_the_first(show, keyboard, capsys):
+    keyboard.press(*["SPACE"] * 12)
+    show("--show", 0, *GRAY)
+    assert [line[2:4] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")] == [
+        *(f"{k:02d}" for k in range(12)), "00",
+    ]  # fmt: skip
+
+
+def test_with_a_timer_every_image_is_shown_once(show, keyboard, capsys):
+    keyboard.press(*[""] * 500)
+    show("--show", 0, "--every", "0.001", *GRAY)
+    shown = [screen[368:400, 480:544, 0] for screen in keyboard.different()]
+    assert len(shown) == 12 and all(map(np.array_equal, shown, GrayCode(64, 32, 8).sequence()))
+    assert max(keyboard.waits) == 1  # milliseconds
+
+
+def test_a_pattern_larger_than_the_display_is_refused_before_it_is_written(show, tmp_path, capsys):
+    said = fails(
+        capsys, lambda: show("--show", 0, "--preset", "1280x720"), "the pattern has 1280 x 720 pixels, the display"
+    )
+    assert "1024 x 768" in said and "a pattern is never scaled" in said and not (tmp_path / "p").exists()
+
+
+def test_a_picture_that_was_changed_is_refused(show, tmp_path, capsys):
+    from PIL import Image
+
+    show(*SMALL)
+    Image.new("L", (160, 121)).save(tmp_path / "p" / "pattern.png")
+    fails(capsys, lambda: show("--show", 0), "is no grey image of 160 x 120 pixels, as pattern.json says")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--show", "1"], "--show 1: there is no display of this number; displays are 0 (1024 x 768)"),
+        (["--show", "-1"], "--show -1: there is no display"),
+    ],
+)
+def test_displays_that_are_not_there(show, capsys, tmp_path, flags, message):
+    fails(capsys, lambda: show(*flags), message)
+    assert not (tmp_path / "p").exists()
+
+
+def test_flags_that_do_not_fit(show, capsys):
+    for flags, message in (
+        (["--every", "1", *GRAY], "--every 1: give seconds above 0, together with --show"),
+        (["--every", "0", "--show", "0"], "--every 0: give seconds above 0"),
+        (
+            ["--show", "0", "--kind", "chessboard", "--print-width", "180"],
+            "--show: has no meaning for --kind chessboard",
+        ),
+        (["--show", "0", "--every", "2", *SMALL], "--every 2: a coded grid is one image; leave it out"),
+    ):
+        with pytest.raises(SystemExit):
+            show(*flags)
+        assert message in capsys.readouterr().err
+
+
+def test_without_a_screen_the_reason_is_said(show, monkeypatch, capsys):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    fails(capsys, lambda: show("--show", 0), "there is no display to show anything on")
+
+
+def test_without_pygame_the_command_that_installs_it_is_said(show, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    fails(capsys, lambda: show("--show", 0), "pip install 'sl-nerfstudio[show]'")
