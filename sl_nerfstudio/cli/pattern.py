@@ -8,12 +8,13 @@ import tyro
 
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 _GRID_FLAGS = ("preset", "width", "height", "period", "line_width", "gap", "seed", "print_width")
 _BOARD_FLAGS = ("print_width", "square")
 _FLAGS = {
     "grid": _GRID_FLAGS,
-    "gray-code": ("preset", "width", "height", "cell", "print_width"),
+    "gray-code": ("preset", "width", "height", "cell", "sequence", "print_width"),
     "chessboard": (*_BOARD_FLAGS, "corners"),
     "charuco": (*_BOARD_FLAGS, "squares", "marker", "dictionary"),
 }
@@ -50,6 +51,8 @@ class Arguments:
     """selects one of the possible code arrays; default: 0"""
     cell: int | None = None
     """side of the squares that Gray code numbers; default: 2"""
+    sequence: SequenceName | None = None
+    """order of the images of a Gray code, by the program that shows them so; default: sl-pattern"""
     print_width: float | None = None
     """width on paper or slide in millimetres: of a pattern, for printing programs, or of all squares of a board"""
     corners: str | None = None
@@ -79,7 +82,9 @@ def _write() -> None:
         lengths = a.width, a.height, a.period, a.line_width, a.gap
         said = write_grid(a.output, a.print_width, a.preset, *lengths, a.seed or 0)
     elif a.kind == "gray-code":
-        said = write_gray_code(a.output, a.print_width, a.preset, a.width, a.height, 2 if a.cell is None else a.cell)
+        cell = 2 if a.cell is None else a.cell
+        order = a.sequence or "sl-pattern"
+        said = write_gray_code(a.output, a.print_width, a.preset, a.width, a.height, cell, order)
     else:
         said = write_board(a.output, a.print_width, a.kind, a.corners or a.squares, a.square, a.marker, a.dictionary)
     print(said)

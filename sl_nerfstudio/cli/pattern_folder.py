@@ -18,6 +18,7 @@ from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.pattern.presets import DEFAULT_PRESET, PRESETS, Preset, longer_period, make_grid
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 _SUPERSAMPLING = 4  # of pattern.png
 _DEFAULT_COUNTS = {"chessboard": "9x6", "charuco": "11x8"}
@@ -64,13 +65,19 @@ def margin_warning(grid: GridPattern) -> str:
 
 
 def write_gray_code(
-    output: Path, print_width: float | None, preset: Preset | None, w: int | None, h: int | None, cell: int
+    output: Path,
+    print_width: float | None,
+    preset: Preset | None,
+    w: int | None,
+    h: int | None,
+    cell: int,
+    sequence: SequenceName,
 ) -> str:
     """A Gray-code sequence; None: the preset's value. Returns what to say."""
     preset_w, preset_h, _ = PRESETS[preset or DEFAULT_PRESET]
     with NewFolder(output) as folder:
         try:
-            layout = GrayCode(preset_w if w is None else w, preset_h if h is None else h, cell)
+            layout = GrayCode.in_order(sequence, preset_w if w is None else w, preset_h if h is None else h, cell)
         except ValueError as error:
             raise UserError(f"--width, --height, --cell: {error}") from error
         for index, image in enumerate(layout.sequence()):

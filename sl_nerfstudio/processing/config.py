@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,8 @@ class ProcessConfig:
     images: Path
     """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame"""
     pattern: Path
-    """pattern.json of the projected pattern, as written by sl-pattern or sl-synth"""
+    """pattern.json of the projected pattern, as written by sl-pattern or sl-synth; for the Gray code of another program
+    the projector's resolution, as 1024x768"""
     intrinsics: Path
     """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt"""
     output: Path
@@ -28,6 +30,12 @@ class ProcessConfig:
     """graycode_step with which procam-calibration was run, if the intrinsics come from it"""
     decoder: str | None = None
     """decoder of the captures: network for a coded grid, graycode for Gray code; default: the one for the pattern"""
+    sequence: SequenceName | None = None
+    """order of the images of a Gray-code sequence, by the program that showed it; default: what pattern.json states, or
+    for a --pattern that is a resolution what the images show"""
+    cell: int | None = None
+    """side of the squares that a Gray code numbers, in projector pixels, if --pattern is a resolution; default: what
+    the number of images says"""
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
     50 mm" with pixels x, y; without it, the unit of the scan is arbitrary"""
@@ -55,6 +63,7 @@ class ProcessConfig:
         rules = (
             (self.jobs is None or self.jobs >= 1, "--jobs", self.jobs, "give at least 1"),
             (self.procam_step >= 1, "--procam-step", self.procam_step, "give at least 1"),
+            (self.cell is None or self.cell >= 1, "--cell", self.cell, "give at least 1"),
             (self.seed >= 0, "--seed", self.seed, "seeds are at least 0"),
         )
         for holds, flag, value, why in rules:

@@ -7,6 +7,8 @@ from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
+from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.processing.capture_files.sequences import in_order, recognise_sequence, resolution
 from sl_nerfstudio.processing.captures import Captures, find_captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
@@ -29,9 +31,9 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     """Read what the flags name. Raises UserError for flags and files that are wrong."""
     config.check()
     known = None if config.known_length is None else parse_known_length(config.known_length)
-    layout = read_layout(config.pattern)
+    layout, captures = _layout_and_captures(config)
     decoder = choose_decoder(layout, config.decoder, config.pattern)
-    captures = find_captures(config.images, decoder.sequence)
+    captures = captures or find_captures(config.images, decoder.sequence)
     names = [frame.name for frame in captures.frames]
     camera = read_device_file(config.intrinsics, "camera", captures.size, procam_step=config.procam_step)
     projector = read_device_file(
@@ -48,6 +50,19 @@ def read_inputs(config: ProcessConfig) -> Inputs:
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),
     )
+
+
+def _layout_and_captures(config: ProcessConfig) -> tuple[PatternLayout, Captures | None]:
+    """The pattern; and the captures, if they had to be looked at to know it."""
+    size = resolution(config.pattern)
+    if size is not None:
+        captures = find_captures(config.images, sequences=True)
+        return recognise_sequence(captures, size, config.sequence, config.cell), captures
+    layout = read_layout(config.pattern)
+    if config.cell is not None:
+        raise UserError("--cell: pattern.json states it\n    cause:  it is only for a --pattern like 1024x768\n"
+                        "    remedy: leave --cell out")  # fmt: skip
+    return (layout if config.sequence is None else in_order(layout, config.sequence, config.pattern)), None
 
 
 def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:

@@ -11,6 +11,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.processing.capture_files.sequences import describe_sequence
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
@@ -52,6 +54,8 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     inputs = read_inputs(config)
     job, captures = inputs.job, inputs.captures
     log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {job.decoder.name}")
+    if isinstance(job.decoder.layout, GrayCode):
+        log(describe_sequence(job.decoder.layout))
 
     results = run_frame_stage(config, job, captures)
     log(describe_frame_stage(results))

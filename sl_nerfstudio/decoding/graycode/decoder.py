@@ -15,7 +15,7 @@ class GrayCodeDecoder(Decoder[GrayCode]):
     """Decodes a folder of images: one photograph of every pattern of the sequence."""
 
     name: ClassVar[str] = "graycode"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     reads: ClassVar[str] = GrayCode.kind
     sequence: ClassVar[bool] = True
 
