@@ -169,8 +169,9 @@ def _under_even_light(pose: BoardPhotographs, decoder: Decoder[Any] | None) -> F
     layout = None if decoder is None else decoder.layout
     if not isinstance(layout, GrayCode) or len(pose.images) != layout.images:
         return as_grey(read_image(pose.images[0]))
-    places = [place for axis in (0, 1) for pair in layout.bit_images(axis) for place in pair]
-    return np.mean([as_grey(read_image(pose.images[place])) for place in places], axis=0, dtype=np.float32)
+    return np.mean(
+        [as_grey(read_image(pose.images[place])) for place in layout.even_images()], axis=0, dtype=np.float32
+    )
 
 
 def _pattern_and_plain(pose: BoardPhotographs, board: Board) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
