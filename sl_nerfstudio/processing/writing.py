@@ -17,7 +17,7 @@ from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.photographs import read_photograph
 from sl_nerfstudio.scan.writing import ScanWriter, encode_json
 
 _SUPERSAMPLING = 4  # of pattern.png
@@ -62,6 +62,7 @@ def write_scan(
                 coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
+                camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
                 T_world_projector=poses.adjusted.poses.T_world_projector[k],
                 pose_sigma=poses.adjusted.sigma[k],
@@ -74,6 +75,6 @@ def write_scan(
 def _image(frame: FrameStageResult, shown: int) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
     """The capture (of a sequence the image in full light, by its place); None if it cannot be read."""
     try:
-        return read_image(frame.frame.images[shown])
+        return read_photograph(frame.frame.images[shown])
     except (FileError, IndexError):
         return None

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.decoding.graycode.phase import cell_places, phase_coordinates
-from sl_nerfstudio.decoding.graycode.photographs import Image, Photographs, several_sizes
+from sl_nerfstudio.decoding.graycode.photographs import Image, Photographs, check_sizes
 from sl_nerfstudio.decoding.graycode.subcell import LEVELS, Cells, subcell_coordinates
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
@@ -136,9 +136,7 @@ def check_count(count: int, layout: GrayCode) -> None:
 
 def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
     check_count(len(images), layout)
-    sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
-    if len(sizes) > 1:
-        raise several_sizes(sizes)
+    check_sizes(images)
 
 
 def _check_light(images: Sequence[Image], layout: GrayCode, light: Light) -> None:

@@ -87,10 +87,12 @@ class Photographs:
         return MAD_TO_SIGMA / scale * float(np.median(np.abs(rest[1:-1, 1:-1] - around)))
 
 
-def several_sizes(sizes: Sequence[str]) -> DecodingError:
-    """The error of a sequence whose images have several sizes, given as "640 x 480"."""
-    return DecodingError(
-        f"holds images of several sizes ({', '.join(sizes)})",
-        "the folder holds images of another camera or resolution, too",
-        "keep one folder for each frame, with nothing but its own images",
-    )
+def check_sizes(images: Sequence[Image]) -> None:
+    """Raise DecodingError unless all images of a sequence have one size."""
+    sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
+    if len(sizes) > 1:
+        raise DecodingError(
+            f"holds images of several sizes ({', '.join(sizes)})",
+            "the folder holds images of another camera or resolution, too",
+            "keep one folder for each frame, with nothing but its own images",
+        )

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.decoding.decoded import DecodingError
 from sl_nerfstudio.decoding.graycode.order_check import OrderCheck, check_order, one_direction, sine_phase
-from sl_nerfstudio.decoding.graycode.photographs import Image, several_sizes
+from sl_nerfstudio.decoding.graycode.photographs import Image, check_sizes
 from sl_nerfstudio.decoding.graycode.samples import Samples, take_samples
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.sequence import ORDERS, SequenceName
@@ -19,6 +19,7 @@ _MOST_PERIODS = 200  # of a sine across the pattern
 _LEAST_LOCKED = 0.3  # length of the mean unit vector: the two sines of an axis belong together
 _SMOOTHING = 1.5  # samples
 _NAMED = 4  # images in a message
+_MIRRORED = 0.1  # of the samples: where fewer turn as the camera's axes, the pattern is seen as in a mirror
 _ONE_DIRECTION = DecodingError(
     "shows stripes in one direction only",
     "only the columns of the projector were coded, or only its rows",
@@ -37,9 +38,7 @@ def layout_of_images(
     With `name`, only that program's order is considered, with `cell` only that side of a cell. What remains is decided
     by the number of images, and by what they show. Raises DecodingError if nothing fits, or more than one sequence.
     """
-    sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
-    if len(sizes) != 1:
-        raise several_sizes(sizes)
+    check_sizes(images)
     samples = take_samples(images)
     try:
         possible = possible_layouts(len(images), size, name, cell)
@@ -121,13 +120,34 @@ def _nothing_fits(checks: Sequence[tuple[GrayCode, OrderCheck]]) -> DecodingErro
         )
     layout, nearest = min(checks, key=lambda item: len(item[1].misplaced))
     if nearest.misplaced:
-        listed = "; ".join(f"image {m.place} ({m.expected}) {m.seen}" for m in nearest.misplaced[:_NAMED])
-        more = f"; and {len(nearest.misplaced) - _NAMED} more" if len(nearest.misplaced) > _NAMED else ""
+        names = [f"image {place}" for place in range(layout.images)]
         return DecodingError(
-            f"shows no known sequence; nearest is {_described(layout)}, but counted from 0 {listed}{more}",
+            f"shows no known sequence; nearest is {_described(layout)}, but counted from 0 {_listed(nearest, names)}",
             "images are in the wrong order or of another frame, or something moved in between",
             "put the images in the order of projection, or give a pattern.json that lists what each image shows",
         )
+    return _mirrored(layout)
+
+
+def order_fault(check: OrderCheck, layout: GrayCode, names: Sequence[str]) -> DecodingError | None:
+    """The error of photographs called `names` that do not show the sequence; None where nothing contradicts it."""
+    if check.misplaced:
+        return DecodingError(
+            f"is not in the order of the sequence ({layout.order}): {_listed(check, names)}",
+            "images are exchanged, doubled or of another frame, the sequence is that of another program, or something "
+            "moved in between",
+            "name the images so that sorting puts them in the order of projection; --sequence selects another order",
+        )
+    return _mirrored(layout) if check.turning is not None and check.turning < _MIRRORED else None
+
+
+def _listed(check: OrderCheck, names: Sequence[str]) -> str:
+    found = [f"{names[m.place]} ({m.expected}) {m.seen}" for m in check.misplaced[:_NAMED]]
+    more = len(check.misplaced) - _NAMED
+    return "; ".join(found) + (f"; and {more} more" if more > 0 else "")
+
+
+def _mirrored(layout: GrayCode) -> DecodingError:
     return DecodingError(
         f"shows {_described(layout)} as in a mirror",
         "rows and columns, or an image and its inverse, are exchanged, or the images are mirrored",

@@ -1,9 +1,11 @@
 """The sequence of a Gray code that another program showed: by its name, by the images, or both."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.graycode.decode import check_count
 from sl_nerfstudio.decoding.graycode.recognition import layout_of_images, possible_layouts
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.graycode import GrayCode
@@ -11,7 +13,7 @@ from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.pattern.sequence import SequenceName
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.photographs import read_photograph
 
 _RESOLUTION = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
 _LOOKED_AT = 3  # frames
@@ -41,6 +43,30 @@ def in_order(layout: PatternLayout, name: SequenceName, path: Path) -> GrayCode:
     return GrayCode.in_order(name, layout.w, layout.h, layout.cell)
 
 
+def incomplete(captures: Captures, layout: GrayCode) -> dict[str, FileError]:
+    """The fault of every frame that has not one image for each pattern, and the number that its names lack."""
+    faults = {}
+    for frame in captures.frames:
+        try:
+            check_count(len(frame.images), layout)
+        except DecodingError as error:
+            missing = _missing_numbers([path.stem for path in frame.images])
+            gap = f" (by the names, {', '.join(missing[:3])} is missing)" if missing else ""
+            problem = error.problem + gap
+            faults[frame.name] = FileError(frame.images[0].parent, problem, error.cause, error.remedy)
+    return faults
+
+
+def _missing_numbers(stems: Sequence[str]) -> list[str]:
+    """Numbers left out where names end in successive numbers, as "17"."""
+    found = [re.search(r"(\d+)$", stem) for stem in stems]
+    numbers = [int(match[1]) for match in found if match is not None]
+    if len(numbers) != len(stems) or numbers != sorted(set(numbers)):
+        return []
+    gaps = [n for n in range(numbers[0], numbers[-1]) if n not in set(numbers)] if len(numbers) > 1 else []
+    return [str(n) for n in gaps] if len(gaps) <= len(numbers) // 4 + 1 else []
+
+
 def recognise_sequence(
     captures: Captures, size: tuple[int, int], name: SequenceName | None, cell: int | None
 ) -> GrayCode:
@@ -61,7 +87,7 @@ def recognise_sequence(
             if len(possible) == 1 and possible[0].bit_images(0) and name is not None:
                 found.setdefault(possible[0], folder)  # nothing to recognise: a frame that does not fit says so itself
                 continue
-            found.setdefault(layout_of_images([read_image(p) for p in frame.images], size, name, cell), folder)
+            found.setdefault(layout_of_images([read_photograph(p) for p in frame.images], size, name, cell), folder)
         except FileError as error:
             errors.append(error)
         except DecodingError as error:
