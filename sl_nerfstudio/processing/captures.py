@@ -24,6 +24,19 @@ class CapturedFrame:
     camera: str = ""  # the name of its camera; "" if there is only one
 
 
+class SeveralFaults(FileError):
+    """All faults of one frame, in one message."""
+
+    def __init__(self, folder: Path, errors: Sequence[FileError]) -> None:
+        """`folder` holds the frame's images."""
+        listed = [f"{e.path.name if e.path != folder else 'the folder'} {e.problem}" for e in errors]
+        more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+        causes, remedies = (dict.fromkeys(getattr(e, key) for e in errors) for key in ("cause", "remedy"))
+        problem = f"has {len(errors)} faults: {'; '.join(listed[:_LISTED])}{more}"
+        super().__init__(folder, problem, "; ".join(causes), "; ".join(remedies))
+        self.errors = tuple(errors)
+
+
 @dataclass(frozen=True)
 class Captures:
     """All frames, and the faults of those that cannot be used."""
@@ -131,14 +144,8 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
 
 def _together(frame: CapturedFrame, errors: Sequence[FileError]) -> FileError:
     """One error of a frame for all of its faults."""
-    if len(errors) == 1:
-        return errors[0]
-    folder = frame.images[0].parent
-    listed = [f"{e.path.name if e.path != folder else 'the folder'} {e.problem}" for e in errors]
-    more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    causes, remedies = (dict.fromkeys(getattr(e, key) for e in errors) for key in ("cause", "remedy"))
-    problem = f"has {len(errors)} faults: {'; '.join(listed[:_LISTED])}{more}"
-    return FileError(folder, problem, "; ".join(causes), "; ".join(remedies))
+    every = [one for error in errors for one in (error.errors if isinstance(error, SeveralFaults) else [error])]
+    return every[0] if len(every) == 1 else SeveralFaults(frame.images[0].parent, every)
 
 
 def _other_size(path: Path, size: Size, usual: Size) -> FileError:

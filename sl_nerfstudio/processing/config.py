@@ -14,7 +14,8 @@ class ProcessConfig:
     """Make a scan folder from photographs. Without a known length, its unit is arbitrary."""
 
     images: Path
-    """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame"""
+    """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame; or a video, of
+    which the sharp frames are taken"""
     pattern: Path
     """pattern.json of the projected pattern, as written by sl-pattern or sl-synth; for the Gray code of another program
     the projector's resolution, as 1024x768"""
@@ -39,6 +40,8 @@ class ProcessConfig:
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
     50 mm" with pixels x, y; without it, the unit of the scan is arbitrary"""
+    not_mosaic: bool = False
+    """the images are not raw mosaics of a colour filter (Bayer), although their pixels alternate like those"""
     unordered: bool = False
     """the frames were not captured in order around the object: try every pair"""
     poses: Path | None = None

@@ -4,14 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sl_nerfstudio.calibration.device_files import read_device_file
-from sl_nerfstudio.calibration.formats.plain_json import camera_names
-from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.layout import PatternLayout
-from sl_nerfstudio.processing.capture_files.sequences import in_order, incomplete, recognise_sequence, resolution
-from sl_nerfstudio.processing.captures import Captures, find_captures
+from sl_nerfstudio.processing.capture_files.captured import CaptureNotes, read_captured
+from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
@@ -27,17 +22,16 @@ class Inputs:
     captures: Captures
     given: GivenPoses | None  # in the order of the captures
     known: KnownLength | None  # its frames by name
+    notes: CaptureNotes  # on the captures
 
 
 def read_inputs(config: ProcessConfig) -> Inputs:
     """Read what the flags name. Raises UserError for flags and files that are wrong."""
     config.check()
     known = None if config.known_length is None else parse_known_length(config.known_length)
-    layout, captures = _layout_and_captures(config)
-    decoder = choose_decoder(layout, config.decoder, config.pattern)
-    captures = captures or find_captures(config.images, decoder.sequence, camera_names(config.intrinsics))
-    if isinstance(layout, GrayCode):
-        captures = captures.with_faults(incomplete(captures, layout))
+    captured = read_captured(config)
+    decoder, captures = captured.decoder, captured.captures
+    layout = decoder.layout
     names = [frame.name for frame in captures.frames]
     cameras = {
         name: read_device_file(config.intrinsics, "camera", size, None, config.procam_step, name)
@@ -54,25 +48,19 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
     return Inputs(
         FrameJob(
-            config.work_folder, decoder, first, projector, config.seed, masks, cameras if "" not in cameras else {}
+            config.work_folder,
+            decoder,
+            first,
+            projector,
+            config.seed,
+            masks,
+            cameras=cameras if "" not in cameras else {},
         ),
         captures,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),
+        captured.notes,
     )
-
-
-def _layout_and_captures(config: ProcessConfig) -> tuple[PatternLayout, Captures | None]:
-    """The pattern; and the captures, if they had to be looked at to know it."""
-    size = resolution(config.pattern)
-    if size is not None:
-        captures = find_captures(config.images, True, camera_names(config.intrinsics))
-        return recognise_sequence(captures, size, config.sequence, config.cell), captures
-    layout = read_layout(config.pattern)
-    if config.cell is not None:
-        raise UserError("--cell: pattern.json states it\n    cause:  it is only for a --pattern like 1024x768\n"
-                        "    remedy: leave --cell out")  # fmt: skip
-    return (layout if config.sequence is None else in_order(layout, config.sequence, config.pattern)), None
 
 
 def _sizes_of_frames(captures: Captures) -> dict[str, tuple[int, int]]:

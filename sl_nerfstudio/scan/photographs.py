@@ -16,11 +16,11 @@ from sl_nerfstudio.scan.images import ImageHeader, as_grey, read_header_and_orie
 PHONE = (".heic", ".heif")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", *PHONE)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".x3f", ".raw")
-Pixels = UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]
+Pixels = UInt8[ndarray, "..."] | UInt16[ndarray, "..."]  # (h, w) or (h, w, 3)
 _TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that exchange rows and columns
 # Mosaics of a colour filter.
 _TILE = 16  # pixels
-_BRIGHT = 0.1  # of full scale: darker tiles are not looked at
+_BRIGHT = 0.3  # of the bright tiles: darker ones are not looked at
 _LEAST_TILES = 20
 _CONTRAST = 0.08  # of the tile's mean: between the brightest and the darkest of its four pixel classes
 _GREENS = 0.3  # of that contrast: between the two green classes
@@ -92,7 +92,8 @@ def is_mosaic(pixels: Pixels) -> bool:
     h, w = (size // _TILE * _TILE for size in grey.shape)
     tiles = grey[:h, :w].reshape(h // _TILE, _TILE // 2, 2, w // _TILE, _TILE // 2, 2).mean((1, 4))
     classes = tiles.transpose(0, 2, 1, 3).reshape(-1, 4)  # (0, 0), (0, 1), (1, 0), (1, 1) of every tile
-    classes = classes[classes.mean(1) > _BRIGHT]
+    mean = classes.mean(1)
+    classes = classes[(mean > _BRIGHT * np.percentile(mean, 95)) & (mean > 0)]
     if len(classes) < _LEAST_TILES:
         return False
     contrast = np.ptp(classes, axis=1)
@@ -107,8 +108,12 @@ def is_mosaic(pixels: Pixels) -> bool:
 
 
 def refuse_mosaic(path: Path) -> None:
-    """Raise FileError if an image is a raw mosaic."""
-    if path.suffix.lower() not in PHONE and is_mosaic(read_pixels_and_orientation(path)[0]):
+    """Raise FileError if an image is a raw mosaic; one that cannot be read is not looked at."""
+    try:
+        mosaic = path.suffix.lower() not in PHONE and is_mosaic(read_pixels_and_orientation(path)[0])
+    except FileError:
+        return
+    if mosaic:
         raise FileError(
             path,
             "is the raw mosaic of a colour filter (Bayer), not a picture",

@@ -18,7 +18,7 @@ _LARGEST_CELL = 32  # pattern pixels
 _MOST_PERIODS = 200  # of a sine across the pattern
 _LEAST_LOCKED = 0.3  # length of the mean unit vector: the two sines of an axis belong together
 _SMOOTHING = 1.5  # samples
-_NAMED = 4  # images in a message
+_NAMED = 8  # images in a message
 _MIRRORED = 0.1  # of the samples: where fewer turn as the camera's axes, the pattern is seen as in a mirror
 _ONE_DIRECTION = DecodingError(
     "shows stripes in one direction only",
