@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.sequence import SequenceName
 
@@ -19,9 +21,10 @@ class ProcessConfig:
     pattern: Path
     """pattern.json of the projected pattern, as written by sl-pattern or sl-synth; for the Gray code of another program
     the projector's resolution, as 1024x768"""
-    intrinsics: Path
-    """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt"""
-    output: Path
+    intrinsics: Path | None = None
+    """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt; without those of
+    the camera, its focal length comes from the photographs' EXIF data, and is refined"""
+    output: Path = tyro.MISSING
     """scan folder to write; it must be new or empty"""
     projector_intrinsics: Path | None = None
     """file of the projector, if --intrinsics describes only the camera"""

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.capture_files.cameras import Cameras, read_cameras, require_intrinsics
 from sl_nerfstudio.processing.capture_files.captured import CaptureNotes, read_captured
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -19,6 +21,7 @@ class Inputs:
     """Everything that the stages start from."""
 
     job: FrameJob
+    cameras: Cameras
     captures: Captures
     given: GivenPoses | None  # in the order of the captures
     known: KnownLength | None  # its frames by name
@@ -33,13 +36,10 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     decoder, captures = captured.decoder, captured.captures
     layout = decoder.layout
     names = [frame.name for frame in captures.frames]
-    cameras = {
-        name: read_device_file(config.intrinsics, "camera", size, None, config.procam_step, name)
-        for name, size in captures.sizes.items()
-    }
-    first = next(iter(cameras.values()))
+    require_intrinsics(config, projector_needed=True)
+    cameras = read_cameras(config, captures)
     projector = read_device_file(
-        config.projector_intrinsics or config.intrinsics,
+        config.projector_intrinsics or config.intrinsics or Path(),
         "projector",
         (layout.w, layout.h),
         config.projector_model,
@@ -47,15 +47,8 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     )
     masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
     return Inputs(
-        FrameJob(
-            config.work_folder,
-            decoder,
-            first,
-            projector,
-            config.seed,
-            masks,
-            cameras=cameras if "" not in cameras else {},
-        ),
+        FrameJob(config.work_folder, decoder, cameras.first, projector, config.seed, masks, cameras=cameras.several),
+        cameras,
         captures,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),

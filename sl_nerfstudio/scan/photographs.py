@@ -3,11 +3,15 @@
 A scan folder itself holds only images that need no turning (`images.py`).
 """
 
+import math
+import struct
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy import ndarray
+from PIL import Image
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan.file_error import FileError, check_file
@@ -17,6 +21,7 @@ PHONE = (".heic", ".heif")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", *PHONE)
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".x3f", ".raw")
 Pixels = UInt8[ndarray, "..."] | UInt16[ndarray, "..."]  # (h, w) or (h, w, 3)
+_EXIF_IFD = 0x8769
 _TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that exchange rows and columns
 # Mosaics of a colour filter.
 _TILE = 16  # pixels
@@ -143,3 +148,28 @@ def _open_heif(path: Path):
             "it is truncated, damaged, or another kind of file",
             "copy it again, or export it as JPEG",
         ) from error
+
+
+def exif_numbers(path: Path) -> dict[int, float]:
+    """All tags of the EXIF data whose value is a number, by their codes; empty if there are none.
+
+    Raises FileError if the file is no photograph.
+    """
+    if path.suffix.lower() in RAW:
+        raise raw_file(path)
+    exif = Image.Exif()
+    try:
+        if path.suffix.lower() in PHONE:
+            exif.load(_open_heif(path).info.get("exif") or b"")
+        else:
+            photograph_header(path)
+            with Image.open(path) as image:
+                exif = image.getexif()
+        tags = {**exif, **exif.get_ifd(_EXIF_IFD)}
+        return {int(key): float(value) for key, value in tags.items() if _is_number(value)}
+    except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error, ZeroDivisionError):
+        return {}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(float(value))

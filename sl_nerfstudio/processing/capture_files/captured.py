@@ -1,7 +1,7 @@
 """Everything about the captures that the flags name: the pattern, the frames, and what is to be said about them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sl_nerfstudio.calibration.formats.plain_json import camera_names
@@ -33,11 +33,17 @@ class CaptureNotes:
     sequence: str | None = None  # names of the order of a Gray code
     recognised: bool = False  # the order, from the images
     video: VideoChoice | None = None
+    camera: dict[str, Any] | None = None  # figures of a camera that no file describes
+
+    def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
+        """With what is known of a camera that no file describes."""
+        return replace(self, sentences=(*self.sentences, sentence), camera=figures)
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
         video = None if self.video is None else self.video.document()
-        return {"sequence": self.sequence, "sequence_recognised": self.recognised, "video": video}
+        names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
+        return {**names, "video": video, "camera_focal": self.camera}
 
 
 @dataclass(frozen=True)
