@@ -10,10 +10,12 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.relative_pose.camera_focal import CameraFocal, FrameOfCamera, estimate_camera_focal
+from sl_nerfstudio.relative_pose.camera_estimate import CameraEstimate, FrameOfCamera, estimate_camera
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+
+_ROUNDS = 2  # the first poses, found with the rough focal length, reject some coordinates
 
 
 @dataclass(frozen=True)
@@ -64,56 +66,60 @@ class CameraNotes:
     """A camera that no file describes: its start, and what the frames say of it."""
 
     start: CameraStart
-    found: CameraFocal | None = None  # None: the frames were not asked
+    found: CameraEstimate
 
     def sentence(self) -> str:
         """For the output and the report."""
-        focal = self.start.camera.fl_x
-        said = (
-            f"camera: focal length {focal:.0f} px ± {100 * self.start.sigma:.0f} % from EXIF ({self.start.source}), "
-            "principal point in the middle, no distortion"
-        )
-        if self.found is None:
-            return said
+        camera, (x, y) = self.found.camera, self.found.sigma_centre_px
         return (
-            f"{said}; with all frames {focal * self.found.factor:.1f} ± {focal * self.found.sigma:.1f} px "
-            f"(frames alone: {focal * self.found.from_frames:.1f} ± {focal * self.found.sigma_from_frames:.1f} px)"
+            f"camera: focal length {self.start.camera.fl_x:.0f} px ± {100 * self.start.sigma:.0f} % from EXIF "
+            f"({self.start.source}); with all frames {camera.fl_x:.1f} ± {self.found.sigma_focal_px:.1f} px, principal "
+            f"point ({camera.cx:.1f} ± {x:.1f}, {camera.cy:.1f} ± {y:.1f}) px, k1 {camera.k1:.3f} ± "
+            f"{self.found.sigma_k1:.3f}"
         )
 
     def document(self) -> dict[str, Any]:
         """As JSON."""
-        focal, found = self.start.camera.fl_x, self.found
+        start, camera = self.start, self.found.camera
         return {
-            "source": self.start.source,
-            "start_px": focal,
-            "start_sigma_px": focal * self.start.sigma,
-            "px": focal * (1.0 if found is None else found.factor),
-            "sigma_px": focal * (self.start.sigma if found is None else found.sigma),
+            "source": start.source,
+            "start_px": start.camera.fl_x,
+            "start_sigma_px": start.camera.fl_x * start.sigma,
+            "px": camera.fl_x,
+            "sigma_px": self.found.sigma_focal_px,
+            "centre_px": [camera.cx, camera.cy],
+            "sigma_centre_px": list(self.found.sigma_centre_px),
+            "k1": camera.k1,
+            "sigma_k1": self.found.sigma_k1,
         }
 
 
 def refine_camera(
     job: FrameJob, results: Sequence[FrameStageResult], start: CameraStart, log: Callable[[str], None]
 ) -> tuple[FrameJob, list[FrameStageResult], CameraNotes]:
-    """The job with the camera's focal length from all frames, and the frames calibrated with it."""
-    frames = [
-        FrameOfCamera(
-            *correspondences_of(result.cloud.coords),
-            (result.cloud.pose.T_camera_projector[:3, :3], result.cloud.pose.T_camera_projector[:3, 3]),
-        )
-        for result in results
-        if result.cloud is not None
-    ]
-    if not frames:
-        return job, list(results), CameraNotes(start)
-    found = estimate_camera_focal(frames, job.camera, job.projector, start.sigma, job.seed)
+    """The job with the camera from all frames, and the frames calibrated with it. Some frame must have a pose.
+
+    Frames start again from all of their decoded coordinates: those that the first pose rejected may be right. Raises
+    ValueError if no frame has a pose.
+    """
+    refined, again, found = job, list(results), None
+    for _ in range(_ROUNDS):
+        frames = [
+            FrameOfCamera(*correspondences_of(cloud.coords), (T[:3, :3], T[:3, 3]))
+            for cloud in clouds_of(again)
+            for T in (cloud.pose.T_camera_projector,)
+        ]
+        if not frames:
+            break
+        found = estimate_camera(frames, job.camera, job.projector, start.sigma, job.seed, refined.camera)
+        refined = replace(job, camera=found.camera)
+        worker = FrameWorker(refined)
+        again = [
+            result if result.cloud is None else worker.calibrate(result, worker.load(result))
+            for result in track(again, "calibrating again", len(again))
+        ]
+    if found is None:
+        raise ValueError("no frame has a pose")
     notes = CameraNotes(start, found)
     log(notes.sentence())
-    camera = replace(job.camera, fl_x=job.camera.fl_x * found.factor, fl_y=job.camera.fl_y * found.factor)
-    refined = replace(job, camera=camera)
-    worker = FrameWorker(refined)
-    again = [
-        result if result.cloud is None else worker.calibrate(result, worker.load(result))
-        for result in track(results, "calibrating again", len(results))
-    ]
     return refined, again, notes
