@@ -16,14 +16,21 @@ from sl_nerfstudio.scan.intrinsics import device_problems
 
 
 def read_device_file(
-    path: Path, role: Role, size: tuple[int, int], model: DeviceKind | None = None, procam_step: int = 1
+    path: Path,
+    role: Role,
+    size: tuple[int, int],
+    model: DeviceKind | None = None,
+    procam_step: int = 1,
+    name: str = "",
 ) -> Device:
     """The camera or the projector in a file of any known format, for images (patterns) of `size` (w, h).
 
     `model` replaces the projector's model, which some formats cannot state. `procam_step` is the graycode_step with
-    which procam-calibration was run. Raises UserError with file, cause and remedy.
+    which procam-calibration was run; `name` is that of the device in a file with several cameras. Raises UserError with
+    file, cause and remedy.
     """
-    entry = _choose(path, read_entries(path, procam_step), role, size)
+    entries = [entry for entry in read_entries(path, procam_step) if name in ("", entry.label)]
+    entry = _choose(path, entries, role, size)
     device = _device(path, entry, size)
     if model is not None and role == "projector":
         device = replace(device, model=model)

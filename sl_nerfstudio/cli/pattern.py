@@ -8,6 +8,7 @@ import tyro
 
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 if TYPE_CHECKING:
     from sl_nerfstudio.pattern.layout import PatternLayout
@@ -17,7 +18,7 @@ _GRID_FLAGS = ("preset", "width", "height", "period", "line_width", "gap", "seed
 _BOARD_FLAGS = ("print_width", "square")
 _FLAGS = {
     "grid": _GRID_FLAGS,
-    "gray-code": ("preset", "width", "height", "cell", "print_width"),
+    "gray-code": ("preset", "width", "height", "cell", "sequence", "print_width"),
     "chessboard": (*_BOARD_FLAGS, "corners"),
     "charuco": (*_BOARD_FLAGS, "squares", "marker", "dictionary"),
 }
@@ -54,6 +55,8 @@ class Arguments:
     """selects one of the possible code arrays; default: 0"""
     cell: int | None = None
     """side of the squares that Gray code numbers; default: 2"""
+    sequence: SequenceName | None = None
+    """order of the images of a Gray code, by the program that shows them so; default: sl-pattern"""
     print_width: float | None = None
     """width on paper or slide in millimetres: of a pattern, for printing programs, or of all squares of a board"""
     corners: str | None = None
@@ -116,7 +119,7 @@ def _layout(arguments: Arguments, display: tuple[int, int] | None = None) -> "Pa
         period = float(longer_period(w, h)) if period is None else period
     preset = a.preset or DEFAULT_PRESET
     if a.shown_kind == "gray-code":
-        return make_gray_code(preset, w, h, 2 if a.cell is None else a.cell)
+        return make_gray_code(preset, w, h, 2 if a.cell is None else a.cell, a.sequence or "sl-pattern")
     return make_grid(preset, w, h, period, a.line_width, a.gap, a.seed or 0)
 
 

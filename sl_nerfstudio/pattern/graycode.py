@@ -1,7 +1,7 @@
 """Gray-code stripes: a sequence of patterns from which each camera pixel is decoded without its neighbours.
 
-The projector shows, in this order: white, black, the bits of the column (coarse to fine, each followed by its
-inverse), then the bits of the row in the same way. Neighbouring cells differ in exactly one bit.
+Unless another order is given, the projector shows white, black, the bits of the column (coarse to fine, each followed
+by its inverse), then the bits of the row in the same way. Neighbouring cells differ in exactly one bit.
 """
 
 from collections.abc import Iterator
@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Float32, Float64, Int, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.layout import PatternLayout, whole_number
-
-HEAD = 2  # white and black
+from sl_nerfstudio.pattern.sequence import ORDERS, Scope, SequenceName, Shown, check_shown, order_names
 
 
 @dataclass(frozen=True)
@@ -26,14 +25,30 @@ class GrayCode(PatternLayout):
     w: int = 1920
     h: int = 1080
     cell: int = 2
+    shown: tuple[Shown, ...] = ()
+    """What each image shows, in the order of projection; empty: the order of sl-pattern."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for sizes that do not make a sequence."""
+        """Raises ValueError for sizes that do not make a sequence, and for images that do not determine the cell."""
         if self.cell < 1 or min(self.w, self.h) < 2 * self.cell:
             raise ValueError(
                 f"a Gray code needs at least 2 x 2 cells of 1 pixel or more, got {self.w} x {self.h} pixels "
                 f"in cells of {self.cell}"
             )
+        if not self.shown:
+            object.__setattr__(self, "shown", tuple(ORDERS["sl-pattern"](self._scope)))
+        check_shown(self.shown, self.bits, (self.w, self.h))
+
+    @staticmethod
+    def in_order(
+        name: SequenceName, w: int, h: int, cell: int = 1, periods: tuple[float, float] | None = None
+    ) -> "GrayCode":
+        """The sequence of a program. `periods`, of sines along x and y in pattern pixels, is by default `cell`.
+
+        Raises ValueError for sizes that do not make a sequence.
+        """
+        scope = GrayCode(w, h, cell)._scope
+        return GrayCode(w, h, cell, tuple(ORDERS[name](Scope(scope.size, scope.bits, periods or scope.periods))))
 
     @property
     def columns(self) -> int:
@@ -53,53 +68,91 @@ class GrayCode(PatternLayout):
     @property
     def images(self) -> int:
         """Number of patterns, and of photographs of each frame."""
-        return HEAD + 2 * sum(self.bits)
+        return len(self.shown)
 
-    def bit_images(self, axis: int) -> list[tuple[int, int]]:
-        """Index in the sequence of every bit of an axis (0: column, 1: row) and of its inverse, coarse to fine."""
-        start = HEAD + (2 * self.bits[0] if axis else 0)
-        return [(start + 2 * k, start + 2 * k + 1) for k in range(self.bits[axis])]
+    @property
+    def order(self) -> str:
+        """Names of the programs that use this order, or "its own"."""
+        return ", ".join(order_names(self.shown, self._scope)) or "its own"
+
+    def place(self, shown: Shown) -> int | None:
+        """Index in the sequence of the image that shows this; None if there is none."""
+        return self.shown.index(shown) if shown in self.shown else None
+
+    def bit_images(self, axis: int) -> list[tuple[int, int | None]]:
+        """Index in the sequence of every bit of an axis (0: column, 1: row) and of its inverse, coarse to fine.
+
+        The inverse is None if the sequence has none. The list is empty if the axis has sines alone.
+        """
+        bits = reversed(range(self.bits[axis] if Shown("bit", axis, 0) in self.shown else 0))
+        return [(self.shown.index(Shown("bit", axis, k)), self.place(Shown("bit", axis, k, True))) for k in bits]
+
+    def sines(self, axis: int) -> list[tuple[int, float]]:
+        """Steps and period (pattern pixels) of every sine along an axis, the longest first."""
+        found = {(item.steps, item.period) for item in self.shown if item.what == "phase" and item.axis == axis}
+        return sorted(found, key=lambda sine: -sine[1])
+
+    def even_images(self) -> list[int]:
+        """Index of the images whose mean shows no stripes: pairs of a bit and its inverse, white, or all sines."""
+        pairs = [pair for axis in (0, 1) for pair in self.bit_images(axis)]
+        with_inverse = [place for direct, inverse in pairs if inverse is not None for place in (direct, inverse)]
+        white = self.place(Shown("white"))
+        return with_inverse or (list(range(self.images)) if white is None else [white])
+
+    def sine_images(self, axis: int, steps: int, period: float) -> list[int]:
+        """Index in the sequence of every shift of a sine."""
+        return [self.shown.index(Shown("phase", axis, k, False, steps, period)) for k in range(steps)]
 
     def sequence(self) -> Iterator[UInt8[ndarray, "h w"]]:
-        """All patterns in the order in which they are shown, 0 or 255."""
-        white = np.full((self.h, self.w), 255, dtype=np.uint8)
-        yield white
-        yield np.zeros_like(white)
-        for axis in (0, 1):
-            for lit in self._stripes(axis):
-                image = np.broadcast_to(lit if axis == 0 else lit[:, None], (self.h, self.w))
-                yield np.where(image, white, np.uint8(0))
-                yield np.where(image, np.uint8(0), white)
+        """All patterns in the order in which they are shown, 0 to 255."""
+        for shown in self.shown:
+            values = np.rint(255 * self._values(shown)).astype(np.uint8)
+            along = values if shown.axis == 0 else values[:, None]
+            yield np.array(np.broadcast_to(along, (self.h, self.w)))
 
     def render(self, supersampling: int = 2) -> Float32[ndarray, "h w"]:
         """Mean of the finest stripes of both axes, in [0, 1].
 
         Stripes end where pixels end, so the mean over a pixel is the same for every `supersampling`.
         """
-        x, y = (self._stripes(axis)[-1].astype(np.float32) for axis in (0, 1))
+        x, y = (self._values(self.finest(axis)).astype(np.float32) for axis in (0, 1))
         return (x[None, :] + y[:, None]) / 2
+
+    def finest(self, axis: int) -> Shown:
+        """The finest stripes along an axis: those of the last bit, otherwise the shortest sine."""
+        if Shown("bit", axis, 0) in self.shown:
+            return Shown("bit", axis, 0)
+        steps, period = self.sines(axis)[-1]
+        return Shown("phase", axis, 0, False, steps, period)
 
     def fields(self) -> dict[str, Any]:
         """The side of a cell, and what each image of the sequence shows."""
-        names = ["white", "black"]
-        for axis, bits in zip("xy", self.bits, strict=True):
-            names += [f"{axis} bit {bits - 1 - k}{inverse}" for k in range(bits) for inverse in ("", " inverse")]
-        return {"cell": self.cell, "sequence": names}
+        return {"cell": self.cell, "sequence": [str(shown) for shown in self.shown]}
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "GrayCode":
-        """The sequence that a pattern.json describes."""
-        layout = cls(*(whole_number(document, key) for key in ("w", "h", "cell")))
-        names = layout.fields()["sequence"]
-        if document.get("sequence", names) != names:
-            raise ValueError(f"sequence does not list the {len(names)} images of a {layout.w} x {layout.h} Gray code")
-        return layout
+        """The sequence that a pattern.json describes; without a list of images, in the order of sl-pattern."""
+        w, h, cell = (whole_number(document, key) for key in ("w", "h", "cell"))
+        if "sequence" not in document:
+            return cls(w, h, cell)
+        names = document["sequence"]
+        if not isinstance(names, list) or not names:
+            raise ValueError("sequence is no list of what the images show")
+        return cls(w, h, cell, tuple(Shown.of(name) for name in names))
 
-    def _stripes(self, axis: int) -> list[ndarray]:
-        """Whether each pixel along an axis is lit, for every bit, coarse to fine."""
-        cell = np.arange((self.w, self.h)[axis]) // self.cell
-        code = gray(cell)
-        return [code >> k & 1 == 1 for k in reversed(range(self.bits[axis]))]
+    @property
+    def _scope(self) -> Scope:
+        x, y = (min((sine[1] for sine in self.sines(axis)), default=float(max(self.cell, 2))) for axis in (0, 1))
+        return Scope((self.w, self.h), self.bits, (x, y))
+
+    def _values(self, shown: Shown) -> Float64[ndarray, "n"]:
+        """Brightness in [0, 1] of each pixel along the axis of an image."""
+        pixel = np.arange((self.w, self.h)[shown.axis])
+        if shown.what == "phase":
+            return 0.5 + 0.5 * np.cos(2 * np.pi * (pixel / shown.period - shown.index / shown.steps))
+        if shown.what == "bit":
+            return ((gray(pixel // self.cell) >> shown.index & 1) == (0 if shown.inverse else 1)).astype(np.float64)
+        return np.full(len(pixel), 1.0 if shown.what == "white" else 0.0)
 
 
 def gray(index: Int[ndarray, "*n"]) -> Int[ndarray, "*n"]:

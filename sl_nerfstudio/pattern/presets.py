@@ -6,6 +6,7 @@ from typing import Literal
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.grid import MAX_NODES, MAX_PIXELS, GridPattern
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 Preset = Literal["800x800", "1280x720", "1920x1080", "3840x2160", "doe"]
 DEFAULT_PRESET: Preset = "800x800"
@@ -58,12 +59,16 @@ def make_grid(
 
 
 def make_gray_code(
-    preset: Preset = DEFAULT_PRESET, w: int | None = None, h: int | None = None, cell: int = 2
+    preset: Preset = DEFAULT_PRESET,
+    w: int | None = None,
+    h: int | None = None,
+    cell: int = 2,
+    order: SequenceName = "sl-pattern",
 ) -> GrayCode:
-    """The Gray-code sequence of a preset's size, or of another. Raises UserError for one that cannot be."""
+    """A Gray-code sequence of a preset's size, or of another. Raises UserError for one that cannot be."""
     preset_w, preset_h, _ = PRESETS[preset]
     try:
-        return GrayCode(preset_w if w is None else w, preset_h if h is None else h, cell)
+        return GrayCode.in_order(order, preset_w if w is None else w, preset_h if h is None else h, cell)
     except ValueError as error:
         raise UserError(f"--width, --height, --cell: {error}") from error
 

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.sequence import SequenceName
 
 
 @dataclass(frozen=True)
@@ -13,12 +16,15 @@ class ProcessConfig:
     """Make a scan folder from photographs. Without a known length, its unit is arbitrary."""
 
     images: Path
-    """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame"""
+    """folder of the captures: one image per frame, or for Gray code one sub-folder of images per frame; or a video, of
+    which the sharp frames are taken"""
     pattern: Path
-    """pattern.json of the projected pattern, as written by sl-pattern or sl-synth"""
-    intrinsics: Path
-    """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt"""
-    output: Path
+    """pattern.json of the projected pattern, as written by sl-pattern or sl-synth; for the Gray code of another program
+    the projector's resolution, as 1024x768"""
+    intrinsics: Path | None = None
+    """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt; without those of
+    the camera, its focal length comes from the photographs' EXIF data, and is refined"""
+    output: Path = tyro.MISSING
     """scan folder to write; it must be new or empty"""
     projector_intrinsics: Path | None = None
     """file of the projector, if --intrinsics describes only the camera"""
@@ -28,9 +34,17 @@ class ProcessConfig:
     """graycode_step with which procam-calibration was run, if the intrinsics come from it"""
     decoder: str | None = None
     """decoder of the captures: network for a coded grid, graycode for Gray code; default: the one for the pattern"""
+    sequence: SequenceName | None = None
+    """order of the images of a Gray-code sequence, by the program that showed it; default: what pattern.json states, or
+    for a --pattern that is a resolution what the images show"""
+    cell: int | None = None
+    """side of the squares that a Gray code numbers, in projector pixels, if --pattern is a resolution; default: what
+    the number of images says"""
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
     50 mm" with pixels x, y; without it, the unit of the scan is arbitrary"""
+    not_mosaic: bool = False
+    """the images are not raw mosaics of a colour filter (Bayer), although their pixels alternate like those"""
     unordered: bool = False
     """the frames were not captured in order around the object: try every pair"""
     poses: Path | None = None
@@ -55,6 +69,7 @@ class ProcessConfig:
         rules = (
             (self.jobs is None or self.jobs >= 1, "--jobs", self.jobs, "give at least 1"),
             (self.procam_step >= 1, "--procam-step", self.procam_step, "give at least 1"),
+            (self.cell is None or self.cell >= 1, "--cell", self.cell, "give at least 1"),
             (self.seed >= 0, "--seed", self.seed, "seeds are at least 0"),
         )
         for holds, flag, value, why in rules:

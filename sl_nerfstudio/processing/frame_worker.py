@@ -1,7 +1,7 @@
 """One frame by itself: decoding, the relative pose of the projector, triangulation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,11 @@ class FrameJob:
     projector: Device
     seed: int
     masks: UserMasks | None = None  # of the user
+    cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
+
+    def camera_of(self, frame: CapturedFrame) -> Device:
+        """The camera that took a frame."""
+        return self.cameras.get(frame.camera, self.camera)
 
 
 @dataclass(frozen=True)
@@ -87,14 +92,14 @@ class FrameWorker:
 
     def calibrate(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
-        job, coords = self._job, decoded.coords
+        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
         try:
             pose = self._stages.kept(
                 f"calibration {result.name}",
-                (coords, job.camera, job.projector, job.seed),
-                lambda: estimate_relative_pose(*correspondences_of(coords), job.camera, job.projector, job.seed),
+                (coords, camera, job.projector, job.seed),
+                lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
             )
-            cloud = frame_cloud(result.name, coords, job.camera, job.projector, pose)
+            cloud = frame_cloud(result.name, coords, camera, job.projector, pose)
         except RelativePoseError as error:
             return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
         return replace(result, cloud=cloud)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from sl_nerfstudio.calibration.device_files import read_device_file
-from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.processing.captures import Captures, find_captures
+from sl_nerfstudio.processing.capture_files.cameras import Cameras, read_cameras, require_intrinsics
+from sl_nerfstudio.processing.capture_files.captured import CaptureNotes, read_captured
+from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
@@ -20,34 +21,43 @@ class Inputs:
     """Everything that the stages start from."""
 
     job: FrameJob
+    cameras: Cameras
     captures: Captures
     given: GivenPoses | None  # in the order of the captures
     known: KnownLength | None  # its frames by name
+    notes: CaptureNotes  # on the captures
 
 
 def read_inputs(config: ProcessConfig) -> Inputs:
     """Read what the flags name. Raises UserError for flags and files that are wrong."""
     config.check()
     known = None if config.known_length is None else parse_known_length(config.known_length)
-    layout = read_layout(config.pattern)
-    decoder = choose_decoder(layout, config.decoder, config.pattern)
-    captures = find_captures(config.images, decoder.sequence)
+    captured = read_captured(config)
+    decoder, captures = captured.decoder, captured.captures
+    layout = decoder.layout
     names = [frame.name for frame in captures.frames]
-    camera = read_device_file(config.intrinsics, "camera", captures.size, procam_step=config.procam_step)
+    require_intrinsics(config, projector_needed=True)
+    cameras = read_cameras(config, captures)
     projector = read_device_file(
-        config.projector_intrinsics or config.intrinsics,
+        config.projector_intrinsics or config.intrinsics or Path(),
         "projector",
         (layout.w, layout.h),
         config.projector_model,
         config.procam_step,
     )
-    masks = None if config.masks is None else find_masks(config.masks, names, captures.size)
+    masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
     return Inputs(
-        FrameJob(config.work_folder, decoder, camera, projector, config.seed, masks),
+        FrameJob(config.work_folder, decoder, cameras.first, projector, config.seed, masks, cameras=cameras.several),
+        cameras,
         captures,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),
+        captured.notes,
     )
+
+
+def _sizes_of_frames(captures: Captures) -> dict[str, tuple[int, int]]:
+    return {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
 
 
 def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:

@@ -6,11 +6,13 @@ Decoded frames, the registration and the adjustment are kept in the work folder,
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.processing.capture_files.cameras import refine_camera
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
@@ -52,10 +54,17 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     inputs = read_inputs(config)
     job, captures = inputs.job, inputs.captures
     log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {job.decoder.name}")
+    for sentence in inputs.notes.sentences:
+        log(sentence)
 
     results = run_frame_stage(config, job, captures)
     log(describe_frame_stage(results))
     _require_clouds(config, inputs, results, make_report)
+    notes = inputs.notes
+    if inputs.cameras.start is not None:
+        job, results, camera = refine_camera(job, results, inputs.cameras.start, log)
+        notes = notes.with_camera(camera.sentence(), camera.document())
+        _require_clouds(config, inputs, results, make_report)
     if config.refine_projector_focal:
         job, results = refine_focal(job, results, log)
         _require_clouds(config, inputs, results, make_report)
@@ -80,6 +89,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     registration = consistent.registration
     poses = find_scan_poses(clouds, registration, consistent.adjusted, inputs.known, given)
     result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross)
+    result = replace(result, captured=notes)
     if config.object_only:
         found = find_object_only(job, results, registration, poses)
         log("object only: " + "\n    ".join(object_sentences(found)))

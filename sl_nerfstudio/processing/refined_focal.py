@@ -23,7 +23,7 @@ def refine_focal(
     not differ significantly from the stated one.
     """
     views = [
-        PosedFrame(*correspondences_of(cloud.coords), job.camera, _all_inliers(cloud)) for cloud in clouds_of(results)
+        PosedFrame(*correspondences_of(cloud.coords), cloud.camera, _all_inliers(cloud)) for cloud in clouds_of(results)
     ]
     found = refine_projector_focal(views, job.projector, job.seed)
     log(f"projector's focal length: {found.factor:.4f} of the stated one, plus or minus {found.sigma:.4f}")

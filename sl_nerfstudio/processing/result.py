@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sl_nerfstudio.processing.capture_files.captured import CaptureNotes
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.selection.object_only import ObjectOnly
 from sl_nerfstudio.processing.selection.object_words import object_document
@@ -64,6 +65,7 @@ class ProcessResult:
     verdict: Verdict
     versions: dict[str, str]
     object_only: ObjectOnly | None = None  # None: surroundings were not looked for
+    captured: CaptureNotes | None = None  # on the captures
 
     @property
     def registered(self) -> int:
@@ -86,6 +88,7 @@ class ProcessResult:
             "remarks": list(self.remarks),
             "recapture": list(self.recapture),
             "joint_adjustment_px": self.joint_px,
+            "captures": None if self.captured is None else self.captured.document(),
             "object_only": None if self.object_only is None else object_document(self.object_only),
             "cross_frame_px": self.cross_px,
             "versions": self.versions,

@@ -8,6 +8,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.object_separation.separate import Part
+from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.sequence import Shown
 from sl_nerfstudio.processing.failures import REPORT
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
 from sl_nerfstudio.processing.preview import Preview, make_preview
@@ -15,7 +17,7 @@ from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.photographs import read_photograph
 from sl_nerfstudio.scan.writing import ScanWriter, encode_json
 
 _SUPERSAMPLING = 4  # of pattern.png
@@ -31,6 +33,7 @@ def write_scan(
 ) -> None:
     """Write all frames that are in the scan by `result`. Leaving the folder completes it."""
     layout = job.decoder.layout
+    shown = layout.place(Shown("white")) or 0 if isinstance(layout, GrayCode) else 0
     row = {cloud.name: k for k, cloud in enumerate(clouds_of(results))}
     worker = FrameWorker(job)
     size = (job.projector.w, job.projector.h)
@@ -45,7 +48,7 @@ def write_scan(
         within=folder,
     ) as writer:
         for frame, record in zip(track(results, "writing"), result.frames, strict=True):
-            image = _image(frame)
+            image = _image(frame, shown)
             cloud = frame.cloud
             part = None if result.object_only is None else result.object_only.parts.get(frame.name)
             previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part))
@@ -59,6 +62,7 @@ def write_scan(
                 coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
+                camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
                 T_world_projector=poses.adjusted.poses.T_world_projector[k],
                 pose_sigma=poses.adjusted.sigma[k],
@@ -68,9 +72,9 @@ def write_scan(
         writer.add_file(REPORT, make_report(result, previews).encode())
 
 
-def _image(frame: FrameStageResult) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
-    """The capture (of a sequence its first image, in full light); None if it cannot be read."""
+def _image(frame: FrameStageResult, shown: int) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
+    """The capture (of a sequence the image in full light, by its place); None if it cannot be read."""
     try:
-        return read_image(frame.frame.images[0])
-    except FileError:
+        return read_photograph(frame.frame.images[shown])
+    except (FileError, IndexError):
         return None

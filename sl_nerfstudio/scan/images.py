@@ -54,10 +54,18 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """Size and kind of an image, without decoding it. Raises FileError for kinds that a scan must not hold."""
+    header, orientation = read_header_and_orientation(path)
+    _refuse_orientation(path, orientation)
+    return header
+
+
+def read_header_and_orientation(path: Path) -> tuple[ImageHeader, int]:
+    """Size and kind as stored, and the EXIF orientation (1: as stored). Raises FileError for other kinds."""
     check_file(path)
     try:
         with path.open("rb") as stream:
-            return _header(path, _open(path, stream))
+            image = _open(path, stream)
+            return _header(path, image), _orientation(path, image)
     except OSError as error:
         raise unreadable(path, error) from error
 
@@ -68,9 +76,17 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
     Raises FileError for a file that is missing, damaged, truncated, of an unknown format, rotated by an EXIF tag, or
     that has a palette or transparency: none of this is repaired.
     """
+    pixels, orientation = read_pixels_and_orientation(path)
+    _refuse_orientation(path, orientation)
+    return pixels
+
+
+def read_pixels_and_orientation(path: Path) -> tuple[UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"], int]:
+    """The pixels as stored, and the EXIF orientation (1: as stored). Raises FileError like `read_image`."""
     content = read_bytes(path)
     image = _open(path, BytesIO(content))
     header = _header(path, image)
+    _orientation(path, image)
     try:
         image.load()
     except MemoryError as error:
@@ -84,11 +100,11 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
         ) from error
     if isinstance(image, PngImageFile):
         _check_png_sums(path, content)
-    _refuse_orientation(path, image)  # again: a PNG may have the tag after its pixels
+    orientation = _orientation(path, image)  # again: a PNG may have the tag after its pixels
     if header.bits == 16 and header.mode == "RGB":
-        return _decode_deep_colour(path, content)
+        return _decode_deep_colour(path, content), orientation
     pixels = np.array(image)
-    return pixels.astype(np.uint16) if header.bits == 16 else pixels
+    return (pixels.astype(np.uint16) if header.bits == 16 else pixels), orientation
 
 
 def as_grey(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Float32[ndarray, "h w"]:
@@ -134,7 +150,6 @@ def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
 
 def _header(path: Path, image: ImageFile) -> ImageHeader:
     """Size and kind; FileError for every kind that a scan must not hold."""
-    _refuse_orientation(path, image)
     if getattr(image, "n_frames", 1) != 1:
         raise FileError(
             path,
@@ -175,17 +190,22 @@ def _check_png_sums(path: Path, content: bytes) -> None:
         place = end + 4
 
 
-def _refuse_orientation(path: Path, image: ImageFile) -> None:
+def _orientation(path: Path, image: ImageFile) -> int:
+    """The EXIF orientation, 1 to 8; 1 where there is none."""
     # PngImageFile.getexif() would decode the pixels to look for the tag after them.
-    orientation: object = 1
+    found: object = 1
     if not isinstance(image, PngImageFile) or "exif" in image.info:
         try:
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+            found = image.getexif().get(_EXIF_ORIENTATION, 1)
         except _DAMAGE as error:
             raise FileError(
                 path, f"has damaged EXIF data ({error})", "a faulty program wrote it", "remove the EXIF data"
             ) from error
-    if orientation not in (0, 1):
+    return found if isinstance(found, int) and found in range(1, 9) else 1
+
+
+def _refuse_orientation(path: Path, orientation: int) -> None:
+    if orientation != 1:
         raise FileError(
             path,
             f"must be rotated before it is shown (EXIF orientation {orientation})",

@@ -1,12 +1,15 @@
 """Gray code: neighbours differ in one bit, and the sequence shows the bits."""
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout, read_pattern
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
+from sl_nerfstudio.pattern.sequence import SequenceName, Shown
 
 
 def test_neighbours_differ_in_one_bit_and_indices_are_recovered():
@@ -58,3 +61,49 @@ def test_the_sequence_is_listed_in_the_description():
 def test_sizes_that_cannot_make_a_sequence():
     with pytest.raises(ValueError, match="at least 2 x 2 cells"):
         GrayCode(3, 100, 2)
+
+
+@pytest.mark.parametrize("name", get_args(SequenceName))
+def test_the_orders_of_other_programs_are_written_and_read_back(tmp_path, name):
+    layout = GrayCode.in_order(name, 64, 48, 4)
+    path = tmp_path / "pattern.json"
+    path.write_bytes(layout.encode())
+    assert read_layout(path) == layout and name in layout.order.split(", ")
+    images = list(layout.sequence())
+    assert len(images) == layout.images and all(image.shape == (48, 64) for image in images)
+    assert [str(Shown.of(str(shown))) for shown in layout.shown] == json.loads(layout.encode())["sequence"]
+
+
+def test_the_orders_are_those_of_the_programs():
+    """By the formulas of the programs: bit k of column j is lit where bits k and k + 1 of j differ."""
+    opencv = list(GrayCode.in_order("opencv", 16, 8).sequence())
+    j = np.arange(16)
+    for k in range(4):  # OpenCV writes bit k at 2 n - 2 k - 2, and its inverse behind it
+        lit = ((j >> k) ^ (j >> (k + 1))) & 1
+        assert (opencv[2 * 4 - 2 * k - 2] == 255 * lit).all() and (opencv[2 * 4 - 2 * k - 1] == 255 * (1 - lit)).all()
+    assert opencv[-2].min() == 255 and opencv[-1].max() == 0
+    slstudio = list(GrayCode.in_order("slstudio", 60, 40, 1, (12.0, 8.0)).sequence())
+    for i in range(3):
+        wave = 127.5 * (1 + np.cos(2 * np.pi * np.arange(60) / 12 - 2 * np.pi * i / 3))
+        assert np.abs(slstudio[i] - wave).max() <= 0.51
+    assert len(slstudio) == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: [n for n in s if n[0] != "y"], "shows columns only .*show the other stripes, too"),
+        (lambda s: s[2:], "no image white and no image black"),
+        (lambda s: [*s, s[3]], "lists x bit 1 inverse more than once"),
+        (lambda s: [n for n in s if n != "x bit 0"], "2 bits of x; missing or too many: x bit 0"),
+        (lambda s: [*s[:-1], "y bot 0"], "'y bot 0' is no image of a sequence"),
+        (lambda s: [*s, "x phase 0 of 3, period 8"], "sines of x with period 8 must have 3 or more steps, all listed"),
+        (lambda s: "white", "no list"),
+    ],
+)
+def test_lists_that_do_not_determine_the_pixel(tmp_path, change, message):
+    document = json.loads(GrayCode(8, 4, 2).encode())
+    path = tmp_path / "pattern.json"
+    path.write_text(json.dumps(document | {"sequence": change(document["sequence"])}))
+    with pytest.raises(UserError, match=message):
+        read_layout(path)

@@ -21,9 +21,9 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.scan.file_error import FileError, unreadable
-from sl_nerfstudio.scan.images import as_grey, read_header, read_image
+from sl_nerfstudio.scan.images import as_grey
+from sl_nerfstudio.scan.photographs import ENDINGS, photograph_header, read_photograph
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 LEAST_IN_PATTERN = 8  # corners of a view that the pattern must reach
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 
@@ -87,7 +87,7 @@ def common_size(poses: Sequence[BoardPhotographs]) -> tuple[int, int]:
     faults: list[FileError] = []
     for path in (path for pose in poses for path in pose.images):
         try:
-            header = read_header(path)
+            header = photograph_header(path)
             sizes[path] = (header.w, header.h)
         except FileError as error:
             faults.append(error)
@@ -139,7 +139,9 @@ def _read_pose(
     pattern, plain = pose.images, pose.images[:1]
     if decoder is not None and not decoder.sequence:
         pattern, plain = _pattern_and_plain(pose, board)
-    grey = _under_even_light(pose, decoder) if decoder is None or decoder.sequence else as_grey(read_image(plain[0]))
+    grey = (
+        _under_even_light(pose, decoder) if decoder is None or decoder.sequence else as_grey(read_photograph(plain[0]))
+    )
     corners = find_corners(grey, board)
     if corners is None:
         raise _Unused(_not_found(pose, plain[0], grey, board), grey)
@@ -168,9 +170,9 @@ def _under_even_light(pose: BoardPhotographs, decoder: Decoder[Any] | None) -> F
     """The board without stripes: the mean of images that come with their inverse, or the one under white light."""
     layout = None if decoder is None else decoder.layout
     if not isinstance(layout, GrayCode) or len(pose.images) != layout.images:
-        return as_grey(read_image(pose.images[0]))
-    places = [place for axis in (0, 1) for pair in layout.bit_images(axis) for place in pair]
-    return np.mean([as_grey(read_image(pose.images[place])) for place in places], axis=0, dtype=np.float32)
+        return as_grey(read_photograph(pose.images[0]))
+    even = [as_grey(read_photograph(pose.images[place])) for place in layout.even_images()]
+    return np.mean(even, axis=0, dtype=np.float32)
 
 
 def _pattern_and_plain(pose: BoardPhotographs, board: Board) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
@@ -181,7 +183,7 @@ def _pattern_and_plain(pose: BoardPhotographs, board: Board) -> tuple[tuple[Path
             "    cause:  one is missing, or there are images of several poses\n"
             "    remedy: give one photograph under the pattern and one under plain light, with nothing moved in between"
         )
-    edges = [_edges(as_grey(read_image(path))) for path in pose.images]
+    edges = [_edges(as_grey(read_photograph(path))) for path in pose.images]
     first, second = ((path,) for path in pose.images)
     return (first, second) if edges[0] > edges[1] else (second, first)
 

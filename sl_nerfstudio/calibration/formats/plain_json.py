@@ -1,7 +1,7 @@
 """Plain JSON: `camera` and `projector` objects.
 
 The centre of the first pixel is (0.5, 0.5), or (0, 0) where the file says `"pixel_centre": 0`. The camera's keys may be
-at the top level, as in transforms.json.
+at the top level, as in transforms.json. Several cameras are objects in `cameras`, by their names.
 """
 
 from pathlib import Path
@@ -25,6 +25,11 @@ def read_json_entries(path: Path) -> list[DeviceEntry]:
     if "camera" in document:
         section = top.read_section("camera")
         found.append(None if section is None else _entry(section, "camera", offset))
+    elif "cameras" in document:
+        cameras = top.read_section("cameras")
+        for name in () if cameras is None else tuple(cameras.record):
+            section = cameras.read_section(name) if cameras is not None else None
+            found.append(None if section is None else _entry(section, "camera", offset, name))
     elif "fl_x" in document:
         found.append(_entry(top, "camera", offset))
     if "projector" in document:
@@ -43,7 +48,15 @@ def read_json_entries(path: Path) -> list[DeviceEntry]:
     return [entry for entry in found if entry is not None]
 
 
-def _entry(fields: Fields, role: Role, offset: float) -> DeviceEntry | None:
+def camera_names(path: Path) -> tuple[str, ...]:
+    """Names of the cameras of a file with several, in its order; empty for a file with one or none."""
+    if path.suffix.lower() != ".json":
+        return ()
+    cameras = read_document(path).get("cameras")
+    return tuple(cameras) if isinstance(cameras, dict) else ()
+
+
+def _entry(fields: Fields, role: Role, offset: float, name: str | None = None) -> DeviceEntry | None:
     """One device; None if a field is missing or wrong, which is then among the faults of `fields`."""
     model = "OPENCV"
     for key in ("model", "camera_model"):
@@ -57,4 +70,4 @@ def _entry(fields: Fields, role: Role, offset: float) -> DeviceEntry | None:
     fl_x, fl_y, cx, cy = (n or 0.0 for n in numbers)
     kind: DeviceKind = "DOE" if model == "DOE" else "OPENCV"
     matrix = camera_matrix(fl_x, fl_y, cx + offset, cy + offset)
-    return DeviceEntry(role, role, (w, h), matrix, tuple(k or 0.0 for k in lens), kind)
+    return DeviceEntry(name or role, role, (w, h), matrix, tuple(k or 0.0 for k in lens), kind)

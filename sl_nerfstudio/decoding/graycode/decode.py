@@ -1,4 +1,4 @@
-"""Decoding of Gray-code sequences with inverse images.
+"""Decoding of Gray-code sequences, with or without inverse images and shifted sines.
 
 A bit is read by comparing an image with its inverse. Indirect light (interreflection, scattering) can make a bit
 uncertain; this is judged as in Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light"
@@ -9,17 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.graycode.phase import cell_places, phase_coordinates
+from sl_nerfstudio.decoding.graycode.photographs import Image, Photographs, check_sizes
 from sl_nerfstudio.decoding.graycode.subcell import LEVELS, Cells, subcell_coordinates
 from sl_nerfstudio.decoding.regions import drop_small_regions
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
+from sl_nerfstudio.pattern.sequence import Shown
 from sl_nerfstudio.scan.images import as_grey
 
-Image = UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]
 # Pixels that count as lit.
 _FINEST = 4  # bits of each axis that separate direct from global light; the finest alone may be out of focus
 _LEAST_DIRECT = 0.02  # of full scale: with less light, bits are lost in the noise
@@ -30,7 +31,7 @@ _UNCERTAIN = 0.08  # of the direct light: the smallest difference of an image an
 _LEAST_LIT = 0.002  # of the image: with less, the pattern counts as not seen
 _LEAST_DECODED = 0.02  # of the lit pixels
 # Regions that are kept.
-_LARGEST_STEP = 3.0  # cells between neighbouring pixels of one surface
+_LARGEST_STEP = 3.0  # cells, or usual steps where these are larger, between neighbouring pixels of one surface
 _LEAST_REGION = 60  # pixels
 
 
@@ -50,54 +51,76 @@ class Light:
 
 
 def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
-    """Coordinates of every pixel from the photographs of one sequence, in the order of projection.
+    """Coordinates of every pixel from the photographs of one sequence, in the order of `layout`.
 
     Grey or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
-    the difference of an image and its inverse changes sign. Raises DecodingError if the sequence is incomplete, if its
-    images have several sizes, or if nothing can be decoded.
+    the difference of an image and its inverse changes sign, and sines where there are any. Raises DecodingError if the
+    sequence is incomplete, if its images have several sizes, or if nothing can be decoded.
     """
     _check_sequence(images, layout)
-    light = separate(images, layout)
-    _check_light(images, light)
+    photographs = Photographs(images, layout)
+    light = separate(photographs)
+    _check_light(images, layout, light)
     coords = np.full((*light.lit.shape, 2), np.nan, dtype=np.float32)
     stripes: list[Float32[ndarray, "h w"]] = []
     for axis in (0, 1):
-        cells = _read_cells(images, layout, axis, light)
-        coords[..., axis] = subcell_coordinates(cells, (layout.columns, layout.rows)[axis]) * layout.cell
-        stripes.append(_stripe_image(images, layout, axis, light))
+        coords[..., axis] = _coordinates(photographs, axis, light)
+        stripes.append(_stripe_image(photographs, axis, light))
     known = np.isfinite(coords).all(-1) & light.lit
     coords[~known] = np.nan
-    coords = drop_small_regions(coords, _LARGEST_STEP * layout.cell, _LEAST_REGION)
+    coords = drop_small_regions(coords, _LARGEST_STEP * max(layout.cell, _usual_step(coords)), _LEAST_REGION)
     decoded = Decoded(coords, light.lit, np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32))
     if decoded.rate < _LEAST_DECODED:
         raise DecodingError(
             f"only {decoded.rate:.1%} of the lit pixels could be decoded",
             "the images are not in the order of the sequence, belong to another sequence, or something moved",
-            "give white, black, then the bits of the column and of the row, coarse to fine, each followed by its "
-            "inverse, named so that sorting puts them in that order",
+            "give the images in the order of the pattern file, named so that sorting puts them in that order; "
+            "--sequence names the orders of other programs",
         )
     return decoded
 
 
-def separate(images: Sequence[Image], layout: GrayCode) -> Light:
+def separate(photographs: Photographs) -> Light:
     """Light of every pixel: direct and global light from the finest stripes, half of which are dark."""
-    pairs = [layout.bit_images(axis) for axis in (0, 1)]
-    highest = signal = np.zeros(images[0].shape[:2], dtype=np.float32)
+    layout = photographs.layout
+    highest = signal = np.zeros(photographs.images[0].shape[:2], dtype=np.float32)
     lowest = np.full_like(highest, np.inf)
-    sums: list[Float32[ndarray, "h w"]] = []
+    count = 0
     for axis in (0, 1):
-        fine = len(pairs[axis]) - _FINEST
-        for k, (direct, inverse) in enumerate(pairs[axis]):
-            p, q = as_grey(images[direct]), as_grey(images[inverse])
-            signal = signal + np.abs(p - q)
-            if k == 0:
-                sums.append(p + q)  # the same light in two pairs of images: the difference is noise
-            if k >= fine:
+        places = layout.bit_images(axis)
+        for k, place in enumerate(places):
+            p, q = photographs.pair(*place)
+            signal, count = signal + np.abs(p - q), count + 1
+            if k >= len(places) - _FINEST:
                 highest = np.maximum(highest, np.maximum(p, q))
                 lowest = np.minimum(lowest, np.minimum(p, q))
-    noise = MAD_TO_SIGMA / 2 * float(np.median(np.abs(sums[0] - sums[1])))
-    ambient = 2 * np.clip(lowest - as_grey(images[1]), 0, None)
-    return Light(highest - lowest, ambient, signal / sum(layout.bits), noise)
+        if not places:
+            sine = photographs.sine(axis, *layout.sines(axis)[-1])
+            signal, count = signal + 2 * sine.amplitude, count + 1
+            highest = np.maximum(highest, sine.mean + sine.amplitude)
+            lowest = np.minimum(lowest, sine.mean - sine.amplitude)
+    black = photographs.shown(Shown("black"))
+    ambient = 2 * np.clip(lowest - (0 if black is None else black), 0, None)
+    return Light(highest - lowest, ambient, signal / np.float32(count), photographs.noise())
+
+
+def _coordinates(photographs: Photographs, axis: int, light: Light) -> Float32[ndarray, "h w"]:
+    """Coordinates of all pixels along an axis, in pattern pixels."""
+    layout = photographs.layout
+    cells = _read_cells(photographs, axis, light) if layout.bit_images(axis) else None
+    if cells is not None and not layout.sines(axis):
+        return subcell_coordinates(cells, (layout.columns, layout.rows)[axis]) * layout.cell
+    coarse = None if cells is None else cell_places(cells) * np.float32(layout.cell)
+    found = phase_coordinates(photographs, axis, coarse, light.noise)
+    size = (layout.w, layout.h)[axis]
+    return np.where((found >= 0) & (found <= size), found, np.float32(np.nan))
+
+
+def _usual_step(coords: Float32[ndarray, "h w 2"]) -> float:
+    """Median difference of neighbouring pixels, in pattern pixels: a camera far coarser than the projector."""
+    steps = [np.abs(np.diff(coords, axis=axis)).max(-1) for axis in (0, 1)]
+    known = np.concatenate([step[np.isfinite(step)] for step in steps])
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def check_count(count: int, layout: GrayCode) -> None:
@@ -113,20 +136,14 @@ def check_count(count: int, layout: GrayCode) -> None:
 
 def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
     check_count(len(images), layout)
-    sizes = sorted({f"{image.shape[1]} x {image.shape[0]}" for image in images})
-    if len(sizes) > 1:
-        raise DecodingError(
-            f"holds images of several sizes ({', '.join(sizes)})",
-            "the folder holds images of another camera or resolution, too",
-            "keep one folder for each frame, with nothing but its own images",
-        )
+    check_sizes(images)
 
 
-def _check_light(images: Sequence[Image], light: Light) -> None:
+def _check_light(images: Sequence[Image], layout: GrayCode, light: Light) -> None:
     share = float(light.lit.mean())
     if share >= _LEAST_LIT:
         return
-    brightness = float(as_grey(images[0]).mean())
+    brightness = float(as_grey(images[layout.place(Shown("white")) or 0]).mean())
     what = "black" if brightness < _LEAST_DIRECT else "white" if brightness > 1 - _LEAST_DIRECT else "not changing"
     raise DecodingError(
         f"no stripes are seen: the images are {what} (lit: {share:.2%} of the pixels)",
@@ -137,15 +154,16 @@ def _check_light(images: Sequence[Image], light: Light) -> None:
     )  # fmt: skip
 
 
-def _read_cells(images: Sequence[Image], layout: GrayCode, axis: int, light: Light) -> Cells:
+def _read_cells(photographs: Photographs, axis: int, light: Light) -> Cells:
     """Cells of all pixels along an axis."""
+    layout = photographs.layout
     places = layout.bit_images(axis)
     bits = len(places)
     code = np.zeros(light.lit.shape, dtype=np.int32)
     uncertain = np.zeros_like(code)
     differences = np.empty((bits, *code.shape), dtype=np.int16)
-    for k, (direct, inverse) in enumerate(places):
-        p, q = as_grey(images[direct]), as_grey(images[inverse])
+    for k, place in enumerate(places):
+        p, q = photographs.pair(*place)
         difference = p - q
         value = np.int32(1 << (bits - 1 - k))
         code += value * (difference > 0)
@@ -173,8 +191,14 @@ def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Li
     return (difference <= light.ambient - light.direct) | (difference < np.maximum(_UNCERTAIN * light.direct, noise))
 
 
-def _stripe_image(images: Sequence[Image], layout: GrayCode, axis: int, light: Light) -> Float32[ndarray, "h w"]:
+def _stripe_image(photographs: Photographs, axis: int, light: Light) -> Float32[ndarray, "h w"]:
     """The finest stripes of an axis in [0, 1], with albedo and shading removed."""
-    direct, inverse = layout.bit_images(axis)[-1]
-    difference = as_grey(images[direct]) - as_grey(images[inverse])
-    return np.clip(0.5 + difference / (2 * np.maximum(light.direct, _LEAST_DIRECT)), 0, 1).astype(np.float32)
+    layout, direct = photographs.layout, np.maximum(light.direct, _LEAST_DIRECT)
+    places = layout.bit_images(axis)
+    if places:
+        p, q = photographs.pair(*places[-1])
+        difference = p - q
+    else:
+        sine = photographs.sine(axis, *layout.sines(axis)[-1])
+        difference = 2 * sine.amplitude * np.cos(sine.phase)
+    return np.clip(0.5 + difference / (2 * direct), 0, 1).astype(np.float32)

@@ -10,7 +10,7 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
 from sl_nerfstudio.decoding.grid.trained import weight_files
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.photographs import read_photograph
 
 
 class NetworkDecoder(Decoder[GridPattern]):
@@ -23,7 +23,7 @@ class NetworkDecoder(Decoder[GridPattern]):
 
     def decode(self, paths: Sequence[Path]) -> Decoded:
         """Decode the one image of a frame."""
-        return self._images.decode(read_image(paths[0]))
+        return self._images.decode(read_photograph(paths[0]))
 
     def weights(self) -> Iterable[Path]:
         """The files of the trained networks."""

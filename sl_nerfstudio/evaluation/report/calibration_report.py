@@ -73,9 +73,7 @@ def _device_table(found: BoardCalibration, k: int) -> DeviceTable:
     rows = tuple((key, getattr(device, key), sigma.values[key]) for key in PARAMETERS if sigma.values[key])
     corners = [view.camera if k == 0 else view.projector for view in found.views]
     field = _residual_field(device, corners, found.residuals[k])
-    return DeviceTable(
-        DEVICES[k], device, rows, str(found.free[k]), found.rms_px[k], found.left_out.error_px[k], field
-    )
+    return DeviceTable(DEVICES[k], device, rows, str(found.free[k]), found.rms_px[k], found.left_out.error_px[k], field)
 
 
 def _cards(found: BoardCalibration, pictures: Sequence[BoardPicture]) -> list[PoseCard]:

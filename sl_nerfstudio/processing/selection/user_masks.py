@@ -3,7 +3,6 @@
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +12,12 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.captures import ENDINGS
 from sl_nerfstudio.processing.selection.mask_file import read_mask
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.file_error import FileError, unreadable
 from sl_nerfstudio.verdict.verdict import listed
 
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _LISTED = 20  # frames in a message
 
 
@@ -27,7 +26,7 @@ class UserMasks:
     """The file of each frame's mask, and a digest of the pixels that it selects."""
 
     folder: Path
-    size: tuple[int, int]  # (w, h)
+    sizes: dict[str, tuple[int, int]]  # (w, h) by the frame's name
     files: dict[str, Path]  # by the frame's name
     digests: dict[str, str]
 
@@ -38,7 +37,7 @@ class UserMasks:
         inside the mask, UserError if the mask is another one than at the start of the run.
         """
         path = self.files[frame]
-        mask = read_mask(path, self.size)
+        mask = read_mask(path, self.sizes[frame])
         if _digest(mask) != self.digests[frame]:
             raise UserError(
                 f"{path}: was changed while sl-process was running\n    cause:  another program wrote it\n"
@@ -59,8 +58,8 @@ class UserMasks:
         return hashlib.sha256(lines.encode()).hexdigest()[:24]
 
 
-def find_masks(folder: Path, frames: Sequence[str], size: tuple[int, int]) -> UserMasks:
-    """The masks of all frames, each read and checked. `size` is the captures' (w, h).
+def find_masks(folder: Path, frames: dict[str, tuple[int, int]]) -> UserMasks:
+    """The masks of all frames, each read and checked. `frames` are the sizes (w, h) of the captures by their names.
 
     Raises FileError that names all frames without a mask, or all masks that cannot be used.
     """
@@ -92,14 +91,14 @@ def find_masks(folder: Path, frames: Sequence[str], size: tuple[int, int]) -> Us
             "keep one of them",
         )
     used = {name: files[name] for name in frames}
-    return UserMasks(folder, size, used, _checked(used, size))
+    return UserMasks(folder, frames, used, _checked(used, frames))
 
 
-def _checked(files: dict[str, Path], size: tuple[int, int]) -> dict[str, str]:
+def _checked(files: dict[str, Path], sizes: dict[str, tuple[int, int]]) -> dict[str, str]:
     digests, faults = {}, []
     for name, path in track(files.items(), "reading masks", len(files)):
         try:
-            digests[name] = _digest(read_mask(path, size))
+            digests[name] = _digest(read_mask(path, sizes[name]))
         except FileError as error:
             faults.append(error)
     if faults:

@@ -41,29 +41,29 @@ UPPER = {name: _mask(slice(0, 75)) for name in NAMES}
 def test_all_frames_without_a_mask_are_named_at_once(tmp_path):
     folder = _write(tmp_path / "m", {NAMES[0]: _mask(), "other": _mask()})
     with pytest.raises(FileError, match=r"has no mask for 3 of 4 frames: a 2, a 3, a 10\n.*name of the frame"):
-        find_masks(folder, NAMES, SIZE)
+        find_masks(folder, dict.fromkeys(NAMES, SIZE))
 
 
 def test_all_masks_that_cannot_be_used_are_named_at_once(tmp_path):
     folder = _write(tmp_path / "m", UPPER | {NAMES[1]: _mask()[:50], NAMES[3]: np.zeros(SIZE, bool)})
     with pytest.raises(FileError, match=r"a 2.png: is 130 x 50 pixels.* \(and 1 more cannot be used: a 10.png\)"):
-        find_masks(folder, NAMES, SIZE)
+        find_masks(folder, dict.fromkeys(NAMES, SIZE))
 
 
 def test_folders_that_cannot_be_meant_are_refused(tmp_path):
     with pytest.raises(FileError, match="is no folder"):
-        find_masks(tmp_path / "nowhere", NAMES, SIZE)
+        find_masks(tmp_path / "nowhere", dict.fromkeys(NAMES, SIZE))
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileError, match="holds no masks"):
-        find_masks(tmp_path / "empty", NAMES, SIZE)
+        find_masks(tmp_path / "empty", dict.fromkeys(NAMES, SIZE))
     folder = _write(tmp_path / "m", UPPER)
     (folder / f"{NAMES[2]}.bmp").write_bytes(b"x")
     with pytest.raises(FileError, match="holds several masks for a 3"):
-        find_masks(folder, NAMES, SIZE)
+        find_masks(folder, dict.fromkeys(NAMES, SIZE))
 
 
 def test_a_mask_limits_everything_that_was_decoded(tmp_path):
-    masks = find_masks(_write(tmp_path / "m", UPPER), NAMES, SIZE)
+    masks = find_masks(_write(tmp_path / "m", UPPER), dict.fromkeys(NAMES, SIZE))
     ones = np.ones((*SIZE, 2), np.float32)
     found = masks.applied(NAMES[0], Decoded(ones, np.ones(SIZE, bool), ones[..., 0]))
     assert (np.isfinite(found.coords).all(-1) == UPPER[NAMES[0]]).all() and found.rate == 1

@@ -1,0 +1,1 @@
+"""Tests of captures as people have them."""
