@@ -75,7 +75,7 @@ def _reasons(found: BoardCalibration, limits: CalibrationLimits) -> Iterator[Rea
         focal, centre = sigma.focal() / device.fl_x, sigma.centre() / device.fl_x
         if focal > limits.good_focal:
             band = "acceptable" if focal <= limits.acceptable_focal else "poor"
-            yield Reason(band, f"the focal length of the {name} is uncertain by {focal:.1%} (1 sigma){because}")
+            yield Reason(band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}")
         if centre > limits.good_centre:
             band = "acceptable" if centre <= limits.acceptable_centre else "poor"
             yield Reason(

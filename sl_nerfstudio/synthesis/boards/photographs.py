@@ -35,8 +35,7 @@ class BoardPhotographer:
         albedo, lookup = self._surface(self.scene.T_camera_board[pose])
         for pattern in patterns:
             blurred = cv2.GaussianBlur(pattern.astype(np.float32) / 255, (0, 0), _PROJECTOR_BLUR)
-            # remap counts pixel centres from 0
-            lit = cv2.remap(blurred, lookup - np.float32(0.5), None, cv2.INTER_LINEAR, borderValue=0.0)
+            lit = cv2.remap(blurred, *_maps(lookup), cv2.INTER_LINEAR, borderValue=(0.0,))
             yield self._exposed(albedo * (_ROOM_LIGHT + _LAMP * lit), rng)
 
     def _exposed(self, light: Float32[ndarray, "h w"], rng: np.random.Generator) -> UInt8[ndarray, "h w"]:
@@ -68,5 +67,10 @@ class BoardPhotographer:
 def _albedo(board: Board, p_board: Float32[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     drawn = draw_board(board, _SQUARE_PX, _MARGIN).astype(np.float32) / 255
     values = _BLACK + (_WHITE - _BLACK) * drawn
-    place = (p_board[..., :2] * (1, -1) / board.square + _MARGIN) * _SQUARE_PX - 0.5
-    return cv2.remap(values, place.astype(np.float32), None, cv2.INTER_LINEAR, borderValue=_BEYOND)
+    place = (p_board[..., :2] * (1, -1) / board.square + _MARGIN) * _SQUARE_PX
+    return cv2.remap(values, *_maps(place.astype(np.float32)), cv2.INTER_LINEAR, borderValue=(_BEYOND,))
+
+
+def _maps(uv: Float32[ndarray, "h w 2"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """Columns and rows as cv2.remap counts them, with the first pixel's centre at 0."""
+    return uv[..., 0] - np.float32(0.5), uv[..., 1] - np.float32(0.5)
