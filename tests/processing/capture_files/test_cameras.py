@@ -17,7 +17,7 @@ def test_the_camera_is_refined_and_its_uncertainty_stated(ramp_scan, tmp_path):
     rough = replace(true, fl_x=1.04 * true.fl_x, fl_y=1.04 * true.fl_y, cx=true.w / 2, cy=true.h / 2)
     job = replace(ramp_scan.job(tmp_path / "w"), camera=rough)
     captures = find_captures(ramp_scan.root / "images", True)
-    results = [FrameWorker(job)(frame) for frame in captures.frames]
+    results = [FrameWorker(job)(frame) for frame in captures.frames[:2]]
     log = []
     refined, again, notes = refine_camera(job, results, CameraStart(rough, 0.04, "26 mm"), log.append)
     assert refined.camera.fl_x == pytest.approx(true.fl_x, rel=2e-3)
