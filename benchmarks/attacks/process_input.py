@@ -28,6 +28,7 @@ _PATHS = (
     "dangling", "empty", "empty folder", "captures/pattern.png", "captures/images", "captures/images/frame_00000.png",
     "text", "n" * 300, "captures/pattern.json/x", "x\udcff", "locked",
 )  # fmt: skip
+_RESOLUTIONS = ("1024x768", "1x1", "0x0", "-5x5", "99999x99999", "1024x", "x768", "9" * 300 + "x768")
 _FLAGS = ("--images", "--pattern", "--intrinsics", "--projector-intrinsics", "--masks", "--poses")
 _RIGHT = {"--images": "captures/images"}
 
@@ -37,6 +38,9 @@ def cases() -> list[Case]:
     lengths = [f"baseline of frame 0 = {value} mm" for value in _VALUES] + list(_TEXTS)
     found = [_refused(f"--known-length {_short(text)}", "--known-length", text) for text in lengths]
     found += [_refused(f"--jobs {value}", "--jobs", value) for value in ("0", "-1", "-99999999999", "9" * 5000)]
+    found += [_refused(f"--pattern {value}", "--pattern", value) for value in _RESOLUTIONS]
+    found += [_refused(f"--cell {value}", "--cell", value) for value in ("0", "-1", "2", "9" * 5000)]
+    found += [_refused(f"--sequence {value}", "--sequence", value) for value in ("opencv", "OpenCV", "", "x" * 10_000)]
     for flag in _FLAGS:
         for path in _PATHS:
             if _RIGHT.get(flag) != path:
