@@ -18,7 +18,7 @@ from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.writing import device_fields
 from sl_nerfstudio.synthesis.boards.photographs import BoardPhotographer
-from sl_nerfstudio.synthesis.boards.poses import make_board_scene
+from sl_nerfstudio.synthesis.boards.poses import board_devices, make_board_scene
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 BOARDS: dict[str, Board] = {
@@ -43,24 +43,30 @@ def write_board_captures(config: SynthConfig, output: Path) -> None:
     _refuse_other_flags(config)
     layout = _DEFAULT if config.pattern is None else read_layout(config.pattern)
     board, rng = BOARDS[config.scene], np.random.default_rng([config.seed, 0])
-    scene = make_board_scene(board, (layout.w, layout.h), config, rng)
-    photographer = BoardPhotographer(scene, config.supersampling, config.sensor_noise)
+    scene = make_board_scene(board, board_devices((layout.w, layout.h), config), config.frames, rng)
     with NewFolder(output) as folder:
-        shown = _shown(layout)
-        for pose in track(range(config.frames), "rendering", config.frames):
-            noise = np.random.default_rng([config.seed, 1, pose])
-            for k, image in enumerate(photographer.photographs(pose, shown, noise)):
-                folder.write(f"images/pose_{pose:02d}/{k:02d}.png", encode_png(image))
-        truth = {
-            "units": "mm",
-            "camera": device_fields(scene.camera, "model"),
-            "projector": device_fields(scene.projector, "model"),
-            "T_projector_camera": scene.T_projector_camera.tolist(),
-            "T_camera_board": scene.T_camera_board.tolist(),
-        }
-        folder.write("ground_truth/intrinsics.json", (json.dumps(truth, indent=1) + "\n").encode())
+        write_photographs(
+            folder, BoardPhotographer(scene, config.supersampling, config.sensor_noise), layout, config.seed
+        )
         folder.write("pattern.png", encode_png(np.rint(255 * layout.render()).astype(np.uint8)))
         folder.write("pattern.json", layout.encode(), last=True)
+
+
+def write_photographs(folder: NewFolder, photographer: BoardPhotographer, layout: PatternLayout, seed: int) -> None:
+    """images/ with a folder for each pose, and ground_truth/intrinsics.json."""
+    scene, shown = photographer.scene, _shown(layout)
+    for pose in track(range(len(scene.T_camera_board)), "rendering"):
+        noise = np.random.default_rng([seed, 1, pose])
+        for k, image in enumerate(photographer.photographs(pose, shown, noise)):
+            folder.write(f"images/pose_{pose:02d}/{k:02d}.png", encode_png(image))
+    truth = {
+        "units": "mm",
+        "camera": device_fields(scene.camera, "model"),
+        "projector": device_fields(scene.projector, "model"),
+        "T_projector_camera": scene.T_projector_camera.tolist(),
+        "T_camera_board": scene.T_camera_board.tolist(),
+    }
+    folder.write("ground_truth/intrinsics.json", (json.dumps(truth, indent=1) + "\n").encode())
 
 
 def _shown(layout: PatternLayout) -> list[UInt8[ndarray, "h w"]]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.pattern.boards import Board
 from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.devices import DevicePair
 
 _FOCAL = 1.3  # in widths of the image: a field of view of 42 degrees
 _PROJECTOR_FOCAL = 1.4
@@ -33,10 +34,8 @@ class BoardScene:
     T_camera_board: Float64[ndarray, "n 4 4"]
 
 
-def make_board_scene(
-    board: Board, pattern: tuple[int, int], config: SynthConfig, rng: np.random.Generator
-) -> BoardScene:
-    """Poses with all corners in the camera's image and in the pattern; `pattern` is its (w, h)."""
+def board_devices(pattern: tuple[int, int], config: SynthConfig) -> DevicePair:
+    """A camera of 4:3, and a projector whose principal point lies below its image; `pattern` is its (w, h)."""
     w, h = config.resolution, round(0.75 * config.resolution)
     f = _FOCAL * w
     camera = Device(w, h, f, f, 0.51 * w, 0.49 * h, *config.camera_distortion)
@@ -44,15 +43,21 @@ def make_board_scene(
     fp = _PROJECTOR_FOCAL * columns
     projector = Device(columns, rows, fp, fp, 0.49 * columns, _LENS_SHIFT * rows, *config.projector_distortion,
                        config.projector_model)  # fmt: skip
+    return DevicePair(camera, projector)
+
+
+def make_board_scene(board: Board, devices: DevicePair, poses: int, rng: np.random.Generator) -> BoardScene:
+    """Poses with all corners in the camera's image and in the pattern."""
+    camera, projector = devices.camera, devices.projector
     p_board = np.c_[board.corners() * (1, -1), np.zeros(len(board.corners()))]
-    distance = _FOCAL / _FILL * float(np.ptp(p_board[:, 0]))
+    distance = camera.fl_x / camera.w / _FILL * float(np.ptp(p_board[:, 0]))
     T_projector_camera = _relative_pose(projector, distance)
     found: list[ndarray] = []
     for _ in range(_TRIES):
         T = _random_pose(camera, p_board, distance, rng)
         if _inside(camera, T, p_board).all() and _inside(projector, T_projector_camera @ T, p_board).all():
             found.append(T)
-            if len(found) == config.frames:
+            if len(found) == poses:
                 return BoardScene(board, camera, projector, T_projector_camera, np.array(found))
     raise AssertionError("the devices see no common volume")
 
