@@ -2,9 +2,9 @@
 
     python -m benchmarks.first_scan [--folder FOLDER] [--output FILE]
 
-Every command of the page runs as it stands there. Those with a display or a camera do not: tests/capture runs them. What the
-camera would have seen is rendered: the board under the sequence of the page, and an object under its pattern, by the same
-two devices, which no command is told. The known length is replaced by the true one.
+Every command of the page runs as it stands there. Those with a display or a camera do not: tests/capture runs them.
+What the camera would have seen is rendered: the board under the sequence of the page, and an object under its pattern,
+by the same two devices, which no command is told. The known length is replaced by the true one.
 """
 
 import json
@@ -99,10 +99,9 @@ def _capture(config: Config, folder: Path) -> None:
     os.rename(folder / "rendered/images", folder / "captures")
     devices = _devices(folder / "rendered/intrinsics.json")
     board = make_board_scene(Chessboard(9, 6, 20.0), devices, config.poses, np.random.default_rng(config.seed))
+    photographer = BoardPhotographer(board, supersampling=2, noise=0.012)
     with NewFolder(folder / "rendered-board") as new:
-        write_photographs(
-            new, BoardPhotographer(board, 2, 0.012), read_layout(folder / "gray/pattern.json"), config.seed
-        )
+        write_photographs(new, photographer, read_layout(folder / "gray/pattern.json"), config.seed)
     os.rename(folder / "rendered-board/images", folder / "calibration")
 
 
@@ -142,10 +141,8 @@ def _accuracy(folder: Path) -> list[Figure]:
     figures.append(Figure("verdict of sl-process", processing["verdict"]))
     figures.append(Figure("frames in the scan", sum(frame["in_scan"] for frame in processing["frames"])))
     shutil.copytree(folder / "rendered/ground_truth", folder / "scan/ground_truth")
-    _run(
-        folder,
-        shlex.split("sl-eval --mesh mesh.ply --data scan --poses refined/transforms.json --json evaluation.json"),
-    )
+    evaluate = "sl-eval --mesh mesh.ply --data scan --poses refined/transforms.json --json evaluation.json"
+    _run(folder, shlex.split(evaluate))
     result = json.loads((folder / "evaluation.json").read_text())
     rigid = result["rigid"]["accuracy"]
     figures += [Figure(f"surface to truth, {key}, mm", rigid[key]) for key in ("rmse", "median")]

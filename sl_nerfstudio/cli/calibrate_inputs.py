@@ -1,10 +1,11 @@
 """What the flags of sl-calibrate name: photographs, the pattern on them, and the corners of the board."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sl_nerfstudio.calibration.board.calibrate import FEWEST_VIEWS
 from sl_nerfstudio.calibration.board.captures import BoardCaptures, BoardPhotographs, read_board_captures
+from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
@@ -22,9 +23,6 @@ from sl_nerfstudio.processing.capture_files.sequences import (
 from sl_nerfstudio.processing.captures import Captures, find_captures
 from sl_nerfstudio.progress import track
 
-if TYPE_CHECKING:
-    from sl_nerfstudio.cli.calibrate import CalibrateConfig
-
 Size = tuple[int, int]
 
 
@@ -37,7 +35,7 @@ class CalibrationInputs:
     pattern_size: Size | None  # None: the camera alone
 
 
-def read_inputs(config: "CalibrateConfig", board: Board) -> CalibrationInputs:
+def read_inputs(config: CalibrateConfig, board: Board) -> CalibrationInputs:
     """Find the board in all photographs, and say which poses cannot be used.
 
     Raises UserError if fewer than three remain, with what is wrong with each of the others.
@@ -63,21 +61,21 @@ def read_inputs(config: "CalibrateConfig", board: Board) -> CalibrationInputs:
     return CalibrationInputs(captures, found.size, None if layout is None else (layout.w, layout.h))
 
 
-def _photographs(config: "CalibrateConfig") -> Captures:
+def _photographs(config: CalibrateConfig) -> Captures:
     """Poses in sub-folders; for the camera alone, also single images."""
     if config.camera_only and any(path.is_file() for path in _content(config)):
         return find_captures(config.images, sequences=False)
     return find_captures(config.images, sequences=True)
 
 
-def _content(config: "CalibrateConfig") -> list[Any]:
+def _content(config: CalibrateConfig) -> list[Any]:
     try:
         return [path for path in config.images.iterdir() if not path.name.startswith(".")]
     except OSError:
         return []  # said by find_captures
 
 
-def _decoder(config: "CalibrateConfig", found: Captures) -> Decoder[Any]:
+def _decoder(config: CalibrateConfig, found: Captures) -> Decoder[Any]:
     """For the pattern that was projected."""
     if config.pattern is None:
         layout = likely_layout(found, config.sequence or "opencv")

@@ -135,6 +135,6 @@ def _next_command(config: CaptureConfig) -> str:
     if config.pattern is None:
         board = '--board chessboard --corners 9x6 --square "18 mm"'
         words = "next, for images of a board (with its own numbers):"
-        return f"{words}\n    sl-calibrate {images} {board} --output intrinsics.json"
+        return f"{words}\n    sl-calibrate {images} {board} --camera-only --output intrinsics.json"
     pattern = f"--pattern {shlex.quote(str(config.pattern))}"
     return f"next:\n    sl-process {images} {pattern} --intrinsics intrinsics.json --output scan"

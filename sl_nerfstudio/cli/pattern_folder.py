@@ -115,7 +115,8 @@ def calibrate_command(board: Board) -> str:
         flags = ["--board", "charuco", "--squares", f"{board.columns}x{board.rows}"]
         last = ["--marker", f'"{board.marker:g} mm"', "--dictionary", shlex.quote(board.dictionary)]
     lengths = ["--square", f'"{board.square:g} mm"', *last]
-    return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, "--output", "intrinsics.json"])
+    end = ["--pattern", "pattern.json", "--output", "intrinsics.json"]
+    return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, *end])
 
 
 def _board(

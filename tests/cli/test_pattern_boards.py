@@ -133,7 +133,7 @@ def test_the_size_follows_from_the_width_and_the_command_says_it(tmp_path, capsy
     assert words[:3] == ["sl-calibrate", "--images", "captures"]
     assert words[3:] == [
         "--board", "charuco", "--squares", "7x5", "--square", "24.2857 mm", "--marker", "18.2143 mm",
-        "--dictionary", "5X5_1000", "--output", "intrinsics.json",
+        "--dictionary", "5X5_1000", "--pattern", "pattern.json", "--output", "intrinsics.json",
     ]  # fmt: skip
     assert json.loads((tmp_path / "b" / "board.json").read_text())["square_mm"] == 24.2857
     assert "A4, on its side" in said
