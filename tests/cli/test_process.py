@@ -150,8 +150,8 @@ def test_rough_poses_give_axes_and_unit_and_a_wrong_projector_focal_length_is_fo
     wrong["projector"] |= {key: 1.04 * exact["projector"][key] for key in ("fl_x", "fl_y")}
     (tmp_path / "wrong.json").write_text(json.dumps(wrong))
     flags = [*captures.flags[:4], "--intrinsics", tmp_path / "wrong.json", "--poses", tmp_path / "rough.json"]
-    _run(monkeypatch, *flags, "--refine-projector-focal", "--output", tmp_path / "scan", "--jobs", 1)
-    assert "projector's focal length: 0.9" in capsys.readouterr().out
+    _run(monkeypatch, *flags, "--estimate-projector", "--output", tmp_path / "scan", "--jobs", 1)
+    assert "projector, from the epipolar geometry of all frames: focal lengths " in capsys.readouterr().out
     scan = read_scan(tmp_path / "scan")
     assert scan.units == "mm" and scan.scale.source == "given camera poses"
     assert scan.projector.fl_x == pytest.approx(exact["projector"]["fl_x"], rel=0.01)
