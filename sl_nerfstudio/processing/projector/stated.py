@@ -45,7 +45,8 @@ def require_known_camera(config: ProcessConfig, cameras: Cameras) -> None:
         raise UserError(
             "--estimate-projector, --rig static-projector: the camera's intrinsics are not known\n"
             "    cause:  no file describes the camera, EXIF gives only a rough focal length, and both devices at once "
-            "cannot be found\n    remedy: calibrate the camera (sl-calibrate --camera-only) and give its file with --intrinsics"
+            "cannot be found\n    remedy: calibrate the camera (sl-calibrate --camera-only), give its file with "
+            "--intrinsics"
         )
     if config.rig == "rigid" and cameras.several:
         raise UserError(

@@ -64,14 +64,6 @@ def test_a_rigid_rig_has_one_relative_pose(ramps_registered, rigid, tmp_path):
     np.testing.assert_allclose(T, np.broadcast_to(T[0], T.shape), atol=1e-6)
 
 
-def test_nothing_is_known_of_a_projector_that_moves_freely(ramps_registered, ramp_scan, tmp_path):
-    config = ramp_scan.config(tmp_path / "s", estimate_projector=True)
-    result, log = _run(replace(config, intrinsics=_camera_alone(ramp_scan, tmp_path / "camera.json")))
-    assert any(line.startswith("after the joint adjustment: projector, from the epipolar") for line in log)
-    found, sigma = read_scan(tmp_path / "s").projector, result.projector.sigmas()
-    assert abs(found.fl_x - ramp_scan.projector.fl_x) < max(4 * sigma["fl_x"], 2e-3 * found.fl_x)
-
-
 def test_a_camera_alone_in_the_file_is_an_error_that_names_the_flags(ramps_registered, ramp_scan, tmp_path):
     config = ramp_scan.config(tmp_path / "s")
     config = replace(config, intrinsics=_camera_alone(ramp_scan, tmp_path / "camera.json"))
