@@ -62,8 +62,8 @@ def pose_covariance(
     eye = torch.eye(UNKNOWNS, dtype=torch.float64)
     B = torch.block_diag(B, eye)
     poses_H, poses_g = prior_equations(prior, start, e.rig)
-    weight = 1 / max(prior.intrinsics, _EXACT) ** 2
-    H_prior = noise**2 * torch.block_diag(poses_H, weight * eye)
+    weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
+    H_prior = noise**2 * torch.block_diag(poses_H, weight.diag())
     g_prior = noise**2 * torch.cat(
         [poses_g, weight * torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)]
     )

@@ -23,6 +23,13 @@ class PosePrior:
     relative_rotation: Float[Tensor, "frames"]
     intrinsics: float = INTRINSICS_SIGMA  # focal lengths and principal points, as a share of the focal length
     intrinsics_change: IntrinsicsChange = UNCHANGED  # of the devices, relative to the stated intrinsics
+    projector_intrinsics: tuple[float, float, float] | None = None  # focal length, x, y, if known otherwise
+
+    @property
+    def intrinsics_sigma(self) -> Float[Tensor, "6"]:
+        """1 sigma of the intrinsics, in the order of `IntrinsicsChange.values`."""
+        camera = (self.intrinsics,) * 3
+        return torch.tensor([*camera, *(self.projector_intrinsics or camera)], dtype=torch.float64)
 
     @property
     def sigma(self) -> Float[Tensor, "frames 12"]:

@@ -11,6 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
+from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
 from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
@@ -18,10 +19,19 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity, centred_on
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, motion_by_pose_errors
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.types import PoseSigma
+
+
+@dataclass(frozen=True)
+class ProjectorKnowledge:
+    """What is known of the projector's focal length and principal point: shares of the focal length."""
+
+    sigma: tuple[float, float, float]
+    change: DeviceChange = field(default_factory=DeviceChange)  # of the current projector against the known one
 
 
 @dataclass(frozen=True)
@@ -42,6 +52,10 @@ class RegisteredFramesSettings:
     as large as independent residuals suggest."""
     least_sigma: float = 1e-9
     """Smallest sigma that is stated, in scene units or radian."""
+    refine: RefinePoses = "free"
+    """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
+    projector: ProjectorKnowledge | None = None
+    """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
     adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
     """The bundle adjustment itself."""
 
@@ -100,7 +114,7 @@ def adjust_registered(
     )
     maps = CoordinateMaps.of([torch.from_numpy(clouds[k].coords) for k in index], s.adjustment.look_up)
     prior = _prior(clouds, registration, index, S_scene_world.scale, s)
-    found = adjust(start, maps, prior, "free", s.adjustment)
+    found = adjust(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
     rig = restore(start, found.rig, baseline_scale(start, found.rig, None))
     S_world_scene = S_scene_world.inverse()
     stated = s.dependence * frame_sigmas(found.sigma.clamp_min(s.least_sigma), S_world_scene.scale)
@@ -168,4 +182,8 @@ def _prior(
             )
         )
     a, b, c, d = torch.tensor(rows, dtype=torch.float64).unbind(1)
-    return PosePrior(a, b, c, d)
+    if settings.projector is None:
+        return PosePrior(a, b, c, d)
+    known = settings.projector
+    change = IntrinsicsChange(projector=known.change)
+    return PosePrior(a, b, c, d, intrinsics_change=change, projector_intrinsics=known.sigma)

@@ -41,6 +41,12 @@ class SelfCalibration:
         """1 sigma of each change."""
         return self.covariance.diagonal().sqrt()
 
+    def of_projector(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+        """Change of the projector alone, and its covariance, if the cameras' intrinsics are right."""
+        C, k, p = self.covariance, slice(0, 3), slice(3, 6)
+        gain = torch.linalg.solve(C[k, k], C[k, p]).T
+        return self.change[p] - gain @ self.change[k], C[p, p] - gain @ C[k, p]
+
     @property
     def known(self) -> bool:
         """Whether there is an estimate at all; there is none if nothing was adjusted."""

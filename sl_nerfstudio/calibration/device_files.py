@@ -14,6 +14,11 @@ from sl_nerfstudio.geometry.devices import Device, DeviceKind
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.intrinsics import device_problems
 
+_MISSING: dict[Role, str] = {
+    "projector": "give its file with --projector-intrinsics, or find it from the captures: --estimate-projector",
+    "camera": "give the camera's file",
+}
+
 
 def read_device_file(
     path: Path,
@@ -72,7 +77,7 @@ def _choose(path: Path, entries: list[DeviceEntry], role: Role, size: tuple[int,
             path,
             f"describes no {role}, only {', '.join(e.label for e in entries)}",
             "each device has its own file",
-            "give the other file with --projector-intrinsics" if role == "projector" else "give the camera's file",
+            _MISSING[role],
         )
     listed = ", ".join(f"{e.label} ({'x'.join(map(str, e.size)) if e.size else 'no size'})" for e in named or free)
     what = "images" if role == "camera" else "pattern"

@@ -10,6 +10,8 @@ import tyro
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.sequence import SequenceName
 
+Rig = Literal["free", "rigid", "static-projector"]
+
 
 @dataclass(frozen=True)
 class ProcessConfig:
@@ -49,8 +51,10 @@ class ProcessConfig:
     """the frames were not captured in order around the object: try every pair"""
     poses: Path | None = None
     """transforms.json with rough camera poses to start from (within 20 degrees); the scan gets their axes and unit"""
-    refine_projector_focal: bool = False
-    """the focal length of the projector is only roughly known: estimate it from all frames"""
+    rig: Rig = "free"
+    """how the devices moved: each by itself, both fixed to each other, or only the camera"""
+    estimate_projector: bool = False
+    """nobody has calibrated the projector: find its intrinsics from all frames; those in a file are only a start"""
     masks: Path | None = None
     """folder with one mask for each frame, named like the frame: white is used, black is not"""
     object_only: bool = False
@@ -80,6 +84,11 @@ class ProcessConfig:
             raise UserError(
                 f"--work {self.work_folder}: is in the output, which is to be a new folder; give another one"
             )
+
+    @property
+    def finds_projector(self) -> bool:
+        """Whether frames are decoded before anything is known of the projector's poses."""
+        return self.estimate_projector or self.rig == "static-projector"
 
     @property
     def work_folder(self) -> Path:

@@ -10,7 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames, adjust_registered
+from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    AdjustedFrames,
+    RegisteredFramesSettings,
+    adjust_registered,
+)
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
@@ -34,7 +38,10 @@ class ConsistentFrames:
 
 
 def adjust_consistent(
-    clouds: Sequence[FrameCloud], registration: Registration, log: Callable[[str], None]
+    clouds: Sequence[FrameCloud],
+    registration: Registration,
+    log: Callable[[str], None],
+    settings: RegisteredFramesSettings | None = None,
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
@@ -42,20 +49,20 @@ def adjust_consistent(
 
     Raises UserError if fewer than two frames are registered.
     """
-    found = _without_contradictions(clouds, _adjusted(clouds, registration), log)
+    found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
     more = _with_left_out(clouds, found)
     new = np.flatnonzero(more.registered & ~found.registration.registered)
     names = [registration.names[k] for k in new]
     if not names:
         return found
     log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
-    with_more = _adjusted(clouds, more)
+    with_more = _adjusted(clouds, more, settings)
     doubtful = [k for k in new if not _agrees_well(with_more, int(k))]
     if len(doubtful) == len(names):
         return found
     if doubtful:
-        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]))
-    return _without_contradictions(clouds, with_more, log)
+        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]), settings)
+    return _without_contradictions(clouds, with_more, log, settings)
 
 
 def _agrees_well(found: ConsistentFrames, k: int) -> bool:
@@ -82,7 +89,10 @@ def _with_left_out(clouds: Sequence[FrameCloud], found: ConsistentFrames) -> Reg
 
 
 def _without_contradictions(
-    clouds: Sequence[FrameCloud], found: ConsistentFrames, log: Callable[[str], None]
+    clouds: Sequence[FrameCloud],
+    found: ConsistentFrames,
+    log: Callable[[str], None],
+    settings: RegisteredFramesSettings | None,
 ) -> ConsistentFrames:
     for _ in range(_ROUNDS):
         groups = agreeing_groups(found.cross)
@@ -92,7 +102,7 @@ def _without_contradictions(
             break
         names = ", ".join(found.registration.names[k] for group in lost for k in group)
         log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")
-        found = _adjusted(clouds, without_groups(found.registration, lost))
+        found = _adjusted(clouds, without_groups(found.registration, lost), settings)
     return found
 
 
@@ -127,8 +137,10 @@ def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) 
     )
 
 
-def _adjusted(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
-    adjusted = adjust_registered(clouds, registration)
+def _adjusted(
+    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None
+) -> ConsistentFrames:
+    adjusted = adjust_registered(clouds, registration, settings)
     return ConsistentFrames(registration, adjusted, compare_registered(clouds, registration, adjusted))
 
 

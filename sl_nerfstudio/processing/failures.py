@@ -30,6 +30,8 @@ def too_few_frames(
     write_atomic(path, make_report(result, [Preview(None, None)] * len(result.frames)).encode())
     lost = [frame for frame in result.frames if not frame.in_scan]
     first = lost[0].reason.strip().splitlines()[1:] if lost else []
+    if result.contradiction:  # measured, and cause enough
+        first = [f"    {line}" if k == 0 else line for k, line in enumerate(result.contradiction.splitlines())]
     return UserError(
         f"{config.images}: {usable} of {len(result.frames)} frames can be used, a scan needs at least "
         f"{FEWEST_FRAMES}\n"

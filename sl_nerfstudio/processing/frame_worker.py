@@ -30,6 +30,7 @@ class FrameJob:
     seed: int
     masks: UserMasks | None = None  # of the user
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
+    projector_known: bool = True  # False: frames are only decoded, until the projector has been found
 
     def camera_of(self, frame: CapturedFrame) -> Device:
         """The camera that took a frame."""
@@ -88,7 +89,8 @@ class FrameWorker:
         except DecodingError as error:
             return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
         share = float(decoded.mask.mean())
-        return self.calibrate(FrameStageResult(frame, key, resumed, decoded.rate, share), decoded)
+        result = FrameStageResult(frame, key, resumed, decoded.rate, share)
+        return self.calibrate(result, decoded) if self._job.projector_known else result
 
     def calibrate(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""

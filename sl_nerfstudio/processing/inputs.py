@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.capture_files.cameras import Cameras, read_cameras, require_intrinsics
 from sl_nerfstudio.processing.capture_files.captured import CaptureNotes, read_captured
@@ -12,6 +10,7 @@ from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
+from sl_nerfstudio.processing.projector.stated import read_projector, require_known_camera
 from sl_nerfstudio.processing.selection.user_masks import find_masks
 from sl_nerfstudio.registration.known_length import KnownLength, is_index, parse_known_length
 
@@ -23,6 +22,7 @@ class Inputs:
     job: FrameJob
     cameras: Cameras
     captures: Captures
+    projector_stated: bool  # in a file; False: only its size is known
     given: GivenPoses | None  # in the order of the captures
     known: KnownLength | None  # its frames by name
     notes: CaptureNotes  # on the captures
@@ -36,20 +36,19 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     decoder, captures = captured.decoder, captured.captures
     layout = decoder.layout
     names = [frame.name for frame in captures.frames]
-    require_intrinsics(config, projector_needed=True)
+    require_intrinsics(config, projector_needed=not config.finds_projector)
     cameras = read_cameras(config, captures)
-    projector = read_device_file(
-        config.projector_intrinsics or config.intrinsics or Path(),
-        "projector",
-        (layout.w, layout.h),
-        config.projector_model,
-        config.procam_step,
-    )
+    require_known_camera(config, cameras)
+    projector, stated = read_projector(config, (layout.w, layout.h))
     masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
+    known_beam = not config.finds_projector
     return Inputs(
-        FrameJob(config.work_folder, decoder, cameras.first, projector, config.seed, masks, cameras=cameras.several),
+        FrameJob(
+            config.work_folder, decoder, cameras.first, projector, config.seed, masks, cameras.several, known_beam
+        ),
         cameras,
         captures,
+        stated,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),
         captured.notes,

@@ -16,14 +16,17 @@ from sl_nerfstudio.processing.capture_files.cameras import refine_camera
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
-from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.kept.work_folder import work_folder
 from sl_nerfstudio.processing.preview import Preview
-from sl_nerfstudio.processing.refined_focal import refine_focal
+from sl_nerfstudio.processing.projector.found import describe
+from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
+from sl_nerfstudio.processing.projector.rigid import with_equal_baselines
+from sl_nerfstudio.processing.projector.stage import calibrate_frames
+from sl_nerfstudio.processing.projector.stated_test import contradiction_by_epipolar_geometry
 from sl_nerfstudio.processing.result import ProcessResult, with_object_only
 from sl_nerfstudio.processing.scan_poses import find_scan_poses, require_known_frames
 from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
@@ -57,17 +60,21 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     for sentence in inputs.notes.sentences:
         log(sentence)
 
-    results = run_frame_stage(config, job, captures)
-    log(describe_frame_stage(results))
+    calibrated = calibrate_frames(config, inputs, log)
+    job, results, found = calibrated.job, calibrated.results, calibrated.found
     _require_clouds(config, inputs, results, make_report)
     notes = inputs.notes
     if inputs.cameras.start is not None:
         job, results, camera = refine_camera(job, results, inputs.cameras.start, log)
         notes = notes.with_camera(camera.sentence(), camera.document())
         _require_clouds(config, inputs, results, make_report)
-    if config.refine_projector_focal:
-        job, results = refine_focal(job, results, log)
-        _require_clouds(config, inputs, results, make_report)
+    wrong = (
+        ""
+        if found is not None or inputs.cameras.start is not None
+        else contradiction_by_epipolar_geometry(job, results)
+    )
+    if wrong:
+        log(wrong)
 
     clouds = clouds_of(results)
     if inputs.known is not None:
@@ -75,25 +82,40 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     given = _given_for_clouds(inputs.given, results)
     start = None if given is None else given.T_world_camera
     store = StageStore(job.work, log)
-    chosen, registration = store.kept(
-        "registration",
-        (clouds, config.unordered, config.seed, start),
-        lambda: _register(clouds, config.unordered, config.seed, start, log),
-    )
-    clouds = chosen_clouds(clouds, chosen)
-    results = with_clouds(results, clouds)
+    if calibrated.registration is None:
+        chosen, registration = store.kept(
+            "registration",
+            (clouds, config.unordered, config.seed, start),
+            lambda: _register(clouds, config.unordered, config.seed, start, log),
+        )
+        clouds = chosen_clouds(clouds, chosen)
+        results = with_clouds(results, clouds)
+        if config.rig == "rigid":
+            registration = with_equal_baselines(registration)
+    else:
+        registration = calibrated.registration
     log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
-    _require_registered(config, inputs, results, registration, make_report)
+    _require_registered(config, inputs, results, registration, wrong, make_report)
 
-    consistent = store.kept("adjustment", (clouds, registration), lambda: adjust_consistent(clouds, registration, log))
+    settings = adjustment_settings(config.rig, found)
+    consistent = store.kept(
+        "adjustment",
+        (clouds, registration, settings),
+        lambda: adjust_consistent(clouds, registration, log, settings),
+    )
+    if found is not None and config.rig != "static-projector":  # whose placement has adjusted everything
+        refined = refine_projector(clouds, consistent, found, settings, log)
+        clouds, consistent, found = refined.clouds, refined.consistent, refined.found
+        log(f"after the joint adjustment: {describe(found)}")
+        job, results = replace(job, projector=found.projector), with_clouds(results, clouds)
     registration = consistent.registration
     poses = find_scan_poses(clouds, registration, consistent.adjusted, inputs.known, given)
-    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross)
+    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, found, wrong)
     result = replace(result, captured=notes)
     if config.object_only:
-        found = find_object_only(job, results, registration, poses)
-        log("object only: " + "\n    ".join(object_sentences(found)))
-        poses, result = with_usable_scale(poses, found), with_object_only(result, found)
+        parts = find_object_only(job, results, registration, poses)
+        log("object only: " + "\n    ".join(object_sentences(parts)))
+        poses, result = with_usable_scale(poses, parts), with_object_only(result, parts)
     if result.joint_px is not None:
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(folder, job, results, poses, result, make_report)
@@ -135,12 +157,16 @@ def _require_registered(
     inputs: Inputs,
     results: Sequence[FrameStageResult],
     registration: Registration,
+    wrong: str,
     make_report: MakeReport,
 ) -> None:
-    """Raise UserError if fewer than two frames were registered, or fewer than two of those with given poses."""
+    """Raise UserError if fewer than two frames were registered, or fewer than two of those with given poses.
+
+    `wrong`: which intrinsics the frames contradict, or "": then this is the cause.
+    """
     usable = int(registration.registered.sum())
     if usable < FEWEST_FRAMES:
-        result = summarise(config, inputs.job.decoder.name, results, registration, None)
+        result = summarise(config, inputs.job.decoder.name, results, registration, None, contradicted=wrong)
         raise too_few_frames(result, usable, make_report)
     if inputs.given is not None:
         require_given_poses(config, inputs.given, results, registration)

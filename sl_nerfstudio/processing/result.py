@@ -5,6 +5,7 @@ from typing import Any
 
 from sl_nerfstudio.processing.capture_files.captured import CaptureNotes
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.selection.object_only import ObjectOnly
 from sl_nerfstudio.processing.selection.object_words import object_document
 from sl_nerfstudio.verdict.verdict import Verdict
@@ -64,6 +65,8 @@ class ProcessResult:
     cross_px: tuple[float, float] | None  # the same over all points that two frames saw: median, 95 %
     verdict: Verdict
     versions: dict[str, str]
+    projector: FoundProjector | None = None  # None: the projector is the stated one
+    contradiction: str = ""  # which intrinsics the captures contradict; it is among the remarks, too
     object_only: ObjectOnly | None = None  # None: surroundings were not looked for
     captured: CaptureNotes | None = None  # on the captures
 
@@ -80,6 +83,7 @@ class ProcessResult:
             "decoder": self.decoder,
             "units": self.units,
             "scale": self.scale_source or None,
+            "projector": None if self.projector is None else self.projector.document(),
             "frames": [
                 {key: value for key, value in vars(frame).items() if value not in (None, "", ())}
                 for frame in self.frames

@@ -12,6 +12,7 @@ from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.intrinsics_words import contradiction
+from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
@@ -50,13 +51,19 @@ def summarise(
     registration: Registration | None,
     poses: ScanPoses | None,
     cross: CrossFrameAgreement | None = None,
+    found: FoundProjector | None = None,
+    contradicted: str = "",
 ) -> ProcessResult:
-    """The result of a run; without `poses` no frame is in a scan. `cross` is of the registered frames."""
+    """The result of a run; without `poses` no frame is in a scan. `cross` is of the registered frames.
+
+    `found`: the projector, if it was found from the frames. `contradicted`: which intrinsics the epipolar geometry
+    contradicts; what the joint adjustment finds is said where this is empty.
+    """
     frames = _with_cross([_record(result, registration, poses) for result in results], cross)
     edges = () if registration is None else registration.edges
     records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
     adjusted = None if poses is None else poses.adjusted
-    wrong = _contradiction(results, adjusted)
+    wrong = contradicted or _contradiction(results, adjusted)
     return ProcessResult(
         config=config,
         decoder=decoder,
@@ -64,7 +71,11 @@ def summarise(
         scale_source=poses.scale.source if poses is not None and poses.scale.known else "",
         frames=frames,
         edges=records,
-        remarks=(*([wrong] if wrong else []), *_uncertain(registration)),
+        remarks=(
+            *([wrong] if wrong else []),
+            *([found.doubt] if found and found.doubt else []),
+            *_uncertain(registration),
+        ),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
         cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
@@ -73,6 +84,8 @@ def summarise(
                 tuple(map(_facts, frames)), tuple(PairFacts(e.frames, e.used) for e in records), cross, bool(wrong)
             )
         ),
+        projector=found,
+        contradiction=wrong,
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 

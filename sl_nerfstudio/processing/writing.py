@@ -43,6 +43,7 @@ def write_scan(
         units=poses.units,
         scale=poses.scale,
         projector=job.projector,
+        projector_extra=None if result.projector is None else {"intrinsics_sigma": result.projector.sigmas()},
         pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
         camera=job.camera,
         within=folder,

@@ -98,6 +98,26 @@ def estimate_relative_pose(
     return found
 
 
+@one_library_thread()
+def relative_pose_near(
+    T_camera_projector: Float64[ndarray, "4 4"],
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+    seed: int = 0,
+    settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS,
+) -> RelativePose:
+    """The relative pose nearest to one that is known to within a few degrees; no other solution is looked for."""
+    rng = np.random.default_rng(seed)
+    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector, settings.blocks)
+    some = rays.chosen(subsample(np.arange(len(rays)), settings.most, rng))
+    t = T_camera_projector[:3, 3]
+    fit = fit_epipolar(T_camera_projector[:3, :3], t / np.linalg.norm(t), some, settings.fit)
+    frame = _Frame(len(uv_camera), usable, rays, some, block_count(projector, settings.blocks), settings)
+    return _relative_pose(ranked([fit], some, settings)[0], None, (), frame)
+
+
 @dataclass(frozen=True)
 class _Frame:
     """What all solutions of a frame have in common."""

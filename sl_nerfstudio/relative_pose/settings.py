@@ -163,31 +163,4 @@ class RelativePoseSettings:
     """when a frame is degenerate"""
 
 
-@dataclass(frozen=True)
-class FocalSettings:
-    """Gauss-Newton on the projector's focal length and the relative poses of all frames."""
-
-    most: int = 3000
-    """correspondences of each frame at most"""
-    difference_step: float = 1e-5
-    """step of the differences, of the logarithm of the focal length"""
-    iterations: int = 12
-    """iterations at most"""
-    converged: float = 1e-9
-    """step of the logarithm below which the search has converged"""
-    largest_step: float = 0.05
-    """step of the logarithm at most"""
-    kernel_sigmas: float = 3.0
-    """width of the robust kernel, in standard deviations of the residuals"""
-    final_iterations: int = 10
-    """iterations of the fit of each pose in the end"""
-    significant_sigmas: float = 3.0
-    """standard deviations by which the focal length must change to be significant"""
-    blocks: PatternBlocks = field(default_factory=PatternBlocks)
-    """squares of the pattern"""
-    fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
-    """the fit of each pose in the end"""
-
-
 RELATIVE_POSE_DEFAULTS = RelativePoseSettings()
-FOCAL_DEFAULTS = FocalSettings()

@@ -42,13 +42,15 @@ class ScanWriter:
         pattern: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"],
         camera: Device | None = None,
         extra: dict[str, Any] | None = None,
+        projector_extra: dict[str, Any] | None = None,
         within: NewFolder | None = None,
     ) -> None:
         """Start a folder at `root`, which must not exist or be empty (else UserError).
 
         `camera` holds the intrinsics common to all frames; None: each frame has its own. `pattern` has the
-        projector's size. `extra` holds further top-level keys of transforms.json. `within` is a new folder that the
-        caller fills, and that `root` is or lies in: after an exception it is the caller's to remove.
+        projector's size. `extra` holds further top-level keys of transforms.json, `projector_extra` of its projector.
+        `within` is a new folder that the caller fills, and that `root` is or lies in: after an exception it is the
+        caller's to remove.
         """
         if units not in UNITS:
             raise ValueError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
@@ -64,7 +66,11 @@ class ScanWriter:
             "units": units,
             **(device_fields(camera, "camera_model") if camera else {}),
         }
-        self._head["projector"] = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
+        self._head["projector"] = {
+            **device_fields(projector, "model"),
+            "pattern_path": "pattern.png",
+            **(projector_extra or {}),
+        }
         self._head["scale"] = scale_record(scale)
         self._scale = scale
         self._head.update(extra or {})

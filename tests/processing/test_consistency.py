@@ -27,7 +27,7 @@ NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
 @pytest.fixture(autouse=True)
 def quick_adjustment(monkeypatch):
     quick = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
-    monkeypatch.setattr(consistency, "adjust_registered", lambda c, r: adjust_registered(c, r, quick))
+    monkeypatch.setattr(consistency, "adjust_registered", lambda c, r, _: adjust_registered(c, r, quick))
 
 
 @pytest.fixture(scope="module")

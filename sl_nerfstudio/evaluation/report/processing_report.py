@@ -10,6 +10,7 @@ from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import data_uri
 from sl_nerfstudio.processing.advice import first_line
 from sl_nerfstudio.processing.preview import Preview
+from sl_nerfstudio.processing.projector.found import describe
 from sl_nerfstudio.processing.result import FrameRecord, ProcessResult
 from sl_nerfstudio.processing.selection.object_only import FrameShares
 from sl_nerfstudio.processing.selection.object_words import object_sentences
@@ -42,6 +43,7 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "rows": rows,
         "verdict": result.verdict,
         "sentence": _sentence(result),
+        "projector": "" if result.projector is None else describe(result.projector),
         "object_only": () if found is None else object_sentences(found),
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",

@@ -14,11 +14,15 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.files.checked import read_checked, write_checked
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.consistency import ConsistentFrames
 from sl_nerfstudio.processing.kept.records import decode, digest, encode
 from sl_nerfstudio.registration import result
+from sl_nerfstudio.registration.static_projector.solve import NoPlacement, StaticPlacement
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy
 from sl_nerfstudio.relative_pose.estimation import RelativePose
+from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, ProjectorEstimate
+from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import DeviceEvidence, IntrinsicsEvidence
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement, PairAgreement
 
@@ -28,6 +32,8 @@ KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
     result.PoorPair, result.CoordinatesDisagree, result.UndecidedProjector, result.UncertainRotation,
     ConsistentFrames, AdjustedFrames, DevicePoses, PoseSigma, SelfCalibration,
+    Device, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement, IntrinsicsEvidence,
+    DeviceEvidence,
     CrossFrameAgreement, FrameCrossAgreement, PairAgreement, RelativePose, Degeneracy,
 )  # fmt: skip
 """The dataclasses that results of stages consist of."""

@@ -13,7 +13,10 @@ from sl_nerfstudio.processing.kept import stages
 from sl_nerfstudio.processing.kept.records import encode
 from sl_nerfstudio.processing.kept.stages import FOLDER, KEPT, StageStore
 from sl_nerfstudio.registration.result import NoCommonSurface
+from sl_nerfstudio.registration.static_projector.solve import NoPlacement, StaticPlacement
 from sl_nerfstudio.relative_pose.estimation import RelativePose
+from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, ProjectorEstimate
+from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import IntrinsicsEvidence
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,9 @@ def _inside(kind, seen):
 
 
 def test_every_class_in_a_result_can_be_read_again():
-    found = _inside(RelativePose, _inside(ConsistentFrames, set()))
+    found: set[type] = set()
+    for kind in (ConsistentFrames, RelativePose, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement,
+                 IntrinsicsEvidence):  # fmt: skip
+        found = _inside(kind, found)
     assert found == set(KEPT) and len({kind.__name__ for kind in KEPT}) == len(KEPT)
     assert all(fields(kind) for kind in KEPT)

@@ -1,0 +1,162 @@
+"""Projectors that nobody has calibrated: intrinsics and surface, found against known.
+
+    python -m benchmarks.unknown_projector [--output benchmarks/results/unknown_projector.json] [--sets 4]
+
+Free-hand sets under a projector with lens shift, whose starting focal length is 20 % wrong and whose principal point
+counts as the middle of its image. Each set is processed with the true intrinsics and with those that are found: poses,
+registration, joint adjustment. The surface is the triangulated points after one similarity onto the truth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from jaxtyping import Float64
+from numpy import ndarray
+
+from benchmarks.machine import write_rows
+from benchmarks.unknown_projector.sets import CoordinateSet, SetOptions, make_set
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
+from sl_nerfstudio.processing.projector.estimation import sigma_of_fields
+from sl_nerfstudio.processing.projector.found import FoundProjector
+from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth, frame_cloud
+from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
+from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
+from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector
+from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
+
+SETS = (
+    SetOptions("head", 1, 16),
+    SetOptions("frog", 2, 16),
+    SetOptions("cone-and-cylinder", 3, 16),
+    SetOptions("dog", 4, 20),
+    SetOptions("chair", 5, 16),
+    SetOptions("head", 6, 16, aspect=0.97, k1=-0.03),
+)
+_START = 1.2  # of the true focal length
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Which sets, and where the figures go."""
+
+    output: Path = Path("benchmarks/results/unknown_projector.json")
+    """JSON file to write"""
+    sets: int = len(SETS)
+    """number of sets, from the first on"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one set: errors in percent and pixels, each with the stated sigma."""
+
+    scene: str
+    seed: int
+    frames: int
+    focal_percent: float  # error of fl_x from the epipolar geometry
+    focal_sigma_percent: float
+    centre_px: tuple[float, float]
+    centre_sigma_px: tuple[float, float]
+    adjusted_focal_percent: float  # after the joint adjustment
+    adjusted_focal_sigma_percent: float
+    adjusted_centre_px: tuple[float, float]
+    adjusted_centre_sigma_px: tuple[float, float]
+    surface_known_mm: float  # RMS of 95 % of the points, with the true intrinsics
+    surface_found_mm: float
+    ratio: float
+
+
+def main() -> None:
+    """Run, print and write all sets."""
+    arguments = tyro.cli(Arguments)
+    rows = []
+    for options in SETS[: arguments.sets]:
+        row = run(options)
+        rows.append(row)
+        print(row, flush=True)
+        write_rows(arguments.output, rows, start=_START)
+
+
+def run(options: SetOptions) -> Row:
+    """One set with the true intrinsics, and with those that are found."""
+    made = make_set(options)
+    true = made.devices.projector
+    known = surface_error(made, *processed(made, true, None))
+    w, h = true.w, true.h
+    start = Device(w, h, _START * true.fl_x, _START * true.fl_x, w / 2, h / 2)
+    frames = [FrameMatches(str(k), *correspondences_of(uv), made.devices.camera) for k, uv in enumerate(made.coords)]
+    estimate = estimate_projector(frames, start, True)
+    if isinstance(estimate, NoProjector):
+        raise SystemExit(f"{options}: {estimate}")
+    sigma = sigma_of_fields(estimate.projector, estimate.covariance)
+    found = FoundProjector(estimate.projector, sigma, len(estimate.frames), estimate.noise_px, "epipolar geometry")
+    clouds, consistent = processed(made, found.projector, found)
+    refined = refine_projector(clouds, consistent, found, adjustment_settings("free", found), lambda _: None)
+    error = surface_error(made, refined.clouds, refined.consistent)
+    return Row(
+        options.scene, options.seed, options.frames,
+        *_errors(found, true), *_errors(refined.found, true),
+        round(known, 5), round(error, 5), round(error / known, 3),
+    )  # fmt: skip
+
+
+def _errors(found: FoundProjector, true: Device) -> tuple[float, float, tuple[float, float], tuple[float, float]]:
+    device, sigma = found.projector, found.sigma
+    return (
+        round(100 * (device.fl_x / true.fl_x - 1), 4),
+        round(100 * sigma[0] / true.fl_x, 4),
+        (round(device.cx - true.cx, 2), round(device.cy - true.cy, 2)),
+        (round(sigma[2], 2), round(sigma[3], 2)),
+    )
+
+
+def processed(
+    made: CoordinateSet, projector: Device, found: FoundProjector | None
+) -> tuple[Sequence[FrameCloud], ConsistentFrames]:
+    """Relative poses, registration and joint adjustment, as `sl-process` does them."""
+    camera, clouds = made.devices.camera, []
+    for k, coords in enumerate(made.coords):
+        pose = estimate_relative_pose(*correspondences_of(coords), camera, projector)
+        clouds.append(frame_cloud(f"{k:03d}", coords, camera, projector, pose))
+    choice = choose_projectors(clouds, True, 0)
+    clouds = chosen_clouds(clouds, choice.chosen)
+    registration = register(clouds)
+    return clouds, adjust_consistent(clouds, registration, lambda _: None, adjustment_settings("free", found))
+
+
+def surface_error(made: CoordinateSet, clouds: Sequence[FrameCloud], consistent: ConsistentFrames) -> float:
+    """RMS distance of the better 95 % of all points from the truth, after one similarity; millimetres."""
+    ours, theirs = [], []
+    poses = consistent.adjusted.poses
+    for k in np.flatnonzero(consistent.registration.registered):
+        p, place = _points(clouds[k], poses.T_camera_projector[k])
+        ours.append(p @ poses.T_world_camera[k, :3, :3].T + poses.T_world_camera[k, :3, 3])
+        theirs.append(made.p_world[k][place])
+    a, b = np.concatenate(ours), np.concatenate(theirs)
+    good = np.isfinite(a).all(1) & np.isfinite(b).all(1)
+    a, b = a[good], b[good]
+    for _ in range(3):
+        distance = np.linalg.norm(fit_similarity(a, b).points(a) - b, axis=1)
+        keep = distance <= np.quantile(distance, 0.95)
+        S = fit_similarity(a[keep], b[keep])
+        distance = np.linalg.norm(S.points(a) - b, axis=1)
+    return float(np.sqrt((np.sort(distance)[: int(0.95 * len(distance))] ** 2).mean()))
+
+
+def _points(cloud: FrameCloud, T: Float64[ndarray, "4 4"]) -> tuple[Float64[ndarray, "n 3"], tuple[ndarray, ndarray]]:
+    uv_camera, uv_projector = correspondences_of(cloud.coords)
+    d = directions(cloud.camera, uv_camera)
+    depth = camera_depth(T[:3, :3], T[:3, 3], d, directions(cloud.projector, uv_projector))
+    column, row = np.floor(uv_camera).astype(np.int64).T
+    return d * depth[:, None], (row, column)
+
+
+if __name__ == "__main__":
+    main()

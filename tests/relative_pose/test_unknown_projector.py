@@ -1,0 +1,124 @@
+"""Intrinsics of a projector from all frames: exact from exact coordinates, within their sigma otherwise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
+from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector
+from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
+from sl_nerfstudio.relative_pose.unknown_projector.parameters import LOG_ASPECT, device_with, values_of
+from sl_nerfstudio.relative_pose.unknown_projector.settings import UNKNOWN_PROJECTOR_DEFAULTS
+from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import check_intrinsics
+from tests.relative_pose.two_views import CAMERA, PROJECTORS
+from tests.relative_pose.unknown_views import SHIFTED, frames_of
+
+BLANK = Device(SHIFTED.w, SHIFTED.h, 1.5 * SHIFTED.w, 1.5 * SHIFTED.w, SHIFTED.w / 2, SHIFTED.h / 2)
+
+QUICK = replace(UNKNOWN_PROJECTOR_DEFAULTS, grid=replace(UNKNOWN_PROJECTOR_DEFAULTS.grid, starts=2))
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return frames_of(SHIFTED, 6)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return frames_of(SHIFTED, 6, noise=0.3)
+
+
+def test_exact_coordinates_give_the_intrinsics_exactly_whatever_the_start(exact):
+    """The principal point lies 1.2 heights below the middle of the image; nothing but the image's size is known."""
+    for start, stated in ((BLANK, False), (replace(BLANK, fl_x=1.2 * SHIFTED.fl_x, fl_y=1.2 * SHIFTED.fl_x), True)):
+        found = estimate_projector(exact, start, stated, 0, QUICK)
+        assert not isinstance(found, NoProjector) and found.cause is None and not found.centre_kept
+        np.testing.assert_allclose(values_of(found.projector), values_of(SHIFTED), atol=1e-6)
+        assert found.noise_px < 2e-3 and found.free == (0, 2, 3)
+
+
+def test_stated_sigma_covers_the_errors(noisy):
+    found = estimate_projector(noisy, BLANK, False, 0, QUICK)
+    assert not isinstance(found, NoProjector)
+    error = values_of(found.projector) - values_of(SHIFTED)
+    known = found.sigma > 0
+    assert known.sum() >= 3 and (np.abs(error[known]) < 3.5 * found.sigma[known]).all()
+    assert 1e-4 < found.sigma[0] < 0.02
+    assert found.noise_px == pytest.approx(0.3, rel=0.15)
+
+
+def test_the_aspect_is_free_where_left_out_squares_demand_it():
+    squeezed = replace(SHIFTED, fl_y=0.9 * SHIFTED.fl_x)
+    found = estimate_projector(frames_of(squeezed, 6, noise=0.1), BLANK, False, 0, QUICK)
+    assert not isinstance(found, NoProjector) and LOG_ASPECT in found.free
+    assert values_of(found.projector)[LOG_ASPECT] == pytest.approx(np.log(0.9), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"count": 2}, "few frames"),
+        ({"count": 4, "alike": True}, "similar frames"),
+        ({"count": 3, "relief": 0.0}, "flat"),
+    ],
+    ids=["two frames", "one relative pose", "a plane"],
+)
+def test_frames_that_do_not_determine_it_are_refused_with_what_was_measured(changes, cause):
+    found = estimate_projector(frames_of(SHIFTED, **changes, noise=0.3), BLANK, False, 0, QUICK)
+    assert isinstance(found, NoProjector)
+    assert found.cause == cause
+
+
+def test_a_stated_principal_point_is_kept_where_only_the_focal_length_can_be_found():
+    start = device_with(SHIFTED, values_of(SHIFTED) + [np.log(1.05), 0, 0, 0, 0])
+    found = estimate_projector(frames_of(SHIFTED, 3, noise=0.3, alike=True), start, True)
+    assert not isinstance(found, NoProjector)
+    assert found.centre_kept and found.free == (0,)
+    assert abs(np.log(found.projector.fl_x / SHIFTED.fl_x)) < 4 * found.sigma[0]
+
+
+def test_a_diffractive_projector_is_refined_from_a_stated_one():
+    true = PROJECTORS["DOE"]
+    start = replace(true, fl_x=1.03 * true.fl_x, fl_y=1.03 * true.fl_y)
+    found = estimate_projector(frames_of(true, 5), start, True)
+    assert not isinstance(found, NoProjector)
+    np.testing.assert_allclose(values_of(found.projector)[[0, 2, 3]], values_of(true)[[0, 2, 3]], atol=1e-5)
+    assert isinstance(estimate_projector(frames_of(true, 5), start, False), NoProjector)
+
+
+def evidence(frames: list[FrameMatches], projector: Device):
+    found = [estimate_relative_pose(f.uv_camera, f.uv_projector, f.camera, projector) for f in frames]
+    T = [pose.T_camera_projector for pose in found]
+    return check_intrinsics(frames, [(t[:3, :3], t[:3, 3]) for t in T], projector)
+
+
+def test_right_intrinsics_are_not_contradicted(noisy):
+    found = evidence(noisy, SHIFTED)
+    assert not found.contradicts()
+    assert found.projector.chi_square < 20 and found.camera.chi_square < 20
+
+
+@pytest.mark.parametrize("role", ["projector", "camera"])
+def test_a_focal_length_wrong_by_three_percent_is_named_with_its_value(noisy, role):
+    """By five frames; the same error in the other device would need its principal point wrong, too."""
+    frames, projector = noisy[:5], SHIFTED
+    if role == "projector":
+        projector = replace(SHIFTED, fl_x=1.03 * SHIFTED.fl_x, fl_y=1.03 * SHIFTED.fl_y)
+    else:
+        long = replace(CAMERA, fl_x=1.03 * CAMERA.fl_x, fl_y=1.03 * CAMERA.fl_y)
+        frames = [replace(f, camera=long) for f in frames]
+    found = evidence(frames, projector)
+    assert found.contradicts()
+    first = found.explanations()[0]
+    assert [(e.role, e.part) for e in found.explanations()] == [(role, "focal length")]
+    assert abs(1.03 * (1 + first.change[0]) - 1) < 4 * first.sigma[0] < 0.03
+
+
+def test_a_wrong_principal_point_is_named(noisy):
+    found = evidence(noisy, replace(SHIFTED, cy=SHIFTED.cy - 80))
+    assert found.contradicts()
+    one = found.explanations()[0]
+    assert (one.role, one.part) == ("projector", "principal point")
+    assert abs(one.change[2] * SHIFTED.fl_x - 80) < 4 * one.sigma[2] * SHIFTED.fl_x
