@@ -184,19 +184,24 @@ def sine_phase(grid: Grid, layout: GrayCode, axis: int, which: int) -> Float64[n
 def _not_finer(
     samples: Samples, signs: Sequence[OnLines], certain: Sequence[OnLines], axis: int, layout: GrayCode
 ) -> list[Misplaced]:
-    """Bits that change less often than a coarser one."""
+    """Bits that change less often than a coarser one.
+
+    Between two borders of a coarser bit lie borders of every finer one. A line with a single border may lie in a part
+    of the pattern without any of the next bit, so one border of each line does not count.
+    """
     found: list[Misplaced] = []
     most, at = 0.0, -1
     for sign, sure, (place, _) in zip(signs, certain, layout.bit_images(axis), strict=True):
         here, there = samples.neighbours(sure)
         if sure.mean() < _LEAST_CERTAIN * np.mean(certain[0]) or not len(here):
             continue
-        share = float((sign[here] != sign[there]).mean())
-        if share < _FEWER * most and most * len(here) >= _LEAST_CHANGES:
+        changed = sign[here] != sign[there]
+        between = np.maximum(np.bincount(samples.line[here][changed], minlength=1) - 1, 0).sum() / len(here)
+        if changed.mean() < _FEWER * most and most * len(here) >= _LEAST_CHANGES:
             seen = "changes more or less often than its place in the order allows"
             found += [Misplaced(k, str(layout.shown[k]), seen) for k in (at, place)]
-        elif share > most:
-            most, at = share, place
+        elif between > most:
+            most, at = float(between), place
     return found
 
 
