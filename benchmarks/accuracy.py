@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.machine import write_rows
-from benchmarks.whole_runs import Score, run, train_and_score, with_true_poses
+from benchmarks.common.machine import write_rows
+from benchmarks.common.whole_runs import Score, run, train_and_score, with_true_poses
 
 FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 57}
 COMPARED = {

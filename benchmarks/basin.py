@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import write_rows
-from benchmarks.scans import made_once
+from benchmarks.common.machine import write_rows
+from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.pose_errors import compare_poses

@@ -15,7 +15,7 @@ import tyro
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.decoded import DecodingError
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder

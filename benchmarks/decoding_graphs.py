@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from benchmarks.baselines.window_matching import match_windows
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.decoding.grid.gcn import turned_pattern
 from sl_nerfstudio.decoding.grid.graph import neighbourhoods

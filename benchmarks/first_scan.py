@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.new_folder import NewFolder

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import FRAMES
-from benchmarks.machine import write_rows
-from benchmarks.scans import made_once
+from benchmarks.common.machine import write_rows
+from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.rig import Rig

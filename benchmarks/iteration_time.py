@@ -22,9 +22,9 @@ from pathlib import Path
 import torch
 import tyro
 
-from benchmarks.iteration_step import SIZES, VARIANTS
-from benchmarks.machine import describe
-from benchmarks.roofline import Floor, Machine, floor_of, measure_machine
+from benchmarks.common.iteration_step import SIZES, VARIANTS
+from benchmarks.common.machine import describe
+from benchmarks.common.roofline import Floor, Machine, floor_of, measure_machine
 
 
 @dataclass(frozen=True)

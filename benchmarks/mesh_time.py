@@ -14,7 +14,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.meshing.extract import extract_mesh
 

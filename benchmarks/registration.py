@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import fit_similarity

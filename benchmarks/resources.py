@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.writing import ScanWriter

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.machine import write_rows
-from benchmarks.whole_runs import Score, run, train_and_score, with_true_poses
+from benchmarks.common.machine import write_rows
+from benchmarks.common.whole_runs import Score, run, train_and_score, with_true_poses
 
 SYNTH = {
     "noise": ("--noise", (0.0, 0.3, 0.6, 1.0, 2.0)),

@@ -12,7 +12,7 @@ import tyro
 
 from benchmarks.baselines.icp_registration import register
 from benchmarks.baselines.tsdf import fuse
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import score_alignments

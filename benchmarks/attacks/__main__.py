@@ -15,7 +15,7 @@ import tyro
 
 from benchmarks.attacks.fixtures import make_fixtures
 from benchmarks.attacks.runner import Outcome, all_cases, run_cases
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from benchmarks.photographs.command import process
 from benchmarks.photographs.scoring import NOTHING_DECODED, DecodingFigures, PoseError, decoding_figures, pose_errors
 from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets

@@ -17,11 +17,11 @@ import tyro
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
+from benchmarks.common.whole_runs import run
 from benchmarks.photographs.command import process
 from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets
 from benchmarks.photographs.truth import read_truth
-from benchmarks.whole_runs import run
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from benchmarks.separation.cases import Conditions, make_case
 from benchmarks.separation.objects import BACKGROUNDS, OBJECTS
 from sl_nerfstudio.object_separation.plane_judgement import PlaneFinding

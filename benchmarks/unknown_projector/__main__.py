@@ -16,7 +16,7 @@ import tyro
 from jaxtyping import Float64
 from numpy import ndarray
 
-from benchmarks.machine import write_rows
+from benchmarks.common.machine import write_rows
 from benchmarks.unknown_projector.sets import CoordinateSet, SetOptions, make_set
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.similarity import fit_similarity

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import torch
 
-from benchmarks.iteration_step import Ours, Size
+from benchmarks.common.iteration_step import Ours, Size
 
 INPUT, HIDDEN = 43, 128
 
