@@ -119,8 +119,7 @@ def _pattern_and_plain(
         pairs = [(k, inverse) for axis in (0, 1) for k, inverse in layout.bit_images(axis) if inverse is not None]
         white = layout.place(Shown("white"))
         used = [k for pair in pairs for k in pair] or (range(layout.images) if white is None else [white])
-        greys = (as_grey(read_photograph(pose.images[place])) for place in used if place < len(pose.images))
-        return pose.images, np.mean(list(greys), axis=0, dtype=np.float32)
+        return pose.images, _mean([pose.images[place] for place in used if place < len(pose.images)])
     if len(pose.images) != 2:
         fault = FileError(
             pose.images[0].parent,
@@ -133,6 +132,14 @@ def _pattern_and_plain(
     if _edges(first) > _edges(second):
         return pose.images[:1], second
     return pose.images[1:], first
+
+
+def _mean(paths: Sequence[Path]) -> Float32[ndarray, "h w"]:
+    """Of photographs, of which one at a time is in memory."""
+    total = as_grey(read_photograph(paths[0]))
+    for path in paths[1:]:
+        total = total + as_grey(read_photograph(path))
+    return total / np.float32(len(paths))
 
 
 def _edges(grey: Float32[ndarray, "h w"]) -> float:
