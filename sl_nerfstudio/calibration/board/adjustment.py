@@ -21,8 +21,8 @@ _LEAST_SIGMA = 1e-6  # pixels: noise-free corners
 _ROUNDS = 4  # of estimating the noise
 _SETTLED = 0.02  # relative change of the noise
 _MOST_STEPS = 50
-_CONVERGED = 1e-7  # relative decrease of the cost
-_LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-3, 1e10
+_CONVERGED = 1e-6  # relative decrease of the cost
+_LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-5, 1e10
 _PLACING_STEPS = 4
 _SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
 
@@ -152,27 +152,31 @@ def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Nor
     """Of all corners at a rig."""
     begin = np.cumsum([0, *(one.columns().shape[1] for one in free)])
     size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
-    H, g, cost = np.zeros((size, size)), np.zeros(size), 0.0
-    Hb, C, gb = np.zeros((boards, 6, 6)), np.zeros((boards, size, 6)), np.zeros((boards, 6))
+    products, cost = np.zeros((boards, size + 7, size + 7)), 0.0  # of all columns: shared, of the board, residual
     for k, of_device in enumerate(seen):
         one = linearised(rig, k, free[k], of_device)
         costs, weights = kernel(one.residual / sigma[k])
         cost += float(costs.sum())
-        root = np.sqrt(weights)[:, None] / sigma[k]
-        shared = np.zeros((*one.residual.shape, size))
-        shared[..., begin[k] : begin[k + 1]] = one.by_intrinsics
+        rows = np.zeros((len(weights), 2, size + 7))
+        rows[..., begin[k] : begin[k + 1]] = one.by_intrinsics
         if k:
-            shared[..., -6:] = one.by_rig
-        S, B, e = shared * root[..., None], one.by_board * root[..., None], one.residual * root
-        H += np.einsum("nis,nit->st", S, S, optimize=True)
-        g += np.einsum("nis,ni->s", S, e)
-        for b in np.unique(of_device.view):
-            own = of_device.view == b
-            Sb, Bb, eb = S[own].reshape(-1, size), B[own].reshape(-1, 6), e[own].ravel()
-            Hb[b] += Bb.T @ Bb
-            C[b] += Sb.T @ Bb
-            gb[b] += Bb.T @ eb
-    return Normal(cost, H, g, Hb, C, gb)
+            rows[..., size - 6 : size] = one.by_rig
+        rows[..., size : size + 6] = one.by_board
+        rows[..., -1] = one.residual
+        rows *= (np.sqrt(weights) / sigma[k])[:, None, None]
+        ends = np.searchsorted(of_device.view, np.arange(boards + 1))  # corners are ordered by view
+        for b in range(boards):
+            own = rows[ends[b] : ends[b + 1]].reshape(-1, size + 7)
+            products[b] += own.T @ own
+    of_boards = slice(size, size + 6)
+    return Normal(
+        cost,
+        products[:, :size, :size].sum(0),
+        products[:, :size, -1].sum(0),
+        products[:, of_boards, of_boards],
+        products[:, :size, of_boards],
+        products[:, of_boards, -1],
+    )
 
 
 def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:
