@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project, unproject
@@ -38,7 +38,7 @@ class BoardPhotographer:
             lit = cv2.remap(blurred, *_maps(lookup), cv2.INTER_LINEAR, borderValue=(0.0,))
             yield self._exposed(albedo * (_ROOM_LIGHT + _LAMP * lit), rng)
 
-    def _exposed(self, light: Float32[ndarray, "h w"], rng: np.random.Generator) -> UInt8[ndarray, "h w"]:
+    def _exposed(self, light: Float32[ndarray, "hs ws"], rng: np.random.Generator) -> UInt8[ndarray, "h w"]:
         camera = self.scene.camera
         image = cv2.resize(light, (camera.w, camera.h), interpolation=cv2.INTER_AREA)
         image = cv2.GaussianBlur(image, (0, 0), _CAMERA_BLUR)
@@ -46,8 +46,8 @@ class BoardPhotographer:
         return np.rint(255 * noisy.clip(0, 1)).astype(np.uint8)
 
     def _surface(
-        self, T_camera_board: Float32[ndarray, "4 4"]
-    ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w 2"]]:
+        self, T_camera_board: Float64[ndarray, "4 4"]
+    ) -> tuple[Float32[ndarray, "hs ws"], Float32[ndarray, "hs ws 2"]]:
         """Albedo, and pattern coordinates, of every supersampled pixel."""
         camera, s = self.scene.camera, self.supersampling
         x, y = np.meshgrid((np.arange(camera.w * s) + 0.5) / s, (np.arange(camera.h * s) + 0.5) / s)
@@ -64,7 +64,7 @@ class BoardPhotographer:
         return _albedo(self.scene.board, p_board), lookup
 
 
-def _albedo(board: Board, p_board: Float32[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
+def _albedo(board: Board, p_board: Float64[ndarray, "h w 3"]) -> Float32[ndarray, "h w"]:
     drawn = draw_board(board, _SQUARE_PX, _MARGIN).astype(np.float32) / 255
     values = _BLACK + (_WHITE - _BLACK) * drawn
     place = (p_board[..., :2] * (1, -1) / board.square + _MARGIN) * _SQUARE_PX
