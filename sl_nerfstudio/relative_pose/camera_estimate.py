@@ -17,16 +17,9 @@ from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.relative_pose.epipolar_fit import noise_of
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.sampson import moved, sampson, sampson_jacobian
+from sl_nerfstudio.relative_pose.settings import CAMERA_ESTIMATE_DEFAULTS, CameraEstimateSettings
 
-_MOST = 3000  # correspondences of each frame
-_ITERATIONS = 12
-_LARGEST_STEP = 0.05  # of any unknown
-_DIFFERENCE = 1e-5  # of the same, for derivatives
-_CONVERGED = 1e-8
-UNKNOWNS = 4  # logarithm of the focal length, centre x and y as shares of the image's longer side, k1
-SIGMA_CENTRE = 0.01  # of the longer side: how far principal points are from the middle
-SIGMA_K1 = 0.03  # first term of the distortion of a usual lens
-_KERNEL = 3.0  # width of the robust kernel, standard deviations of the residuals
+UNKNOWNS = ("log_focal", "centre_x", "centre_y", "k1")  # centres as shares of the image's longer side
 
 UnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
 
@@ -71,6 +64,7 @@ def estimate_camera(
     sigma: float,
     seed: int = 0,
     current: Device | None = None,
+    settings: CameraEstimateSettings = CAMERA_ESTIMATE_DEFAULTS,
 ) -> CameraEstimate:
     """The camera with the smallest epipolar errors of all frames together, near the stated one.
 
@@ -80,8 +74,8 @@ def estimate_camera(
     if not frames:
         raise ValueError("no frames")
     rng = np.random.default_rng(seed)
-    chosen = [subsample(np.arange(len(frame.uv_camera)), _MOST, rng) for frame in frames]
-    prior = np.diag(1 / np.square([sigma, SIGMA_CENTRE, SIGMA_CENTRE, SIGMA_K1]))
+    chosen = [subsample(np.arange(len(frame.uv_camera)), settings.most, rng) for frame in frames]
+    prior = np.diag(1 / np.square([sigma, settings.sigma_centre, settings.sigma_centre, settings.sigma_k1]))
     poses, value = [frame.pose for frame in frames], _change(camera, current or camera)
     information = prior
 
@@ -92,13 +86,13 @@ def estimate_camera(
             for frame, index in zip(frames, chosen, strict=True)
         ]
 
-    for _ in range(_ITERATIONS):
+    for _ in range(settings.iterations):
         rays = rays_at(value)
-        around = [(rays_at(value + h), rays_at(value - h)) for h in _DIFFERENCE * np.eye(UNKNOWNS)]
+        around = [(rays_at(value + h), rays_at(value - h)) for h in settings.difference_step * np.eye(len(UNKNOWNS))]
         residuals = np.concatenate([sampson(*pose, own) for pose, own in zip(poses, rays, strict=True)])
-        width = _KERNEL * noise_of(residuals)
+        width = settings.kernel_sigmas * noise_of(residuals)
         normals = [
-            _normal(poses[k], rays[k], [(ahead[k], behind[k]) for ahead, behind in around], width)
+            _normal(poses[k], rays[k], [(ahead[k], behind[k]) for ahead, behind in around], width, settings)
             for k in range(len(frames))
         ]
         H, g = sum(n.H for n in normals), sum(n.g for n in normals)
@@ -106,10 +100,10 @@ def estimate_camera(
         scale = max(float(np.mean(np.diag(spread) / np.diag(H).clip(1e-300))), 1e-12)  # squared error of a measurement
         information = H / scale + prior
         step = np.linalg.solve(information, -g / scale - prior @ value)
-        step *= min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        step *= min(1.0, settings.largest_step / max(float(np.abs(step).max()), 1e-300))
         value = value + step
         poses = [moved(*pose, n.pose_step - n.pose_slope @ step) for pose, n in zip(poses, normals, strict=True)]
-        if np.abs(step).max() < _CONVERGED:
+        if np.abs(step).max() < settings.converged:
             break
     return CameraEstimate(changed(camera, value), np.linalg.inv(information))
 
@@ -145,10 +139,17 @@ class _Normal:
     pose_slope: Float64[ndarray, "5 4"]  # change of the pose with the camera
 
 
-def _normal(pose: UnitPose, rays: RayPairs, around: Sequence[tuple[RayPairs, RayPairs]], width: float) -> _Normal:
+def _normal(
+    pose: UnitPose,
+    rays: RayPairs,
+    around: Sequence[tuple[RayPairs, RayPairs]],
+    width: float,
+    settings: CameraEstimateSettings,
+) -> _Normal:
     """`around`: the same correspondences with each unknown of the camera larger and smaller."""
+    apart = 2 * settings.difference_step
     r, J = sampson_jacobian(*pose, rays)
-    j = np.stack([(sampson(*pose, ahead) - sampson(*pose, behind)) / (2 * _DIFFERENCE) for ahead, behind in around], 1)
+    j = np.stack([(sampson(*pose, ahead) - sampson(*pose, behind)) / apart for ahead, behind in around], 1)
     w = geman_mcclure_weight((r / width) ** 2)[:, None]
     A = (J * w).T @ J
     slope = np.linalg.lstsq(A, (J * w).T @ j, rcond=1e-13)[0]

@@ -164,3 +164,28 @@ class RelativePoseSettings:
 
 
 RELATIVE_POSE_DEFAULTS = RelativePoseSettings()
+
+
+@dataclass(frozen=True)
+class CameraEstimateSettings:
+    """Refinement of a camera whose focal length is only roughly known."""
+
+    most: int = 3000
+    """correspondences of each frame"""
+    iterations: int = 12
+    """Gauss-Newton steps, at most"""
+    largest_step: float = 0.05
+    """change of any unknown in one step"""
+    difference_step: float = 1e-5
+    """the same for derivatives"""
+    converged: float = 1e-8
+    """step below which the search ends"""
+    sigma_centre: float = 0.01
+    """how far principal points are from the middle, as a share of the image's longer side"""
+    sigma_k1: float = 0.03
+    """first term of the distortion of a usual lens"""
+    kernel_sigmas: float = 3.0
+    """width of the robust kernel, in standard deviations of the residuals"""
+
+
+CAMERA_ESTIMATE_DEFAULTS = CameraEstimateSettings()

@@ -34,6 +34,7 @@ def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keyboard]:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     import pygame
+    import pygame.surfarray  # before several threads do
 
     keys = Keyboard(pygame)
     monkeypatch.setattr(pygame.event, "wait", keys.wait)

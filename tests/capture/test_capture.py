@@ -68,7 +68,7 @@ def filmed_screen(monkeypatch, keyboard):
         shown = keyboard.pygame.surfarray.array_red(surface).T
         part = shown[(768 - GRAY.h) // 2 : (768 + GRAY.h) // 2, (1024 - GRAY.w) // 2 : (1024 + GRAY.w) // 2]
         if last[0] is None or not np.array_equal(part, last[0]):
-            last[:] = part, photograph(np.maximum(part, 1), BEFORE_DISPLAY, WALL, noise=1.0)
+            last[:] = part, photograph(part / 255, BEFORE_DISPLAY, WALL, noise=1.0)
         return last[1]
 
     capture = FakeCapture(take)

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from sl_nerfstudio.relative_pose.camera_estimate import SIGMA_CENTRE, FrameOfCamera, estimate_camera
+from sl_nerfstudio.relative_pose.camera_estimate import FrameOfCamera, estimate_camera
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
+from sl_nerfstudio.relative_pose.settings import CAMERA_ESTIMATE_DEFAULTS
 from tests.relative_pose.two_views import PROJECTORS, view
 
 OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2))
@@ -40,7 +41,9 @@ def test_noise_moves_it_by_about_its_sigma_and_what_was_known_before_holds_it():
     assert abs(found.camera.fl_x - true.fl_x) < 3 * found.sigma_focal_px < 0.12 * true.fl_x
     for got, exact, sigma in zip((found.camera.cx, found.camera.cy), (true.cx, true.cy), found.sigma_centre_px,
                                  strict=True):  # fmt: skip
-        assert abs(got - exact) < 3 * sigma and sigma < 1.001 * SIGMA_CENTRE * max(true.w, true.h)
+        assert abs(got - exact) < 3 * sigma and sigma < 1.001 * CAMERA_ESTIMATE_DEFAULTS.sigma_centre * max(
+            true.w, true.h
+        )
     # What was known before holds it.
     tight = estimate_camera(frames, stated, PROJECTORS["pinhole"], 1e-5)
     assert tight.camera.fl_x == pytest.approx(stated.fl_x, rel=1e-5)

@@ -1,8 +1,9 @@
 """Which intrinsics to fit: what predicts views that were left out, and nothing that does not pay for itself.
 
 A left-out view keeps only its board's pose free, which its corners in the camera give. Its corners in the projector are
-then predicted outright. Of all models the simplest is taken whose errors are within one standard error of the best one
-(Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10): terms that only overfit are left out.
+then predicted outright. Of all models the simplest is taken that is not worse than the best one with certainty (a
+paired t test over the views): terms that only overfit are left out. How far the result moves with the better one is
+part of the stated uncertainty.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -11,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.stats import t as student_t
 
 from sl_nerfstudio.calibration.board.adjustment import Adjusted, Free, Seen, Sigma, adjust, kernel, place_boards
 from sl_nerfstudio.calibration.board.residuals import Sightings, residuals
@@ -20,6 +22,7 @@ from sl_nerfstudio.geometry.devices import Device
 _TERMS = (0, 1, 2, 4)
 _RICH = FreeIntrinsics(False, 2)  # of the projector while the camera's model is chosen
 _RICHEST = FreeIntrinsics(True, 4)  # by whose noise errors are judged
+_CERTAIN = 0.95  # one-sided
 _FOLDS = 10  # views are left out one by one, or in so many groups
 Track = Callable[[Sequence[int], str], Iterable[int]]
 
@@ -102,11 +105,12 @@ def _of(seen: Sightings, views: ndarray) -> Sightings:
 
 
 def _simplest(scores: Sequence[ModelScore]) -> int:
-    """The simplest model that is within a standard error of the best; views are compared one by one."""
+    """The simplest model that is not certainly worse than the best; views are compared one by one."""
     best = min(scores, key=lambda one: one.costs.mean())
 
     def as_good(one: ModelScore) -> bool:
         difference = one.costs - best.costs
-        return bool(difference.mean() <= difference.std(ddof=1) / np.sqrt(len(difference)))
+        n = len(difference)
+        return bool(difference.mean() <= student_t.ppf(_CERTAIN, n - 1) * difference.std(ddof=1) / np.sqrt(n))
 
     return min((k for k, one in enumerate(scores) if as_good(one)), key=lambda k: scores[k].model.columns().shape[1])

@@ -19,8 +19,6 @@ from sl_nerfstudio.geometry.robust import geman_mcclure_cost, geman_mcclure_weig
 from sl_nerfstudio.registration.static_projector.settings import StaticSettings
 from sl_nerfstudio.relative_pose.unknown_projector.parameters import device_with, values_of
 
-_STEP = 1e-6  # of the differences by the intrinsics
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -82,11 +80,12 @@ class _Prior:
     mean: Float64[ndarray, "5"]
     sigma: Float64[ndarray, "5"]
     free: tuple[int, ...]
+    difference_step: float
 
     @staticmethod
     def of(projector: Device, free: tuple[int, ...], settings: StaticSettings) -> "_Prior":
         sigma = np.array([getattr(settings.prior, name) for name in ("log_focal", "log_aspect", "cx", "cy", "k1")])
-        return _Prior(values_of(projector), sigma, free)
+        return _Prior(values_of(projector), sigma, free, settings.difference_step)
 
     def departure(self, scene: Scene) -> Float64[ndarray, "free"]:
         index = list(self.free)
@@ -170,7 +169,7 @@ def _equations(
     if free:
         by_free = np.zeros((n, 2, len(free)))
         rows = np.flatnonzero(s.device == D - 1)
-        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free)
+        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free, prior.difference_step)
         J = np.concatenate([J, by_free], -1)
         columns = np.concatenate([columns, np.broadcast_to(6 * D + np.arange(len(free)), (n, len(free)))], 1)
     H, gradients, coupling = np.zeros((m, m)), np.zeros((m, C)), np.zeros((m, 3 * C))
@@ -191,18 +190,18 @@ def _equations(
 
 
 def _by_intrinsics(
-    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...]
+    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...], step: float
 ) -> Float64[ndarray, "n 2 free"]:
     values, out = values_of(projector), []
     for k in free:
         ahead, behind = (
             project(
-                Intrinsics.of(device_with(projector, values + sign * _STEP * np.eye(5)[k]), torch.float64),
+                Intrinsics.of(device_with(projector, values + sign * step * np.eye(len(values))[k]), torch.float64),
                 torch.from_numpy(p),
             )[0].numpy()
             for sign in (1, -1)
         )
-        out.append((ahead - behind) / (2 * _STEP))
+        out.append((ahead - behind) / (2 * step))
     return np.stack(out, -1)
 
 

@@ -16,8 +16,6 @@ from sl_nerfstudio.registration.static_projector.cells import Cells
 from sl_nerfstudio.registration.static_projector.settings import ChainSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
-FLIP = np.diag([1.0, -1.0, -1.0])  # between the axes of OpenCV and those of the devices
-
 
 def rays_of(cells: Cells, cameras: Sequence[Device]) -> Float64[ndarray, "frames cells 3"]:
     """Unit rays in each camera's axes; NaN where it does not see the square."""
@@ -32,8 +30,13 @@ def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
 def pose_from_opencv(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
     """T_world_device from OpenCV's R, t, which map points of the world to the device."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R.T @ FLIP, -R.T @ t
+    T[:3, :3], T[:3, 3] = R.T @ _flip(), -R.T @ t
     return T
+
+
+def _flip() -> Float64[ndarray, "3 3"]:
+    """Between the axes of OpenCV and those of the devices."""
+    return np.diag([1.0, -1.0, -1.0])
 
 
 def first_pair(
@@ -77,7 +80,7 @@ def _two_views(
         return None
     T = pose_from_opencv(R, t[:, 0])
     # the first camera's own axes are the world's: from OpenCV's to the device's
-    T[:3, :3], T[:3, 3] = FLIP @ T[:3, :3], FLIP @ T[:3, 3]
+    T[:3, :3], T[:3, 3] = _flip() @ T[:3, :3], _flip() @ T[:3, 3]
     return T, mask[:, 0] > 0
 
 

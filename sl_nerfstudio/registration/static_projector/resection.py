@@ -8,32 +8,32 @@ from scipy.linalg import rq
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.registration.static_projector.chain import pose_from_opencv, posed
+from sl_nerfstudio.registration.static_projector.settings import STATIC_DEFAULTS, ResectionSettings
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 from sl_nerfstudio.relative_pose.unknown_projector.parameters import device_with
 
-_ROUNDS = 8  # of leaving out what does not fit
-_OUTLIER_SIGMAS = 4.0
-_LEAST_RELIEF = 1e-3  # extent of the points across their plane, as a share of that along it
-
 
 def resect(
-    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
+    points: Float64[ndarray, "n 3"],
+    uv: Float64[ndarray, "n 2"],
+    projector: Device,
+    settings: ResectionSettings = STATIC_DEFAULTS.resection,
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Focal length, principal point (anywhere) and pose of a pinhole projector; its pixels count as square.
 
     None where the points lie in a plane, or no projector fits.
     """
     extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    if len(points) < 20 or extent[2] < _LEAST_RELIEF * extent[1]:
+    if len(points) < settings.fewest or extent[2] < settings.least_relief * extent[1]:
         return None
     keep = np.ones(len(points), dtype=bool)
     P = None
-    for _ in range(_ROUNDS):
-        if keep.sum() < 20:
+    for _ in range(settings.rounds):
+        if keep.sum() < settings.fewest:
             return None
         P = _linear(points[keep], uv[keep])
         error = np.linalg.norm(_seen(P, points) - uv, axis=1)
-        limit = _OUTLIER_SIGMAS * MAD_TO_SIGMA * float(np.median(error))
+        limit = settings.outlier_sigmas * MAD_TO_SIGMA * float(np.median(error))
         again: Bool[ndarray, n] = error <= max(limit, 1e-9)
         if (again == keep).all():
             break
@@ -89,7 +89,10 @@ def _device_of(
 
 
 def place_known(
-    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
+    points: Float64[ndarray, "n 3"],
+    uv: Float64[ndarray, "n 2"],
+    projector: Device,
+    settings: ResectionSettings = STATIC_DEFAULTS.resection,
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a projector with known intrinsics; None where no pose fits most of the points."""
     d = directions(projector, uv)

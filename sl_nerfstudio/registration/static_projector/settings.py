@@ -38,6 +38,20 @@ class ChainSettings:
 
 
 @dataclass(frozen=True)
+class ResectionSettings:
+    """The projector from points and their codes."""
+
+    fewest: int = 20
+    """points, at least"""
+    rounds: int = 8
+    """of leaving out what does not fit"""
+    outlier_sigmas: float = 4.0
+    """standard deviations beyond which a point is left out"""
+    least_relief: float = 1e-3
+    """extent of the points across their plane, as a share of that along it"""
+
+
+@dataclass(frozen=True)
 class StaticSettings:
     """All settings."""
 
@@ -73,6 +87,10 @@ class StaticSettings:
     """squares"""
     chain: ChainSettings = field(default_factory=ChainSettings)
     """placement of the cameras"""
+    resection: ResectionSettings = field(default_factory=ResectionSettings)
+    """the projector's first place"""
+    difference_step: float = 1e-6
+    """change of the intrinsics for derivatives"""
 
 
 STATIC_DEFAULTS = StaticSettings()

@@ -86,7 +86,7 @@ def place_under_static_projector(
     T = _grown(T, rays, cells, cameras, settings)
     points = triangulated(rays, T, settings.chain.least_angle_deg)
     firm = _spread(np.isfinite(points[:, 0]), settings.most_points)
-    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
+    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated, settings)
     if found is None:
         return NoPlacement("no projector", most)
     device, T_projector = found
@@ -169,13 +169,18 @@ def _sightings(cells: Cells, placed: Int64[ndarray, "m"], *, with_projector: boo
 
 
 def _projector(
-    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device, known: bool, stated: bool
+    points: Float64[ndarray, "n 3"],
+    uv: Float64[ndarray, "n 2"],
+    projector: Device,
+    known: bool,
+    stated: bool,
+    settings: StaticSettings,
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Intrinsics and pose to start from."""
     if known or projector.model == "DOE":
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
-    found = resect(points, uv, projector)
+    found = resect(points, uv, projector, settings.resection)
     if found is None and stated:
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)

@@ -89,7 +89,7 @@ def estimate_projector(
     else:
         found = choose_model(matches, first, prior, settings)
     doubtful = _uncertainty(found) > settings.doubtful_sigma or len(index) < settings.fewest_frames
-    cause = _cause(found, len(index), len(frames)) if doubtful else None
+    cause = _cause(found, len(index), len(frames), settings) if doubtful else None
     if _uncertainty(found) > settings.largest_sigma or found.noise_px > settings.largest_noise_share * projector.w:
         return NoProjector(cause or "unknown", len(index), _uncertainty(found), found.noise_px)
     covariance = np.zeros((5, 5))
@@ -141,8 +141,8 @@ def _refined(
     for _ in range(settings.rounds):
         poses = poses_with(some, device, seed, settings)
         firm = [one for one in poses if not one.flat]
-        if len(firm) < _FEWEST:
-            return NoProjector("flat" if len(poses) >= _FEWEST else "unknown", len(firm), np.inf, np.inf)
+        if len(firm) < settings.fewest_posed:
+            return NoProjector("flat" if len(poses) >= settings.fewest_posed else "unknown", len(firm), np.inf, np.inf)
         index = [one.frame for one in firm]
         most = min(settings.fit.most_per_frame, max(settings.fit.most // len(index), 1))
         matches = Matches.of([frames[k] for k in index], device, settings.blocks, most, np.random.default_rng(seed))
@@ -169,18 +169,13 @@ def _uncertainty(found: JointFit) -> float:
     return max(unit[k] * float(s) for k, s in zip(found.free, sigma, strict=True) if k in unit)
 
 
-_ALIKE_DEG = 5.0  # between relative poses
-_FEW = 6  # frames
-_FEWEST = 2  # frames with a pose
-
-
-def _cause(found: JointFit, used: int, frames: int) -> Cause:
+def _cause(found: JointFit, used: int, frames: int, settings: UnknownProjectorSettings) -> Cause:
     """What was measured that explains why the focal length is uncertain."""
     R = Rotation.from_matrix(found.poses.R)
     turns = np.degrees((R * R[0].inv()).magnitude())
     swings = np.degrees(np.arccos((found.poses.t @ found.poses.t[0]).clip(-1, 1)))
-    if used > 1 and max(float(turns.max()), float(swings.max())) < _ALIKE_DEG:
+    if used > 1 and max(float(turns.max()), float(swings.max())) < settings.alike_deg:
         return "similar frames"
     if 2 * used < frames:
         return "flat"
-    return "few frames" if used < _FEW else "unknown"
+    return "few frames" if used < settings.few_frames else "unknown"

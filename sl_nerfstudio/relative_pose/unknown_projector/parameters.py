@@ -11,7 +11,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.relative_pose.unknown_projector.settings import IntrinsicsPrior
 
 NAMES = ("log_focal", "log_aspect", "cx", "cy", "k1")
-LOG_FOCAL, LOG_ASPECT, CX, CY, K1 = range(5)
+LOG_FOCAL, LOG_ASPECT, CX, CY, K1 = range(len(NAMES))
 
 
 def values_of(device: Device) -> Float64[ndarray, "5"]:

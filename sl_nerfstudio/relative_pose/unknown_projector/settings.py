@@ -89,6 +89,12 @@ class UnknownProjectorSettings:
 
     fewest_frames: int = 3
     """frames with two constraints each on three unknowns and more"""
+    fewest_posed: int = 2
+    """frames with a pose and with depth that a fit needs"""
+    few_frames: int = 6
+    """frames below which an uncertain result is put down to their number"""
+    alike_deg: float = 5.0
+    """angle between relative poses below which frames are alike"""
     rounds: int = 4
     """searches for the poses of all frames, each with the projector found before, at most"""
     settled: float = 0.5
