@@ -23,6 +23,8 @@ _TERMS = (0, 1, 2, 4)
 _RICH = FreeIntrinsics(False, 2)  # of the projector while the camera's model is chosen
 _RICHEST = FreeIntrinsics(True, 4)  # by whose noise errors are judged
 _CERTAIN = 0.95  # one-sided
+_MUCH_WORSE = 1.25  # mean cost relative to that of the best model
+_LEAST_COST = 1e-12  # of noise-free corners
 _FOLDS = 10  # views are left out one by one, or in so many groups
 Track = Callable[[Sequence[int], str], Iterable[int]]
 
@@ -105,12 +107,18 @@ def _of(seen: Sightings, views: ndarray) -> Sightings:
 
 
 def _simplest(scores: Sequence[ModelScore]) -> int:
-    """The simplest model that is not certainly worse than the best; views are compared one by one."""
+    """The simplest model that is not certainly worse than the best, nor much worse; views are compared one by one.
+
+    The ratio of a view's costs is compared, not their difference: views that are hard for every model would hide how
+    much the others differ. Few views make nothing certain, so a model must not cost much more in the mean, either.
+    """
     best = min(scores, key=lambda one: one.costs.mean())
 
     def as_good(one: ModelScore) -> bool:
-        difference = one.costs - best.costs
-        n = len(difference)
-        return bool(difference.mean() <= student_t.ppf(_CERTAIN, n - 1) * difference.std(ddof=1) / np.sqrt(n))
+        ratio = np.log(one.costs.clip(_LEAST_COST) / best.costs.clip(_LEAST_COST))
+        n = len(ratio)
+        if one.costs.mean() > _MUCH_WORSE * best.costs.mean().clip(_LEAST_COST):
+            return False
+        return bool(ratio.mean() <= student_t.ppf(_CERTAIN, n - 1) * ratio.std(ddof=1) / np.sqrt(n))
 
     return min((k for k, one in enumerate(scores) if as_good(one)), key=lambda k: scores[k].model.columns().shape[1])
