@@ -30,7 +30,7 @@ class BoardCalibration:
     adjusted: Adjusted
     sigmas: tuple[DeviceSigma, ...]  # of the camera, and of the projector if there is one
     rms_px: tuple[float, ...]  # over all corners, outliers included
-    residuals: tuple[tuple[Float64[ndarray, "n 2"], ...], ...]  # of each device, of each view, seen minus predicted
+    residuals: tuple[tuple[Float64[ndarray, "_ 2"], ...], ...]  # of each device, of each view, seen minus predicted
     left_out: LeftOut
     models: tuple[ModelScore, ...]
     coverage: Coverage

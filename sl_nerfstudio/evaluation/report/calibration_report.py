@@ -116,7 +116,7 @@ def _thumbnail(picture: BoardPicture) -> str:
 
 
 def _residual_field(
-    device: Device, corners: Sequence[Corners | None], residuals: Sequence[Float64[ndarray, "n 2"]]
+    device: Device, corners: Sequence[Corners | None], residuals: Sequence[Float64[ndarray, "_ 2"]]
 ) -> str:
     """Residuals as arrows over the image, all enlarged alike; a pattern in them shows what the model lacks."""
     uv = np.concatenate([one.uv for one in corners if one is not None and len(one.uv)])
