@@ -10,13 +10,12 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.boards import Board
-from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.processing.capture_files.projector_size import likely_layout
 from sl_nerfstudio.processing.capture_files.sequences import (
     describe_sequence,
-    in_order,
     incomplete,
+    layout_in_order,
     recognise_sequence,
     resolution,
 )
@@ -86,7 +85,4 @@ def _decoder(config: CalibrateConfig, found: Captures) -> Decoder[Any]:
     size = resolution(config.pattern)
     if size is not None:
         return choose_decoder(recognise_sequence(found, size, config.sequence, None), None, config.pattern)
-    layout = read_layout(config.pattern)
-    if config.sequence is not None:
-        layout = in_order(layout, config.sequence, config.pattern)
-    return choose_decoder(layout, None, config.pattern)
+    return choose_decoder(layout_in_order(config.pattern, config.sequence), None, config.pattern)

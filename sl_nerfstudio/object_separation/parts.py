@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.spatial import Delaunay, KDTree
 
 from sl_nerfstudio.geometry.connectivity import component_labels
+from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.object_separation.plane import Plane
 from sl_nerfstudio.object_separation.settings import SeparationSettings
 from sl_nerfstudio.object_separation.viewed_region import ViewedRegion
@@ -53,7 +54,7 @@ def find_object(
         return ObjectVoxels(size, centres)
     count, label = _connected(voxels)
     distance = np.linalg.norm(centres - region.focus, axis=1) / region.radius
-    main = int(np.argmax(np.bincount(label, 1 / (1 + distance**2) ** 2, count)))
+    main = int(np.argmax(np.bincount(label, geman_mcclure_weight(distance**2), count)))
     kept = _near_main(centres, label, main, _candidates(centres, label, main, planes, size, settings), settings)
     return ObjectVoxels(size, centres[kept[label]])
 

@@ -50,6 +50,13 @@ class Captures:
         """The size of the first camera's images."""
         return next(iter(self.sizes.values()))
 
+    def require_whole(self) -> list[CapturedFrame]:
+        """The frames without faults. Raises the first fault if there are none."""
+        whole = [frame for frame in self.frames if frame.name not in self.faults]
+        if not whole:
+            raise next(iter(self.faults.values()))
+        return whole
+
     def with_faults(self, found: dict[str, FileError]) -> "Captures":
         """With more faults; those of one frame become one."""
         both = {name: [e for e in (self.faults.get(name), found.get(name)) if e] for name in {*self.faults, *found}}

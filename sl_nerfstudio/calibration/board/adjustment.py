@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.calibration.board.residuals import Sightings, linearised, residuals
 from sl_nerfstudio.calibration.board.rig import BoardRig, FreeIntrinsics, numbers, with_numbers
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.geometry.se3 import exp_se3
 
 _KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
@@ -145,7 +145,7 @@ def _cost(rig: BoardRig, seen: Seen, sigma: Sigma) -> float:
 def kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
     """Geman-McClure cost of corners, and their weights, from residuals in standard deviations."""
     x = (whitened**2).sum(-1) / _KERNEL**2
-    return _KERNEL**2 * x / (1 + x), 1 / (1 + x) ** 2
+    return _KERNEL**2 * geman_mcclure_cost(x), geman_mcclure_weight(x)
 
 
 def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Normal:

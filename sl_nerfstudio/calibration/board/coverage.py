@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +17,7 @@ from sl_nerfstudio.calibration.board.rig import BoardRig, BoardView
 from sl_nerfstudio.calibration.board.uncertainty import formal_sigmas
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 
-GRID = (8, 6)  # cells of the image that corners are counted in
+_GRID = (8, 6)  # cells of the image that corners are counted in
 _TILTS = {"facing the camera": (0.0, 0.0), "left edge nearer": (0.0, 35.0), "right edge nearer": (0.0, -35.0),
           "top edge nearer": (35.0, 0.0), "bottom edge nearer": (-35.0, 0.0)}  # fmt: skip
 _PLACES = {"left": 0.25, "middle": 0.5, "right": 0.75}
@@ -63,17 +63,13 @@ def coverage_of(adjusted: Adjusted, views: Sequence[BoardView]) -> Coverage:
     )
 
 
-def cells_filled(corners: Sequence[Corners], device: Device) -> Bool[ndarray, "rows columns"]:
-    """Which cells of a device's image hold a corner."""
-    uv = np.concatenate([one.uv for one in corners]) if corners else np.zeros((0, 2))
-    column, row = (np.clip(uv / (device.w, device.h), 0, 1 - 1e-9) * GRID).astype(int).T
-    filled = np.zeros(GRID[::-1], dtype=bool)
-    filled[row, column] = True
-    return filled
-
-
 def _filled(corners: Sequence[Corners], device: Device) -> float:
-    return float(cells_filled(corners, device).mean())
+    """Share of the cells of a device's image that hold a corner."""
+    uv = np.concatenate([one.uv for one in corners]) if corners else np.zeros((0, 2))
+    column, row = (np.clip(uv / (device.w, device.h), 0, 1 - 1e-9) * _GRID).astype(int).T
+    filled = np.zeros(_GRID[::-1], dtype=bool)
+    filled[row, column] = True
+    return float(filled.mean())
 
 
 def next_pose(adjusted: Adjusted, p_board: Float64[ndarray, "m 3"]) -> NextPose | None:

@@ -54,11 +54,6 @@ def projector_start(
     return _best(found, (*camera.free, FreeIntrinsics()), sightings(views, p_board))
 
 
-def pose_of_board(camera: Device, p_board: Float64[ndarray, "m 3"], corners: Corners) -> Float64[ndarray, "4 4"]:
-    """T_camera_board of one board, not refined."""
-    return _pose(camera, p_board, corners)[0]
-
-
 def _best(found: list[tuple[float, BoardRig]], free: Free, seen: Seen) -> Adjusted:
     """The best solution from the starts that fit best."""
     tried = sorted(found, key=lambda one: one[0])[:_TRIED]

@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.calibration.board.detection import Corners
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
 
 _REACH = 0.7  # half the side of a corner's surroundings, in distances to the next corner
 _LEAST_REACH = 4  # camera pixels
@@ -60,8 +61,8 @@ def _at_origin(xy: Float64[ndarray, "n 2"], uv: Float64[ndarray, "n 2"]) -> Floa
         if (mapped[:, 2] <= 0).any():
             return None
         miss = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - target, axis=1)
-        scale = max(1.4826 * float(np.median(miss)), 1e-9)
-        weight = 1 / (1 + (miss / (_KERNEL * scale)) ** 2) ** 2
+        scale = max(MAD_TO_SIGMA * float(np.median(miss)), 1e-9)
+        weight = geman_mcclure_weight((miss / (_KERNEL * scale)) ** 2)
     return h[:2, 2] * size + middle
 
 

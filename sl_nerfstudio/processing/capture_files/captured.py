@@ -8,13 +8,12 @@ from sl_nerfstudio.calibration.formats.plain_json import camera_names
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.processing.capture_files.sequences import (
     describe_sequence,
-    in_order,
     incomplete,
+    layout_in_order,
     recognise_sequence,
     resolution,
 )
@@ -98,13 +97,12 @@ def read_captured(config: ProcessConfig) -> Captured:
 
 def _layout(config: ProcessConfig) -> PatternLayout:
     """The pattern of a file, in the order of --sequence."""
-    layout = read_layout(config.pattern)
     if config.cell is not None:
         raise UserError(
             "--cell: pattern.json states it\n    cause:  the flag is for a --pattern like 1024x768\n"
             "    remedy: leave --cell out"
         )
-    return layout if config.sequence is None else in_order(layout, config.sequence, config.pattern)
+    return layout_in_order(config.pattern, config.sequence)
 
 
 def _refuse_mosaics(captures: Captures) -> None:

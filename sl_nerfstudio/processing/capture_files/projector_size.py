@@ -23,9 +23,7 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
 
     Raises FileError if no usual resolution has as many images.
     """
-    whole = [frame for frame in captures.frames if frame.name not in captures.faults]
-    if not whole:
-        raise next(iter(captures.faults.values()))
+    whole = captures.require_whole()
     count = len(whole[0].images)
     fitting = [layout for w, h in STANDARD if (layout := GrayCode.in_order(name, w, h)).images == count]
     if not fitting:

@@ -8,6 +8,7 @@ from sl_nerfstudio.decoding.decoded import DecodingError
 from sl_nerfstudio.decoding.graycode.decode import check_count
 from sl_nerfstudio.decoding.graycode.recognition import layout_of_images, possible_layouts
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.pattern.sequence import SequenceName
@@ -33,8 +34,11 @@ def describe_sequence(layout: GrayCode) -> str:
     )
 
 
-def in_order(layout: PatternLayout, name: SequenceName, path: Path) -> GrayCode:
-    """The sequence of a pattern file in the order of a program. Raises UserError for other patterns."""
+def layout_in_order(path: Path, name: SequenceName | None) -> PatternLayout:
+    """The pattern of a file, in the order of a program if one is named. Raises UserError unless it is a Gray code."""
+    layout = read_layout(path)
+    if name is None:
+        return layout
     if not isinstance(layout, GrayCode):
         raise UserError(
             f"{path}: describes {layout.description}, which has no --sequence\n    cause:  the flag is for Gray code\n"
@@ -75,9 +79,7 @@ def recognise_sequence(
     Sequences that differ only where no image could tell are one. Raises UserError with the frame's folder if its images
     fit no known sequence, or more than one, and if two frames show different ones.
     """
-    whole = [frame for frame in captures.frames if frame.name not in captures.faults]
-    if not whole:
-        raise next(iter(captures.faults.values()))
+    whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}
     errors: list[UserError] = []
     for frame in whole[:_LOOKED_AT]:

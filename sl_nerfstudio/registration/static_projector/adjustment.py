@@ -17,7 +17,7 @@ from scipy.stats import norm
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.registration.static_projector.settings import StaticSettings
-from sl_nerfstudio.relative_pose.unknown_projector.parameters import device_with, values_of
+from sl_nerfstudio.relative_pose.unknown_projector.parameters import device_with, prior_sigma, values_of
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,7 @@ class _Prior:
 
     @staticmethod
     def of(projector: Device, free: tuple[int, ...], settings: StaticSettings) -> "_Prior":
-        sigma = np.array([getattr(settings.prior, name) for name in ("log_focal", "log_aspect", "cx", "cy", "k1")])
-        return _Prior(values_of(projector), sigma, free, settings.difference_step)
+        return _Prior(values_of(projector), prior_sigma(settings.prior), free, settings.difference_step)
 
     def departure(self, scene: Scene) -> Float64[ndarray, "free"]:
         index = list(self.free)
