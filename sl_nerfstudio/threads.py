@@ -56,20 +56,21 @@ def _pool(process: int) -> ThreadPoolExecutor:
 def parallel(tasks: Sequence[Callable[[], object]]) -> None:
     """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises."""
     queue = itertools.count()
-
-    def work() -> None:
-        while (i := next(queue)) < len(tasks):
-            tasks[i]()
-
     others = min(threads(), len(tasks)) - 1
-    futures = [_pool(os.getpid()).submit(work) for _ in range(others)]
+    futures = [_pool(os.getpid()).submit(_work, tasks, queue) for _ in range(others)]
     try:
-        work()
+        _work(tasks, queue)
     finally:
         errors = [future.exception() for future in futures]
     for error in errors:
         if error is not None:
             raise error
+
+
+def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int]) -> None:
+    """Run tasks until none is left; `queue` gives each number once, whichever thread asks."""
+    while (i := next(queue)) < len(tasks):
+        tasks[i]()
 
 
 def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:

@@ -1,7 +1,9 @@
 """Set-up of all tests: shapes and types are checked at run time, one thread, no deadlines, signals as in a terminal."""
 
+import importlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -15,6 +17,11 @@ import pytest  # noqa: E402
 import torch  # noqa: E402
 
 torch.set_num_threads(1)
+# While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
+# half a minute; a new thread has a short one.
+_importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))
+_importing.start()
+_importing.join()
 hypothesis.settings.register_profile("project", deadline=None, derandomize=True, max_examples=50, print_blob=True)
 hypothesis.settings.load_profile("project")
 
@@ -26,3 +33,8 @@ def signals_as_in_a_terminal() -> Iterator[None]:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     yield
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files marked as long come first."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)

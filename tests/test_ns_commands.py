@@ -36,7 +36,7 @@ from sl_nerfstudio.methods import sl_neus, sl_neus_paper
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio emits many warnings
 
 SMALL = [
     "--pipeline.model.sdf.log2-table-size",

@@ -13,6 +13,7 @@ from sl_nerfstudio.calibration.device_files import read_device_file
 from sl_nerfstudio.cli.calibrate import main
 from sl_nerfstudio.cli.synth import main as synth
 from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.presets import make_grid
 
 FRAMES = 5
 BOARD = ["--corners", "9x6", "--square", "30 mm"]
@@ -68,6 +69,26 @@ def test_both_devices_are_as_they_were(captures, calibrated):
             assert abs(got[key] - true[key]) < 0.01 * true["fl_x"]
     assert [pose["name"] for pose in found["poses"]] == [f"pose_{k:02d}" for k in range(FRAMES)]
     np.testing.assert_allclose(found["T_projector_camera"], truth["T_projector_camera"], rtol=0.02, atol=8)
+
+
+def test_a_charuco_board_under_the_coded_grid_calibrates_both_devices(tmp_path):
+    """Two photographs of each pose: under the grid, and under white light."""
+    (tmp_path / "pattern.json").write_bytes(make_grid("800x800").encode())
+    flags = ["--frames", 4, "--resolution", 480, "--seed", 2, "--pattern", tmp_path / "pattern.json"]
+    _run(synth, "--scene", "charuco", "--output", tmp_path / "scene", *flags)
+    board = ["--board", "charuco", "--squares", "11x8", "--square", "30 mm", "--marker", "22 mm"]
+    output = tmp_path / "intrinsics.json"
+    _run(main, "--images", tmp_path / "scene" / "images", "--output", output, *board,
+         "--pattern", tmp_path / "pattern.json")  # fmt: skip
+    truth, found = (
+        json.loads(path.read_text()) for path in (tmp_path / "scene" / "ground_truth" / "intrinsics.json", output)
+    )
+    for name in ("camera", "projector"):
+        got, true = found[name], truth[name]
+        assert all(abs(got[key] - true[key]) < 3 * got["sigma"][key] for key in ("fl_x", "cx", "cy"))
+        assert abs(got["fl_x"] - true["fl_x"]) < 0.01 * true["fl_x"]
+    expected = {"columns": 11, "rows": 8, "square": 30.0, "marker": 22.0, "dictionary": "5X5_1000"}
+    assert found["board"] == {"kind": "charuco", **expected}
 
 
 def test_sl_process_reads_the_result(calibrated):

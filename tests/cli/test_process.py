@@ -15,6 +15,8 @@ from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import make_gray_scan
 
+pytestmark = pytest.mark.long
+
 
 def _run(monkeypatch, *flags):
     monkeypatch.setattr(sys, "argv", ["sl-process", *map(str, flags)])

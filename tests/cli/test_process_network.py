@@ -11,6 +11,8 @@ from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
 
+pytestmark = pytest.mark.long
+
 FRAMES, KEPT = 14, 5  # a walk around the object, and the neighbouring frames of it that are used
 RESOLUTION = 540  # a period of the grid is about 14 pixels
 HALF_A_PERIOD = 10.0  # pattern pixels: a pixel that is further off was decoded as another place

@@ -47,6 +47,8 @@ from sl_nerfstudio.scan import (
 
 from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
 
+pytestmark = pytest.mark.long
+
 FRAMES, SIZE, MM = 6, 80, 50.0
 S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
 QUICK = AdjustmentSettings(anchors_per_frame=80, frames_per_anchor=3, max_iterations=14)

@@ -8,6 +8,8 @@ import pytest
 from sl_nerfstudio.object_separation.frame_points import points_of
 from sl_nerfstudio.object_separation.separate import Part, separate
 
+pytestmark = pytest.mark.long
+
 
 def _shares(case, found):
     """Shares of the object's and of the surroundings' decoded pixels that are kept."""

@@ -9,11 +9,16 @@ from tests.pattern.ramps import Ramps
 from tests.processing.ramp_scan import RampScan, make_ramp_scan
 
 
+def register_ramps(patch: pytest.MonkeyPatch) -> None:
+    """The two entries that a new decoder needs."""
+    patch.setitem(LAYOUTS, Ramps.kind, Ramps)
+    patch.setitem(DECODERS, RampsDecoder.name, RampsDecoder)
+
+
 @pytest.fixture
 def ramps_registered(monkeypatch):
-    """The two entries that a new decoder needs."""
-    monkeypatch.setitem(LAYOUTS, Ramps.kind, Ramps)
-    monkeypatch.setitem(DECODERS, RampsDecoder.name, RampsDecoder)
+    """For one test."""
+    register_ramps(monkeypatch)
 
 
 @pytest.fixture(scope="session")

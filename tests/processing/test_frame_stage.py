@@ -19,6 +19,8 @@ from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
 
+pytestmark = pytest.mark.long
+
 
 class KilledDecoder(RampsDecoder):
     """As if the system had run out of memory."""

@@ -10,22 +10,19 @@ import numpy as np
 import pytest
 
 from benchmarks.attacks.dying import dying
-from sl_nerfstudio.decoding.decoders import DECODERS
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
 from sl_nerfstudio.files.lock import LOCK, locked
 from sl_nerfstudio.files.new_folder import NewFolder
-from sl_nerfstudio.pattern.files import LAYOUTS
 from sl_nerfstudio.processing import frame_stage, frame_worker
 from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.kept.records import digest
 from sl_nerfstudio.processing.process import process
-from tests.decoding.ramps_decoder import RampsDecoder
-from tests.pattern.ramps import Ramps
+from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
 
-pytestmark = pytest.mark.usefixtures("ramps_registered")
+pytestmark = [pytest.mark.usefixtures("ramps_registered"), pytest.mark.long]
 
 KEPT = ["registration: kept from an earlier run", "adjustment: kept from an earlier run"]
 
@@ -45,8 +42,7 @@ def whole(ramp_scan, tmp_path_factory):
     """The scan of a run that nothing interrupted, and its work folder."""
     root = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(LAYOUTS, Ramps.kind, Ramps)
-        patch.setitem(DECODERS, RampsDecoder.name, RampsDecoder)
+        register_ramps(patch)
         run(ramp_scan.config(root / "s", known_length="baseline of frame 1 = 5 cm"))
     return root
 

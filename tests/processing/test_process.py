@@ -16,9 +16,10 @@ from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.registration.known_length import parse_known_length
 from sl_nerfstudio.registration.result import NoCommonSurface
 from sl_nerfstudio.scan import check_scan, read_scan
+from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
 
-pytestmark = pytest.mark.usefixtures("ramps_registered")
+pytestmark = [pytest.mark.usefixtures("ramps_registered", "calibrated_before"), pytest.mark.long]
 
 
 ALONE = "no other frame shows any of its surface; capture views in between"
@@ -47,6 +48,22 @@ def _without(registration, names):
     )
 
 
+@pytest.fixture(scope="module")
+def whole(ramp_scan, tmp_path_factory):
+    """A run from nothing to the scan: its result, what it logged, and its folders."""
+    root = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        register_ramps(patch)
+        return *_run(ramp_scan.config(root / "s")), root
+
+
+@pytest.fixture
+def calibrated_before(ramp_scan, whole, tmp_path):
+    """Later runs find all frames decoded and calibrated; they register and adjust by themselves."""
+    work = [ramp_scan.config(root / "s").work_folder for root in (whole[2], tmp_path)]
+    shutil.copytree(*work, ignore=shutil.ignore_patterns("registration-*", "adjustment-*"))
+
+
 @pytest.fixture
 def lose(monkeypatch):
     """Makes registration leave out frames, for good unless they may come `back` after the adjustment."""
@@ -60,15 +77,15 @@ def lose(monkeypatch):
     return lose
 
 
-def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, tmp_path):
-    result, log = _run(ramp_scan.config(tmp_path / "s"))
+def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
+    result, log, root = whole
     assert log[0] == "4 frames of 130 x 130 pixels, decoder ramps"
     assert log[1].startswith("decoded and calibrated 4 of 4 frames")
     assert "registered 4 of 4 frames" in log and log[-1].startswith("joint adjustment: frames agree to 0.0")
-    assert check_scan(tmp_path / "s") == []
-    assert (tmp_path / "s" / "processing.html").read_text() == "4 of 4"
-    assert json.loads((tmp_path / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
-    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
+    assert check_scan(root / "s") == []
+    assert (root / "s" / "processing.html").read_text() == "4 of 4"
+    assert json.loads((root / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
+    found, true = read_scan(root / "s").poses.T_world_camera, ramp_scan.T_world_camera
     S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
     distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
     assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 1e-3 * distance
@@ -190,9 +207,10 @@ def test_frames_of_a_known_length_are_found_by_number_or_name():
 
 
 def test_inputs_are_read_before_anything_is_written(ramp_scan, tmp_path):
+    before = sorted(tmp_path.rglob("*"))
     inputs = read_inputs(ramp_scan.config(tmp_path / "s", known_length="baseline of frame 3 = 1 m"))
     assert [frame.name for frame in inputs.captures.frames] == list(NAMES)
     assert inputs.known.frames == (NAMES[3],) and inputs.given is None
     assert inputs.job.decoder.name == "ramps" and inputs.job.work == tmp_path / "s.work"
     assert (inputs.job.camera, inputs.job.projector) == (ramp_scan.camera, ramp_scan.projector)
-    assert list(tmp_path.iterdir()) == []
+    assert sorted(tmp_path.rglob("*")) == before

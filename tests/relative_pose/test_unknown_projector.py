@@ -15,6 +15,8 @@ from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import chec
 from tests.relative_pose.two_views import CAMERA, PROJECTORS
 from tests.relative_pose.unknown_views import SHIFTED, frames_of
 
+pytestmark = pytest.mark.long
+
 BLANK = Device(SHIFTED.w, SHIFTED.h, 1.5 * SHIFTED.w, 1.5 * SHIFTED.w, SHIFTED.w / 2, SHIFTED.h / 2)
 
 QUICK = replace(UNKNOWN_PROJECTOR_DEFAULTS, grid=replace(UNKNOWN_PROJECTOR_DEFAULTS.grid, starts=2))

@@ -20,6 +20,8 @@ from sl_nerfstudio.scan.check.interpretations import (
     other_interpretations,
 )
 
+pytestmark = pytest.mark.long
+
 OPENCV = np.diag([1.0, -1, -1, 1])
 KEYS = ("transform_matrix", "projector_transform_matrix")
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from sl_nerfstudio.calibration.board.detection import Corners, find_corners, other_board_seen
+from sl_nerfstudio.calibration.board.reflectance import without_reflectance
 from sl_nerfstudio.calibration.board.rig import BoardView
 from sl_nerfstudio.calibration.board.transfer import corners_in_pattern
-from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.decoding.decoder import Decoder
+from sl_nerfstudio.decoding.grid.decoder import NetworkDecoder
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard
 from sl_nerfstudio.pattern.graycode import GrayCode
 from sl_nerfstudio.pattern.sequence import Shown
@@ -81,15 +84,21 @@ class _Unused(Exception):
 def _read_pose(
     pose: BoardPhotographs, board: Board, decoder: Decoder[Any] | None
 ) -> tuple[Float32[ndarray, "h w"], Corners, BoardView]:
-    pattern, grey = _pattern_and_plain(pose, decoder)
+    decode: Callable[[], Decoded] | None
+    if isinstance(decoder, NetworkDecoder):
+        pattern, grey = _pattern_and_plain(pose)
+        decode = partial(decoder.decode_image, without_reflectance(pattern, grey))
+    else:
+        grey = _even_light(pose, decoder)
+        decode = None if decoder is None else partial(decoder.decode, pose.images)
     corners = find_corners(grey, board)
     if corners is None:
         raise _Unused(_not_found(pose, grey, board), grey)
-    if decoder is None:
+    if decode is None:
         return grey, corners, BoardView(pose.name, corners, None)
     folder = pose.images[0].parent
     try:
-        coords = decoder.decode(pattern).coords
+        coords = decode().coords
     except DecodingError as error:
         raise _Unused(FileError(folder, error.problem, error.cause, error.remedy), grey, corners) from error
     carried = corners_in_pattern(corners, coords)
@@ -104,22 +113,22 @@ def _read_pose(
     return grey, corners, BoardView(pose.name, corners, carried)
 
 
-def _pattern_and_plain(
-    pose: BoardPhotographs, decoder: Decoder[Any] | None
-) -> tuple[tuple[Path, ...], Float32[ndarray, "h w"]]:
-    """The photographs to decode, and the board under even light.
+def _even_light(pose: BoardPhotographs, decoder: Decoder[Any] | None) -> Float32[ndarray, "h w"]:
+    """The board under even light.
 
     Without a decoder that is the brightest image; of a sequence with inverses, the mean of all images that have one.
-    Of a coded grid there is one photograph under the pattern, and one without it.
     """
-    if decoder is None:
-        return (), max((as_grey(read_photograph(path)) for path in pose.images), key=lambda image: image.mean())
-    layout = decoder.layout
-    if isinstance(layout, GrayCode):
-        pairs = [(k, inverse) for axis in (0, 1) for k, inverse in layout.bit_images(axis) if inverse is not None]
-        white = layout.place(Shown("white"))
-        used = [k for pair in pairs for k in pair] or (range(layout.images) if white is None else [white])
-        return pose.images, _mean([pose.images[place] for place in used if place < len(pose.images)])
+    layout = None if decoder is None else decoder.layout
+    if not isinstance(layout, GrayCode):
+        return max((as_grey(read_photograph(path)) for path in pose.images), key=lambda image: image.mean())
+    pairs = [(k, inverse) for axis in (0, 1) for k, inverse in layout.bit_images(axis) if inverse is not None]
+    white = layout.place(Shown("white"))
+    used = [k for pair in pairs for k in pair] or (range(layout.images) if white is None else [white])
+    return _mean([pose.images[place] for place in used if place < len(pose.images)])
+
+
+def _pattern_and_plain(pose: BoardPhotographs) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    """One photograph under a coded grid, and one without it, whichever comes first."""
     if len(pose.images) != 2:
         fault = FileError(
             pose.images[0].parent,
@@ -129,9 +138,7 @@ def _pattern_and_plain(
         )
         raise _Unused(fault, as_grey(read_photograph(pose.images[0])))
     first, second = (as_grey(read_photograph(path)) for path in pose.images)
-    if _edges(first) > _edges(second):
-        return pose.images[:1], second
-    return pose.images[1:], first
+    return (first, second) if _edges(first) > _edges(second) else (second, first)
 
 
 def _mean(paths: Sequence[Path]) -> Float32[ndarray, "h w"]:

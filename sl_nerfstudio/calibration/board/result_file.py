@@ -1,6 +1,7 @@
 """The file that sl-calibrate writes: plain JSON that sl-process reads, with the uncertainty of every number."""
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -43,4 +44,4 @@ def _device(device: Device, sigma: DeviceSigma) -> dict[str, Any]:
 
 def _board(board: Board) -> dict[str, Any]:
     kind = "chessboard" if isinstance(board, Chessboard) else "charuco"
-    return {"kind": kind, **vars(board)}
+    return {"kind": kind, **asdict(board)}

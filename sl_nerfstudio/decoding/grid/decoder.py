@@ -5,6 +5,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
+from jaxtyping import UInt8, UInt16
+from numpy import ndarray
+
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
@@ -23,7 +26,11 @@ class NetworkDecoder(Decoder[GridPattern]):
 
     def decode(self, paths: Sequence[Path]) -> Decoded:
         """Decode the one image of a frame."""
-        return self._images.decode(read_photograph(paths[0]))
+        return self.decode_image(read_photograph(paths[0]))
+
+    def decode_image(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
+        """The same for an image that was read, or computed."""
+        return self._images.decode(image)
 
     def weights(self) -> Iterable[Path]:
         """The files of the trained networks."""

@@ -10,6 +10,8 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.verdict.calibration import CalibrationLimits, judge_calibration, shortcomings, undetermined
 from tests.calibration.board.scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
 
+pytestmark = pytest.mark.long
+
 SEEDS = range(3)
 
 

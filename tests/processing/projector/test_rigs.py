@@ -15,6 +15,8 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.setup import make_setup
 from tests.processing.ramp_scan import NAMES, RampScan, make_captures
 
+pytestmark = pytest.mark.long
+
 
 def _captures(root, path) -> RampScan:
     setup = make_setup(SynthConfig(scene="head", frames=22, resolution=130, seed=3, path=path))

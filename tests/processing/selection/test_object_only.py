@@ -14,6 +14,7 @@ from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.types import PickedPixel, Scale, ScaleBar
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.setup import make_setup
+from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES, make_captures
 
 
@@ -26,12 +27,15 @@ def on_a_table(tmp_path_factory):
     return captures, {name: r.object_mask for name, r in zip(NAMES, rendered, strict=True)}
 
 
-@pytest.fixture
-def run(on_a_table, ramps_registered, tmp_path):
+@pytest.fixture(scope="module")
+def run(on_a_table, tmp_path_factory):
     captures, truth = on_a_table
+    root = tmp_path_factory.mktemp("object_only")
     log = []
-    result = process(captures.config(tmp_path / "s", object_only=True), render_processing_report, log.append)
-    return result, read_scan(tmp_path / "s"), truth, "\n".join(log)
+    with pytest.MonkeyPatch.context() as patch:
+        register_ramps(patch)
+        result = process(captures.config(root / "s", object_only=True), render_processing_report, log.append)
+    return result, read_scan(root / "s"), truth, "\n".join(log)
 
 
 def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
