@@ -87,7 +87,7 @@ def test_a_charuco_board_under_the_coded_grid_calibrates_both_devices(tmp_path):
         got, true = found[name], truth[name]
         assert all(abs(got[key] - true[key]) < 3 * got["sigma"][key] for key in ("fl_x", "cx", "cy"))
         assert abs(got["fl_x"] - true["fl_x"]) < 0.01 * true["fl_x"]
-    expected = {"columns": 11, "rows": 8, "square": 30.0, "marker": 22.0, "dictionary": "5X5_1000"}
+    expected = {"columns": 11, "rows": 8, "square": 30.0, "marker": 22.0, "dictionary": "5X5_1000", "legacy": False}
     assert found["board"] == {"kind": "charuco", **expected}
 
 
