@@ -18,6 +18,7 @@ from numpy import ndarray
 
 from benchmarks.common.machine import write_rows
 from benchmarks.unknown_projector.sets import CoordinateSet, SetOptions, make_set
+from sl_nerfstudio.calibration.stated_sigma import CERTAIN
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.similarity import fit_similarity
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
@@ -98,7 +99,7 @@ def run(options: SetOptions) -> Row:
     sigma = sigma_of_fields(estimate.projector, estimate.covariance)
     found = FoundProjector(estimate.projector, sigma, len(estimate.frames), estimate.noise_px, "epipolar geometry")
     clouds, consistent = processed(made, found.projector, found)
-    refined = refine_projector(clouds, consistent, found, adjustment_settings("free", found), lambda _: None)
+    refined = refine_projector(clouds, consistent, found, CERTAIN, adjustment_settings("free", found), lambda _: None)
     error = surface_error(made, refined.clouds, refined.consistent)
     return Row(
         options.scene, options.seed, options.frames,

@@ -11,7 +11,8 @@ Changes are shares of the focal length, in the order of `IntrinsicsChange.values
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
@@ -43,9 +44,22 @@ class SelfCalibration:
 
     def of_projector(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
         """Change of the projector alone, and its covariance, if the cameras' intrinsics are right."""
-        C, k, p = self.covariance, slice(0, 3), slice(3, 6)
-        gain = torch.linalg.solve(C[k, k], C[k, p]).T
-        return self.change[p] - gain @ self.change[k], C[p, p] - gain @ C[k, p]
+        C, gain = self.covariance, self._projector_by_camera()
+        return self.change[3:] - gain @ self.change[:3], C[3:, 3:] - gain @ C[:3, 3:]
+
+    def projector_by_camera(self, camera_sigma: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
+        """Covariance that `of_projector` has besides if the cameras' intrinsics are right within 1 sigma only."""
+        moved = self._projector_by_camera() * torch.tensor(camera_sigma, dtype=self.covariance.dtype)
+        return moved @ moved.T
+
+    def _projector_by_camera(self) -> Float[Tensor, "3 3"]:
+        """How the projector follows the cameras."""
+        C = self.covariance
+        return torch.linalg.solve(C[:3, :3], C[:3, 3:]).T
+
+    def allowing(self, sigma: Float64[ndarray, "6"]) -> "SelfCalibration":
+        """With stated values that are themselves uncertain, by 1 sigma each: no contradiction within it."""
+        return SelfCalibration(self.change, self.covariance + torch.from_numpy(sigma).square().diag())
 
     @property
     def known(self) -> bool:

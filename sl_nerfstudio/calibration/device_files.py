@@ -34,8 +34,7 @@ def read_device_file(
     which procam-calibration was run; `name` is that of the device in a file with several cameras. Raises UserError with
     file, cause and remedy.
     """
-    entries = [entry for entry in read_entries(path, procam_step) if name in ("", entry.label)]
-    entry = _choose(path, entries, role, size)
+    entry = chosen_entry(path, role, size, procam_step, name)
     device = _device(path, entry, size)
     if model is not None and role == "projector":
         device = replace(device, model=model)
@@ -44,6 +43,12 @@ def read_device_file(
     for key, problem in device_problems(device):
         raise FileError(path, f"{entry.label}: {key} {problem.problem}", problem.cause, problem.remedy)
     return device
+
+
+def chosen_entry(path: Path, role: Role, size: tuple[int, int], procam_step: int = 1, name: str = "") -> DeviceEntry:
+    """What the file says of a device, as it stands there; arguments and errors are those of `read_device_file`."""
+    entries = [entry for entry in read_entries(path, procam_step) if name in ("", entry.label)]
+    return _choose(path, entries, role, size)
 
 
 def read_entries(path: Path, procam_step: int = 1) -> list[DeviceEntry]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from sl_nerfstudio.calibration.stated_sigma import StatedSigma
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
@@ -30,6 +31,7 @@ class FrameJob:
     seed: int
     masks: UserMasks | None = None  # of the user
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
+    stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
     projector_known: bool = True  # False: frames are only decoded, until the projector has been found
 
     def camera_of(self, frame: CapturedFrame) -> Device:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from sl_nerfstudio.calibration.stated_sigma import CERTAIN, StatedSigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.capture_files.cameras import Cameras, read_cameras, require_intrinsics
 from sl_nerfstudio.processing.capture_files.captured import CaptureNotes, read_captured
@@ -10,7 +11,7 @@ from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob
 from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
-from sl_nerfstudio.processing.projector.stated import read_projector, require_known_camera
+from sl_nerfstudio.processing.projector.stated import read_projector, read_projector_sigma, require_known_camera
 from sl_nerfstudio.processing.selection.user_masks import find_masks
 from sl_nerfstudio.registration.known_length import KnownLength, is_index, parse_known_length
 
@@ -41,10 +42,19 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     require_known_camera(config, cameras)
     projector, stated = read_projector(config, (layout.w, layout.h))
     masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
+    doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
     known_beam = not config.finds_projector
     return Inputs(
         FrameJob(
-            config.work_folder, decoder, cameras.first, projector, config.seed, masks, cameras.several, known_beam
+            config.work_folder,
+            decoder,
+            cameras.first,
+            projector,
+            config.seed,
+            masks,
+            cameras.several,
+            doubt,
+            known_beam,
         ),
         cameras,
         captures,

@@ -26,7 +26,7 @@ from sl_nerfstudio.processing.projector.found import describe
 from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
 from sl_nerfstudio.processing.projector.rigid import with_equal_baselines
 from sl_nerfstudio.processing.projector.stage import calibrate_frames
-from sl_nerfstudio.processing.projector.stated_test import contradiction_by_epipolar_geometry
+from sl_nerfstudio.processing.projector.stated_test import contradiction_by_epipolar_geometry, within_stated_doubt
 from sl_nerfstudio.processing.result import ProcessResult, with_object_only
 from sl_nerfstudio.processing.scan_poses import find_scan_poses, require_known_frames
 from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
@@ -104,12 +104,13 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
         lambda: adjust_consistent(clouds, registration, log, settings),
     )
     if found is not None and config.rig != "static-projector":  # whose placement has adjusted everything
-        refined = refine_projector(clouds, consistent, found, settings, log)
+        refined = refine_projector(clouds, consistent, found, job.stated.camera, settings, log)
         clouds, consistent, found = refined.clouds, refined.consistent, refined.found
         log(f"after the joint adjustment: {describe(found)}")
         job, results = replace(job, projector=found.projector), with_clouds(results, clouds)
     registration = consistent.registration
-    poses = find_scan_poses(clouds, registration, consistent.adjusted, inputs.known, given)
+    adjusted = within_stated_doubt(consistent.adjusted, job.stated)
+    poses = find_scan_poses(clouds, registration, adjusted, inputs.known, given)
     result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, found, wrong)
     result = replace(result, captured=notes)
     if config.object_only:

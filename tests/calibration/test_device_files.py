@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sl_nerfstudio.calibration.device_files import read_device_file, read_entries
 from sl_nerfstudio.calibration.distortion_fit import reduce_distortion
+from sl_nerfstudio.calibration.stated_sigma import CERTAIN, read_stated_sigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 
@@ -92,6 +93,16 @@ def test_plain_json_says_where_the_first_pixel_is(tmp_path):
     assert read_device_file(path, "camera", SIZE) == read_device_file(path, "projector", SIZE)
 
 
+def test_the_uncertainty_that_a_file_states_is_read_in_shares_of_the_focal_length(tmp_path):
+    path = tmp_path / "intrinsics.json"
+    camera = {"w": 640, "h": 480, "fl_x": 800, "fl_y": 800, "cx": 322.3, "cy": 236.8}
+    path.write_text(
+        json.dumps({"camera": {**camera, "sigma": {"fl_x": 4, "fl_y": 5, "cy": 1.6, "k1": 0.1}}, "projector": camera})
+    )
+    assert read_stated_sigma(path, "camera", SIZE) == (0.005, 0.0, 0.002)
+    assert read_stated_sigma(path, "projector", SIZE) == read_stated_sigma(None, "camera", SIZE) == CERTAIN
+
+
 @given(
     focal=st.tuples(st.floats(900, 3000), st.floats(900, 3000)),
     centre=st.tuples(st.floats(200, 440), st.floats(150, 330)),
@@ -136,6 +147,13 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
     [
         ("a.json", '{"camera": {"w": 640}}', r"camera\.h: is missing|h: is missing"),
         ("a.json", '{"camera": 3}', "camera"),
+        (
+            "a.json",
+            json.dumps(
+                {"camera": {"w": 640, "h": 480, "fl_x": 900, "fl_y": 900, "cx": 1, "cy": 1, "sigma": {"cx": -1}}}
+            ),
+            r"camera\.sigma\.cx: is -1",
+        ),
         ("a.json", '{"frames": []}', "describes neither a camera nor a projector"),
         ("a.json", "{", "is not valid JSON"),
         ("a.txt", "1 OPENCV 640 480 900\n", "camera 1 has model OPENCV with 1 parameters"),

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.calibration.stated_sigma import StatedSigma
+from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
 from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector
 from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
@@ -124,3 +125,31 @@ def test_a_wrong_principal_point_is_named(noisy):
     one = found.explanations()[0]
     assert (one.role, one.part) == ("projector", "principal point")
     assert abs(one.change[2] * SHIFTED.fl_x - 80) < 4 * one.sigma[2] * SHIFTED.fl_x
+
+
+DOUBT = (0.004, 0.003, 0.005)  # of the camera, shares of its focal length
+
+
+@pytest.mark.parametrize("signs", [(1, 1, -1), (-1, 1, 1)])
+def test_an_uncertain_camera_makes_the_projector_as_uncertain_as_it_moves_it(signs):
+    """Exact coordinates, so that nothing else moves it: within what three values of 1 sigma each can do together."""
+    change = DeviceChange(*(sign * sigma for sign, sigma in zip(signs, DOUBT, strict=True)))
+    frames = [replace(f, camera=change.applied(f.camera)) for f in frames_of(SHIFTED, 6)]
+    found = estimate_projector(frames, SHIFTED, True, 0, QUICK, DOUBT)
+    certain = estimate_projector(frames, SHIFTED, True, 0, QUICK)
+    assert not isinstance(found, NoProjector) and not isinstance(certain, NoProjector)
+    assert found.projector == certain.projector
+    index = [0, 2, 3]
+    error = np.abs(values_of(found.projector) - values_of(SHIFTED))[index]
+    assert (error < 2 * found.sigma[index]).all()
+    assert (error > 3 * certain.sigma[index]).any()
+
+
+def test_errors_within_what_a_calibration_states_are_no_contradiction(noisy):
+    """A camera off by its stated 1 sigma; a projector off by many is one all the same."""
+    doubt = StatedSigma(camera=(0.015, 0.015, 0.015)).either
+    change = DeviceChange(0.015, 0.015, -0.015)
+    moved = evidence([replace(f, camera=change.applied(f.camera)) for f in noisy], SHIFTED)
+    assert moved.contradicts() and not moved.allowing(doubt).contradicts()
+    wrong = evidence(noisy, replace(SHIFTED, fl_x=1.2 * SHIFTED.fl_x, fl_y=1.2 * SHIFTED.fl_y))
+    assert wrong.allowing(doubt).contradicts()

@@ -23,6 +23,7 @@ class DeviceEntry:
     matrix: Float64[ndarray, "3 3"]
     distortion: tuple[float, ...]  # the first four to eight of LENS_TERMS
     model: DeviceKind = "OPENCV"
+    sigma_px: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of focal length, cx and cy; 0: the file states none
 
 
 def camera_matrix(fl_x: float, fl_y: float, cx: float, cy: float) -> Float64[ndarray, "3 3"]:

@@ -1,7 +1,8 @@
 """Plain JSON: `camera` and `projector` objects.
 
 The centre of the first pixel is (0.5, 0.5), or (0, 0) where the file says `"pixel_centre": 0`. The camera's keys may be
-at the top level, as in transforms.json. Several cameras are objects in `cameras`, by their names.
+at the top level, as in transforms.json. Several cameras are objects in `cameras`, by their names. `sigma`, optional in
+each device, holds 1 sigma of its `fl_x`, `cx` and `cy` in pixels.
 """
 
 from pathlib import Path
@@ -64,10 +65,22 @@ def _entry(fields: Fields, role: Role, offset: float, name: str | None = None) -
             model = fields.read_choice(key, ("OPENCV", "DOE"), "a model that a scan does not have")
     w, h = fields.read_count("w"), fields.read_count("h")
     numbers = [fields.read_number(key) for key in ("fl_x", "fl_y", "cx", "cy")]
+    sigma = fields.read_section("sigma") if "sigma" in fields.record else None
+    doubts = [0.0 if sigma is None else _at_least_zero(sigma, key) for key in ("fl_x", "cx", "cy")]
     lens = [fields.read_number(key, 0.0) for key in LENS_TERMS]
-    if model is None or w is None or h is None or None in numbers or None in lens:
+    if model is None or w is None or h is None or None in numbers or None in lens or None in doubts:
         return None
     fl_x, fl_y, cx, cy = (n or 0.0 for n in numbers)
     kind: DeviceKind = "DOE" if model == "DOE" else "OPENCV"
     matrix = camera_matrix(fl_x, fl_y, cx + offset, cy + offset)
-    return DeviceEntry(name or role, role, (w, h), matrix, tuple(k or 0.0 for k in lens), kind)
+    focal, x, y = (s or 0.0 for s in doubts)
+    return DeviceEntry(name or role, role, (w, h), matrix, tuple(k or 0.0 for k in lens), kind, (focal, x, y))
+
+
+def _at_least_zero(fields: Fields, key: str) -> float | None:
+    """A standard deviation; 0 if it is not stated."""
+    value = fields.read_number(key, 0.0)
+    if value is not None and value < 0:
+        fields.fault(key, f"is {value:g}", "a standard deviation is at least 0", "correct it, or leave sigma out")
+        return None
+    return value

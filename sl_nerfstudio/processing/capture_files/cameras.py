@@ -6,6 +6,7 @@ from typing import Any
 
 from sl_nerfstudio.calibration.device_files import read_device_file, read_entries
 from sl_nerfstudio.calibration.exif import CameraStart, camera_from_exif
+from sl_nerfstudio.calibration.stated_sigma import CERTAIN, Shares, read_stated_sigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import Captures
@@ -24,6 +25,7 @@ class Cameras:
 
     devices: dict[str, Device]
     start: CameraStart | None = None  # None: from a file
+    sigma: Shares = CERTAIN  # of the first, as its file states it
 
     @property
     def first(self) -> Device:
@@ -41,9 +43,11 @@ def read_cameras(config: ProcessConfig, captures: Captures) -> Cameras:
     path = config.intrinsics
     if path is not None and any(entry.role != "projector" for entry in read_entries(path, config.procam_step)):
         step = config.procam_step
-        return Cameras(
-            {name: read_device_file(path, "camera", size, None, step, name) for name, size in captures.sizes.items()}
-        )
+        found = {
+            name: read_device_file(path, "camera", size, None, step, name) for name, size in captures.sizes.items()
+        }
+        first = next(iter(captures.sizes))
+        return Cameras(found, sigma=read_stated_sigma(path, "camera", captures.sizes[first], step, first))
     images = [frame.images[0] for frame in captures.frames if frame.name not in captures.faults]
     if not images:
         raise next(iter(captures.faults.values()))

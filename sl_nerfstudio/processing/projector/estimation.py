@@ -44,8 +44,8 @@ def find_projector(job: FrameJob, results: Sequence[FrameStageResult], stated: b
         raise UserError("no frame was decoded, so the projector's intrinsics cannot be estimated")
     found = StageStore(job.work).kept(
         "projector",
-        (matches, job.projector, stated, job.seed),
-        lambda: estimate_projector(matches, job.projector, stated, job.seed),
+        (matches, job.projector, stated, job.seed, job.stated.camera),
+        lambda: estimate_projector(matches, job.projector, stated, job.seed, camera_sigma=job.stated.camera),
     )
     if isinstance(found, NoProjector):
         raise not_found(found)

@@ -11,6 +11,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.registered_frames import ProjectorKnowledge, RegisteredFramesSettings
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.calibration.stated_sigma import Shares
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.processing.config import Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
@@ -53,19 +54,21 @@ def refine_projector(
     clouds: Sequence[FrameCloud],
     consistent: ConsistentFrames,
     found: FoundProjector,
+    camera_sigma: Shares,
     settings: RegisteredFramesSettings,
     log: Callable[[str], None],
 ) -> RefinedProjector:
     """Gauss-Newton steps of focal length and principal point, with all poses adjusted again after each.
 
-    A step is kept if less of a contradiction is left than before.
+    A step is kept if less of a contradiction is left than before. `camera_sigma`: how uncertain the camera is; what
+    follows from it is part of the projector's uncertainty.
     """
     projector, covariance = found.projector, None  # None: no step was taken
     for _ in range(_ROUNDS):
         calibration = consistent.adjusted.intrinsics
         if calibration is None or not calibration.known:
             break
-        step, uncertainty = calibration.of_projector()
+        step, _ = calibration.of_projector()
         chi_square = _chi_square(calibration)
         if chi_square < _NEGLIGIBLE:
             break
@@ -80,8 +83,8 @@ def refine_projector(
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:
             break
-        clouds, consistent, projector, covariance = new_clouds, again, new, uncertainty
-    return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance, settings.dependence))
+        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma, settings)
+    return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance))
 
 
 def _chi_square(calibration: SelfCalibration) -> float:
@@ -90,13 +93,18 @@ def _chi_square(calibration: SelfCalibration) -> float:
     return float(step @ torch.linalg.solve(uncertainty, step))
 
 
-def _with_sigma(
-    found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None, dependence: float
-) -> FoundProjector:
+def _covariance(
+    calibration: SelfCalibration, camera_sigma: Shares, settings: RegisteredFramesSettings
+) -> Float[Tensor, "3 3"]:
+    """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
+    return settings.dependence**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
+
+
+def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None) -> FoundProjector:
     """The refined values; their uncertainty never exceeds that of the start."""
     if covariance is None:
         return found
-    shares = dependence * np.sqrt(covariance.diagonal().clamp_min(0).numpy())
+    shares = np.sqrt(covariance.diagonal().clamp_min(0).numpy())
     focal, x, y = np.minimum(shares, found.sigma_share) * projector.fl_x
     aspect = max(found.sigma[1] - found.sigma[0], 0.0)
     return replace(

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from sl_nerfstudio.calibration.device_files import read_device_file, read_entries
+from sl_nerfstudio.calibration.stated_sigma import Shares, read_stated_sigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.capture_files.cameras import Cameras
@@ -16,7 +17,7 @@ def read_projector(config: ProcessConfig, size: tuple[int, int]) -> tuple[Device
 
     If it is to be found from the frames, no file needs to: then only its size is known. Raises UserError.
     """
-    path = config.projector_intrinsics or config.intrinsics or Path()
+    path = _file(config)
     if config.finds_projector and not _described(config):
         if config.projector_model == "DOE":
             raise UserError(
@@ -27,6 +28,15 @@ def read_projector(config: ProcessConfig, size: tuple[int, int]) -> tuple[Device
         w, h = size
         return Device(w, h, _USUAL_FOCAL * w, _USUAL_FOCAL * w, w / 2, h / 2), False
     return read_device_file(path, "projector", size, config.projector_model, config.procam_step), True
+
+
+def read_projector_sigma(config: ProcessConfig, size: tuple[int, int]) -> Shares:
+    """How uncertain the file says that the projector is."""
+    return read_stated_sigma(_file(config), "projector", size, config.procam_step)
+
+
+def _file(config: ProcessConfig) -> Path:
+    return config.projector_intrinsics or config.intrinsics or Path()
 
 
 def _described(config: ProcessConfig) -> bool:

@@ -1,7 +1,10 @@
 """Whether the stated intrinsics can be right, by the epipolar geometry of all frames: before anything is registered."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
+from sl_nerfstudio.calibration.stated_sigma import StatedSigma
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, clouds_of
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.projector.words import wrong_intrinsics
@@ -28,9 +31,16 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
         (frames, poses, job.projector, job.seed),
         lambda: check_intrinsics(frames, poses, job.projector, job.seed),
     )
+    evidence = evidence.allowing(job.stated.either)
     stated_px, best_px = evidence.projector.noise_px
     decisive = len(firm) >= _FEWEST or best_px < _DECISIVE * stated_px
     return wrong_intrinsics(evidence) if decisive and evidence.contradicts() else ""
+
+
+def within_stated_doubt(adjusted: AdjustedFrames, stated: StatedSigma) -> AdjustedFrames:
+    """What the joint adjustment says of the intrinsics, where the files state how uncertain those are."""
+    found = adjusted.intrinsics
+    return adjusted if found is None else replace(adjusted, intrinsics=found.allowing(stated.both))
 
 
 def _firm(clouds: Sequence[FrameCloud]) -> list[FrameCloud]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.relative_pose.ray_pairs import subsample
+from sl_nerfstudio.relative_pose.unknown_projector.camera_doubt import covariance_by_camera
 from sl_nerfstudio.relative_pose.unknown_projector.joint_fit import JointFit, JointProblem, Prior
 from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches, Matches, Poses
 from sl_nerfstudio.relative_pose.unknown_projector.model_choice import choose_model
@@ -66,11 +67,13 @@ def estimate_projector(
     stated: bool,
     seed: int = 0,
     settings: UnknownProjectorSettings = UNKNOWN_PROJECTOR_DEFAULTS,
+    camera_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ProjectorEstimate | NoProjector:
     """Intrinsics of the projector for which the epipolar errors of all frames together are smallest.
 
     `projector` gives size and model, and if `stated` a start for the rest. A model without fundamental matrices (DOE)
-    needs a stated one. Lens terms other than k1 stay as they are.
+    needs a stated one. Lens terms other than k1 stay as they are. `camera_sigma`: 1 sigma of the cameras' focal length
+    and principal point, as shares of the focal length.
     """
     if len(frames) < settings.fewest_frames and not stated:
         return NoProjector("few frames", len(frames), np.inf, np.inf)
@@ -93,7 +96,11 @@ def estimate_projector(
     if _uncertainty(found) > settings.largest_sigma or found.noise_px > settings.largest_noise_share * projector.w:
         return NoProjector(cause or "unknown", len(index), _uncertainty(found), found.noise_px)
     covariance = np.zeros((5, 5))
-    covariance[np.ix_(found.free, found.free)] = found.covariance
+    used = [frames[k] for k in index]
+    by_camera = covariance_by_camera(
+        used, camera_sigma, found, lambda f: _matches(f, projector, seed, settings), prior, settings.fit
+    ) if any(camera_sigma) else 0.0  # fmt: skip
+    covariance[np.ix_(found.free, found.free)] = found.covariance + by_camera
     return ProjectorEstimate(
         found.projector,
         covariance,
@@ -144,8 +151,7 @@ def _refined(
         if len(firm) < settings.fewest_posed:
             return NoProjector("flat" if len(poses) >= settings.fewest_posed else "unknown", len(firm), np.inf, np.inf)
         index = [one.frame for one in firm]
-        most = min(settings.fit.most_per_frame, max(settings.fit.most // len(index), 1))
-        matches = Matches.of([frames[k] for k in index], device, settings.blocks, most, np.random.default_rng(seed))
+        matches = _matches([frames[k] for k in index], device, seed, settings)
         start = Poses.of([one.pose for one in firm])
         fit = JointProblem(matches, device, FOCAL_AND_CENTRE, prior, settings.fit).fit(start)
         change = np.abs(values_of(fit.projector) - values_of(device))[list(FOCAL_AND_CENTRE)]
@@ -153,6 +159,12 @@ def _refined(
         if (change < settings.settled * np.sqrt(np.diag(fit.covariance))).all():
             break
     return found
+
+
+def _matches(frames: Sequence[FrameMatches], device: Device, seed: int, settings: UnknownProjectorSettings) -> Matches:
+    """As many correspondences as the joint fit takes."""
+    most = min(settings.fit.most_per_frame, max(settings.fit.most // len(frames), 1))
+    return Matches.of(frames, device, settings.blocks, most, np.random.default_rng(seed))
 
 
 def _thinned(frame: FrameMatches, settings: UnknownProjectorSettings, rng: np.random.Generator) -> FrameMatches:

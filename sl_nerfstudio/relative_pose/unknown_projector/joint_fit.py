@@ -86,6 +86,13 @@ class JointProblem:
                 break
         return self._result(state, width)
 
+    def gauss_newton_step(self, poses: Poses) -> Float64[ndarray, "free"]:
+        """One whole step of the free intrinsics from where the problem begins; the poses follow."""
+        state = _State(values_of(self._projector), poses)
+        rays = self._rays(state.values)
+        reduced = self._reduced(state, rays, self._s.kernel_sigmas * self._noise(state, rays), 0.0)
+        return -np.linalg.solve(reduced.H, reduced.g)
+
     def _rays(self, values: Float64[ndarray, "5"]) -> RayPairs:
         return self._matches.rays(device_with(self._projector, values))
 

@@ -5,7 +5,7 @@ instead. A frame's own pose absorbs part of a wrong value; what several frames d
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -58,6 +58,12 @@ class IntrinsicsEvidence:
 
     projector: DeviceEvidence
     camera: DeviceEvidence
+
+    def allowing(self, doubt: Float64[ndarray, "3 3"]) -> "IntrinsicsEvidence":
+        """With stated values that are themselves uncertain; covariance of shares of the focal length."""
+        return IntrinsicsEvidence(
+            *(replace(one, covariance=one.covariance + doubt) for one in (self.projector, self.camera))
+        )
 
     def contradicts(self, settings: UnknownProjectorSettings = UNKNOWN_PROJECTOR_DEFAULTS) -> bool:
         """Whether the stated intrinsics cannot be right."""
