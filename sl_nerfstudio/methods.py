@@ -1,9 +1,8 @@
 """`ns-train sl-neus` and `ns-train sl-neus-paper`."""
 
-import warnings
 from typing import Any
 
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
@@ -11,9 +10,6 @@ from sl_nerfstudio.model.config import SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
-
-# nerfstudio 1.1.5 indexes its cameras in a way that torch has deprecated: ten lines of warning before every picture
-warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimensional indexing", module="nerfstudio")
 
 
 def _trainer(
@@ -24,7 +20,7 @@ def _trainer(
         method_name=method_name,
         max_num_iterations=iterations,
         machine=MachineConfig(device_type=default_device()),
-        logging=LoggingConfig(profiler="none"),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host="127.0.0.1"),  # nerfstudio listens on all networks
         vis="tensorboard",
         steps_per_save=1000,
