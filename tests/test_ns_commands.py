@@ -128,10 +128,24 @@ def test_training_saves_and_prints_the_next_commands(
     assert settings.data == root and settings.data.is_absolute()
     assert settings.output_dir.is_absolute()  # so that every command works from any folder
     assert settings.pipeline.model.schedule_iterations == 3
+    said, err = capfd.readouterr()
+    short = config.relative_to(tmp_path)
+    lines = said.replace(" \\\n     ", "").splitlines()  # long commands continue on the next line
+    assert [line[:12].strip() for line in said.splitlines() if not line.startswith(" ")] == [
+        "check", "adjust", "train", "result", "next:",
+    ]  # fmt: skip
+    assert f"  ns-viewer --load-config '{short}' --viewer.websocket-host 127.0.0.1" in lines
+    assert f"  sl-export --load-config '{short}' --output mesh.ply --poses refined" in lines
+    assert f"  sl-eval --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in lines
+    assert len(said.splitlines()) <= 30 and err == ""
+
+
+def test_everything_is_printed_on_request(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    train(monkeypatch, root, tmp_path, 1, "--verbose", True)
     said = capfd.readouterr().out
-    assert f"ns-viewer --load-config '{config}'" in said
-    assert f"sl-export --load-config '{config}' --output mesh.ply --poses refined/" in said
-    assert f"sl-eval   --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in said
+    assert "SLTrainerConfig(" in said and "ETA (time)" in said and "\ntrain       1 steps" in said
 
 
 def test_resumed_run_equals_an_uninterrupted_one(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
