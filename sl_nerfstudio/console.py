@@ -34,6 +34,11 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def figure(value: float) -> str:
+    """A number to three digits, without an exponent for usual sizes."""
+    return f"{float(f'{value:.3g}'):,.0f}" if 1000 <= abs(value) < 1e9 else f"{value:.3g}"
+
+
 def command(*words: object, indent: str = "  ") -> str:
     """A command to copy, quoted for a shell; one that is longer than 80 columns continues at its flags."""
     quoted = [shlex.quote(str(word)) for word in words]

@@ -15,8 +15,8 @@ def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
-    the captures, is always there, and so are `verdict` and `reasons`. `cross_frame` is the agreement of the frames with
-    each other.
+    the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
+    to capture next; `cross_frame` is the agreement of the frames with each other.
     """
     out: dict[str, Any] = {
         "format": 1,
@@ -35,6 +35,8 @@ def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
     if evaluation.initial_pose_errors is not None:
         out["initial"] = _poses(evaluation.initial_pose_errors)
     out["fit"] = asdict(evaluation.agreement)
+    if evaluation.completeness is not None:
+        out["coverage"] = evaluation.completeness.summary()
     if evaluation.cross is not None:
         out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
     return _finite(out)

@@ -12,6 +12,8 @@ from sl_nerfstudio.model.pose_refinement import PriorConfig
 from sl_nerfstudio.rendering.schedule import AnnealingConfig
 from sl_nerfstudio.rendering.settings import LossConfig, SamplingConfig
 
+RECOMMENDED_STEPS = {"sl-neus": 1000, "sl-neus-paper": 10_000}  # by method; the paper's is its own
+
 PoseMethod = Literal["adjust", "adjust-and-render", "render", "render-independently"]
 
 
