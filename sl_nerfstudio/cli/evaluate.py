@@ -3,12 +3,17 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.evaluation.completeness.next_view import NextView
+    from sl_nerfstudio.evaluation.evaluate import Evaluation
+    from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 
 _JSON_MARK, _REPORT_MARK = b'"format": 1,\n  "verdict"', b"<title>Scan report: "  # by which earlier results are known
 
@@ -68,10 +73,13 @@ def _evaluate(config: EvalConfig) -> None:
         config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
     )  # fmt: skip
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
-    judgement = judge(evaluation, hint, steps)
+    capture = _next_capture(evaluation, inputs)
+    judgement = judge(evaluation, hint, steps, capture)
     results: dict[Path, str] = {}
     if config.json:
-        results[config.json] = json.dumps(to_json(evaluation, judgement.verdict), indent=2, allow_nan=False) + "\n"
+        results[config.json] = (
+            json.dumps(to_json(evaluation, judgement.verdict, capture), indent=2, allow_nan=False) + "\n"
+        )
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
@@ -85,6 +93,22 @@ def _evaluate(config: EvalConfig) -> None:
     print(summary(evaluation, judgement, inputs.pose_sigma))
     for path in results:
         print(f"written: {path}")
+
+
+def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "NextView | None":
+    from sl_nerfstudio.evaluation.completeness.knowledge import View
+    from sl_nerfstudio.evaluation.completeness.next_view import next_view
+    from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+
+    found = evaluation.completeness
+    if found is None:
+        return None
+    poses = zip(inputs.poses.T_world_camera, inputs.poses.T_world_projector, strict=True)
+    frames = [
+        View(frame.camera, T_c, inputs.scan.projector, T_p)
+        for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
+    ]
+    return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)
 
 
 def _check(config: EvalConfig) -> None:

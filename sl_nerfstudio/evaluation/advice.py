@@ -4,6 +4,7 @@ import math
 
 from sl_nerfstudio.console import figure
 from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
+from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.verdict.judge import frame_band
 from sl_nerfstudio.verdict.settings import VerdictSettings
@@ -42,10 +43,9 @@ def _contradicts(evaluation: Evaluation, number: int) -> bool:
     return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number], VerdictSettings()) != "good"
 
 
-def capture_next(evaluation: Evaluation) -> str:
+def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
     """Where to capture next and what that would show; "" if nothing that no frame has seen would show."""
     found = evaluation.completeness
-    view = None if found is None else found.next_view
     if found is None or view is None:
         return ""
     whole = found.surface_area + float(found.openings.area.sum())
@@ -53,12 +53,12 @@ def capture_next(evaluation: Evaluation) -> str:
         return ""
     unit = "units" if evaluation.units == "arbitrary" else evaluation.units
     nearest = evaluation.agreement.frames[view.nearest].name
-    side, place = "one side", ""
+    side, way = f"the side {view.nearest_deg:.0f}° from {nearest}, the nearest frame", "it"
     if view.elevation_deg < -_STEEP_DEG:
-        side, place = "the underside", ", from below (turn the object over)"
+        side, way = "the underside", "it from below, or turn the object over"
     elif view.elevation_deg > _STEEP_DEG:
-        side, place = "the top", ", from above"
+        side, way = "the top", "it from above"
     return (
-        f"No frame sees {side}: capture it{place}, {view.nearest_deg:.0f}° from {nearest}, the nearest frame; this "
-        f"would show {view.new_area / view.unseen_area:.0%} of what no frame has seen ({figure(view.new_area)} {unit}²)"
+        f"No frame sees {side}: capture {way}; this would show {view.new_area / view.unseen_area:.0%} of what no frame "
+        f"has seen ({figure(view.new_area)} {unit}²)"
     )

@@ -92,7 +92,7 @@ def evaluate(
         initial_pose_errors=compare_poses(initial, true_poses) if true_poses and moved else None,
         starting_poses=not moved,
         cross=compare_scan_frames(scan, poses, sigma or [None] * len(scan.frames)),
-        completeness=assess_completeness(surface, scan, poses, agreement),
+        completeness=assess_completeness(surface, agreement),
     )
 
 

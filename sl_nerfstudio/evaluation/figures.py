@@ -34,6 +34,5 @@ def judged(
     elif sign * value <= sign * acceptable:
         band = "acceptable"
     text = form.format(value) if math.isfinite(value) else "none"
-    return JudgedFigure(
-        name, value, text, band, limit.format(f"{good:g}"), limit.format(f"{acceptable:g}"), meaning, advice
-    )
+    worst = limit.format(f"{acceptable:g}") if math.isfinite(acceptable) else "any"
+    return JudgedFigure(name, value, text, band, limit.format(f"{good:g}"), worst, meaning, advice)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from sl_nerfstudio.evaluation.advice import capture_next, disagreeing_frames
 from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
 from sl_nerfstudio.evaluation.completeness.figures import completeness_figures
+from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.figures import JudgedFigure, judged
 from sl_nerfstudio.evaluation.reference import MeshReference
@@ -35,10 +36,12 @@ class Judgement:
         return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad), *filter(None, [self.capture])]
 
 
-def judge(evaluation: Evaluation, intrinsics: str = "", steps: TrainedSteps | None = None) -> Judgement:
+def judge(
+    evaluation: Evaluation, intrinsics: str = "", steps: TrainedSteps | None = None, capture: NextView | None = None
+) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
-    `steps` says how long the surface was trained, None where that is not known.
+    `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -82,7 +85,7 @@ def judge(evaluation: Evaluation, intrinsics: str = "", steps: TrainedSteps | No
     verdict = worst(reasons)
     return Judgement(
         verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),
-        capture_next(evaluation),
+        capture_next(evaluation, capture),
     )  # fmt: skip
 
 

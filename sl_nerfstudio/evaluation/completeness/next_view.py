@@ -1,6 +1,6 @@
 """The capture that would reduce what is not known of a surface most: a search over views from all directions."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,6 @@ from sl_nerfstudio.evaluation.completeness.openings import Openings
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan import Scan
 
 _PLACES, _DIRECTIONS, _TURNS = 600, 48, 4
 _STILL = 0.01  # of the usual baseline: a projector that moves less stands still
@@ -34,19 +33,16 @@ class NextView:
     elevation_deg: float  # above the horizon; NaN where the cameras do not say what is up
 
 
-def next_view(
-    surface: IndexedMesh, openings: Openings, scan: Scan, poses: DevicePoses, noise_px: float
-) -> NextView | None:
+def next_view(surface: IndexedMesh, openings: Openings, frames: Sequence[View], noise_px: float) -> NextView | None:
     """The best of some hundred views as far away as the frames are; None if none would add anything.
 
     The projector is held as in the frame with the usual distance from the camera, or where it stands, if it stands
-    still. Nothing is known here about what is in the way of a tripod.
+    still. `noise_px` is the decoding's, in pattern pixels. Nothing is known here about what is in a tripod's way.
     """
     at, occluders = places(surface, openings, _PLACES), Occluders(surface, openings)
-    frames = [
-        View(frame.camera, T_c, scan.projector, T_p)
-        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    ]
+    poses = DevicePoses(
+        *(np.stack(T) for T in zip(*((f.T_world_camera, f.T_world_projector) for f in frames), strict=True))
+    )
     before = known(at, occluders, frames, noise_px)
     doubt = at.area / before
     best, most = None, 0.0
@@ -55,9 +51,7 @@ def next_view(
         removed = float((doubt - at.area / (before + added)).sum())
         if removed > most:
             best, most = (view, added), removed
-    if best is None:
-        return None
-    return _described(*best, most / float(doubt.sum()), at, before, surface, poses)
+    return None if best is None else _described(*best, most / float(doubt.sum()), at, before, surface, poses)
 
 
 def _described(
@@ -86,7 +80,7 @@ def _described(
     )
 
 
-def _candidates(surface: IndexedMesh, openings: Openings, frames: list[View], poses: DevicePoses) -> Iterator[View]:
+def _candidates(surface: IndexedMesh, openings: Openings, frames: Sequence[View], poses: DevicePoses) -> Iterator[View]:
     """Views from directions all around and from in front of the openings, each turned about its axis in four ways."""
     positions = poses.T_world_camera[:, :3, 3]
     distance = float(np.median(np.linalg.norm(positions - surface.centre, axis=1)))

@@ -9,13 +9,15 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.meshing.mesh import Mesh
 
+_SMOOTHING = 8  # steps, each over one edge: jags are one edge wide
+
 
 @dataclass(frozen=True)
 class Openings:
     """The connected borders of a mesh, the largest area first; lengths in the mesh's unit."""
 
     area: Float[ndarray, "n"]  # as seen along the normal
-    length: Float[ndarray, "n"]  # of the border
+    length: Float[ndarray, "n"]  # of the border, smoothed: triangles make it jagged
     centre: Float[ndarray, "n 3"]
     normal: Float[ndarray, "n 3"]  # unit, outward: where somebody stands who looks into the opening
     fan: Float[ndarray, "m 3 3"]  # corners of all closing triangles, counter-clockwise as seen from outside
@@ -32,9 +34,9 @@ def find_openings(mesh: Mesh) -> Openings:
     _, label = np.unique(label, return_inverse=True)
     count = int(label.max()) + 1 if len(label) else 0
     a, b = mesh.vertices[start], mesh.vertices[end]
-    length = np.linalg.norm(b - a, axis=1)
-    total = np.bincount(label, length, count)
-    centre = _sums(label, (a + b) / 2 * length[:, None], count) / np.maximum(total, 1e-300)[:, None]
+    edge = np.linalg.norm(b - a, axis=1)
+    total = np.maximum(np.bincount(label, edge, count), 1e-300)
+    centre = _sums(label, (a + b) / 2 * edge[:, None], count) / total[:, None]
     fan = np.stack([b, a, centre[label]], 1)  # against the direction of the faces beside the border
     cross = np.cross(fan[:, 1] - fan[:, 0], fan[:, 2] - fan[:, 0]) / 2
     normal = _sums(label, cross, count)
@@ -42,7 +44,9 @@ def find_openings(mesh: Mesh) -> Openings:
     normal /= np.maximum(area, 1e-300)[:, None]
     order = np.argsort(-area, kind="stable")
     rank = np.argsort(order)
-    return Openings(area[order], total[order], centre[order], normal[order], fan, rank[label])
+    smooth = _smoothed(mesh.vertices, start, end)
+    length = np.bincount(label, np.linalg.norm(smooth[end] - smooth[start], axis=1), count).astype(np.float64)
+    return Openings(area[order], length[order], centre[order], normal[order], fan, rank[label])
 
 
 def _border(mesh: Mesh) -> tuple[Int[ndarray, "e"], Int[ndarray, "e"]]:
@@ -54,5 +58,18 @@ def _border(mesh: Mesh) -> tuple[Int[ndarray, "e"], Int[ndarray, "e"]]:
     return start[single], end[single]
 
 
+def _smoothed(
+    vertices: Float[ndarray, "v 3"], start: Int[ndarray, "e"], end: Int[ndarray, "e"]
+) -> Float[ndarray, "v 3"]:
+    """Vertices on borders, each moved to the middle of its neighbours along the border, a few times."""
+    count = np.bincount(np.concatenate([start, end]), minlength=len(vertices))
+    some = count > 0
+    out = vertices.copy()
+    for _ in range(_SMOOTHING):
+        sums = _sums(np.concatenate([start, end]), np.concatenate([out[end], out[start]]), len(vertices))
+        out[some] = 0.5 * (out[some] + sums[some] / count[some, None])
+    return out
+
+
 def _sums(label: Int[ndarray, "e"], values: Float[ndarray, "e 3"], count: int) -> Float[ndarray, "n 3"]:
-    return np.stack([np.bincount(label, values[:, k], count) for k in range(3)], 1)
+    return np.stack([np.bincount(label, values[:, k], count) for k in range(3)], 1).astype(np.float64)
