@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, next_steps, short_path
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -151,7 +151,9 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         f"time: surface {exported.extraction_seconds:.1f} s, trimming and writing {exported.writing_seconds:.1f} s"
     )
     known = () if poses is None else ("--poses", poses)
-    evaluation = command("sl-eval", "--mesh", config.output, "--data", scan.root, *known, "--report", "report.html")
+    evaluation = command(
+        "sl-eval", "--mesh", config.output, "--data", short_path(scan.root), *known, "--report", "report.html"
+    )
     return "\n".join([*lines, next_steps([evaluation])])
 
 
