@@ -151,9 +151,8 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         f"time: surface {exported.extraction_seconds:.1f} s, trimming and writing {exported.writing_seconds:.1f} s"
     )
     known = () if poses is None else ("--poses", poses)
-    evaluation = command(
-        "sl-eval", "--mesh", config.output, "--data", short_path(scan.root), *known, "--report", "report.html"
-    )
+    given = ("--mesh", config.output, "--data", short_path(scan.root), *known)
+    evaluation = command("sl-eval", *given, "--report", "report.html")
     return "\n".join([*lines, next_steps([evaluation])])
 
 

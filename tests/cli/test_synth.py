@@ -32,7 +32,7 @@ def test_a_small_scan(monkeypatch, tmp_path, capsys):
         "--autocalibration-error", 0, 0, 0, "--noise", 0, "--missing", 0, "--wrong", 0, "--projector-model", "DOE",
     )  # fmt: skip
     said = capsys.readouterr().out.replace(" \\\n     ", "")  # a long command continues on the next line
-    assert said == f"wrote 2 frames to {out}\nnext:\n  ns-train sl-neus --data {out}\n"
+    assert said == f"wrote 2 frames to {out}\nnext:\n  ns-train sl-neus --data '{out}'\n"
     scan = read_scan(out)
     assert len(scan.frames) == 2 and scan.units == "cm" and scan.projector.model == "DOE"
     assert scan.frames[0].camera.w == 32
