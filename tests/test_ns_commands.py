@@ -407,11 +407,27 @@ def test_export_cameras_gives_the_refined_poses(
         np.testing.assert_allclose([f["transform"] for f in frames], refined[:, :3].numpy(), atol=1e-5)
 
 
-def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline) -> None:
+def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command itself needs CUDA on any machine; these are the two attributes of a model that it uses."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert hasattr(pipeline.model.config, "sdf_field")
     p = torch.rand(100, 3) * 2 - 1
     torch.testing.assert_close(pipeline._sl_model.field.forward_geonetwork(p)[:, 0], pipeline._sl_model.sdf(p))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
+def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        call(
+            ns_export.entrypoint,
+            monkeypatch,
+            *("marching-cubes", "--load-config", config, "--output-dir", tmp_path),
+        )
+    err = capfd.readouterr().err
+    assert end.value.code == 1 and len(err.splitlines()) == 1
+    assert err.startswith("error: ns-export marching-cubes needs a GPU") and "sl-export --load-config" in err
 
 
 def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
