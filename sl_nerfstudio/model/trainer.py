@@ -52,8 +52,8 @@ class SLTrainerConfig(TrainerConfig):
     """Number of the run's last step, set when the run begins; --load-config continues up to it."""
 
     def __post_init__(self) -> None:
-        """Silence nerfstudio once a command line with a scan was read: it prints before it calls `set_timestamp`."""
-        if self.data is not None:
+        """Silence nerfstudio once a command line was read: it prints before it calls `set_timestamp`."""
+        if self.data is not None or self.load_config is not None:
             quiet_nerfstudio(not self.verbose)
 
     def set_timestamp(self) -> None:
