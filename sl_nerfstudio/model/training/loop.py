@@ -80,8 +80,11 @@ class SLTrainer(Trainer):
 
     def _adjust_poses(self) -> None:
         samples = self.pipeline.datamanager.samples
-        with _shown_phase("adjust") as shown:
-            shown.say(self._model.adjust_poses(samples) or "poses are left as they are")
+        if self._model.config.adjusts_poses:
+            with _shown_phase("adjust") as shown:
+                shown.say(self._model.adjust_poses(samples))
+        else:
+            self._model.adjust_poses(samples)
         with INTERRUPTION.held():
             self._model.measure_noise(samples)
             self.save_checkpoint(-1)
