@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SHOW_AFTER_SECONDS = 2.0
-PLAIN_SECONDS = 10.0  # between two lines of progress where there is no terminal
+PLAIN_SECONDS = 9.0  # between two lines of progress where there is no terminal: ten with what lies between phases
 _RECENT_SECONDS = 30.0  # over which the speed is measured
 _shown = False  # one bar at a time: nested bars would overwrite the same line
 _phase: "Phase | None" = None  # the one that runs: loops inside it are its progress
@@ -66,7 +66,7 @@ class Phase:
 
 @contextmanager
 def phase(name: str) -> Iterator[Phase]:
-    """Show a part of a command while it runs: a bar on a terminal, else a line every ten seconds.
+    """Show a part of a command while it runs: a bar on a terminal, else a line every nine seconds.
 
     When it ends without an error, `say` and how long it took are printed on standard output. Loops of `track` inside
     it are shown as its progress.
@@ -86,7 +86,7 @@ def phase(name: str) -> Iterator[Phase]:
 
 @contextmanager
 def _plain(found: Phase) -> Iterator[None]:
-    """Print a line every ten seconds until the block ends."""
+    """Print a line every nine seconds until the block ends."""
     ended = threading.Event()
 
     def lines() -> None:
