@@ -1,30 +1,25 @@
 """`ns-train sl-neus` and `ns-train sl-neus-paper`."""
 
-import warnings
 from typing import Any
 
-from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.model.config import SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
+from sl_nerfstudio.model.settings import RECOMMENDED_STEPS
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 
-# nerfstudio 1.1.5 indexes its cameras in a way that torch has deprecated: ten lines of warning before every picture
-warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimensional indexing", module="nerfstudio")
 
-
-def _trainer(
-    method_name: str, model: SLModelConfig, rays: int, iterations: int, optimizers: dict[str, Any]
-) -> SLTrainerConfig:
+def _trainer(method_name: str, model: SLModelConfig, rays: int, optimizers: dict[str, Any]) -> SLTrainerConfig:
     """A run that trains, saves, prints where the result is, and returns; meanwhile evaluated on held-out pixels."""
     return SLTrainerConfig(
         method_name=method_name,
-        max_num_iterations=iterations,
+        max_num_iterations=RECOMMENDED_STEPS[method_name],
         machine=MachineConfig(device_type=default_device()),
-        logging=LoggingConfig(profiler="none"),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host="127.0.0.1"),  # nerfstudio listens on all networks
         vis="tensorboard",
         steps_per_save=1000,
@@ -45,7 +40,6 @@ sl_neus = MethodSpecification(
         "sl-neus",
         SLModelConfig(),
         rays=4096,
-        iterations=1000,
         optimizers={
             "table": _group(RowAdamOptimizerConfig(lr=1e-3), DecaySchedulerConfig(final=0.002)),
             "mlp": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.002)),
@@ -68,7 +62,6 @@ sl_neus_paper = MethodSpecification(
         "sl-neus-paper",
         paper_model(),
         rays=2024,
-        iterations=10_000,
         optimizers={
             "table": _paper_group(5e-4),
             "mlp": _paper_group(5e-4),

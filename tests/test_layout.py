@@ -13,9 +13,10 @@ PACKAGE = ROOT / "sl_nerfstudio"
 
 # Folders in the order in which data passes through them: each imports only from itself and from those before it.
 LAYERS = (
-    "errors", "progress", "threads", "compiled", "files", "geometry", "scan", "pattern", "synthesis", "decoding",
-    "capture", "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict", "object_separation",
-    "processing", "field", "rendering", "dataparser", "model", "meshing", "runs", "evaluation", "cli", "methods",
+    "errors", "console", "progress", "threads", "compiled", "files", "geometry", "scan", "pattern", "synthesis",
+    "decoding", "capture", "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict",
+    "object_separation", "processing", "field", "rendering", "dataparser", "model", "meshing", "runs", "evaluation",
+    "cli", "methods",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds
 MOST_LINES, MOST_FILES = 400, 20

@@ -128,10 +128,24 @@ def test_training_saves_and_prints_the_next_commands(
     assert settings.data == root and settings.data.is_absolute()
     assert settings.output_dir.is_absolute()  # so that every command works from any folder
     assert settings.pipeline.model.schedule_iterations == 3
+    said, err = capfd.readouterr()
+    short = config.relative_to(tmp_path)
+    lines = said.replace(" \\\n     ", "").splitlines()  # long commands continue on the next line
+    assert [line[:12].strip() for line in said.splitlines() if not line.startswith(" ")] == [
+        "check", "adjust", "train", "result", "next:",
+    ]  # fmt: skip
+    assert f"  ns-viewer --load-config '{short}' --viewer.websocket-host 127.0.0.1" in lines
+    assert f"  sl-export --load-config '{short}' --output mesh.ply --poses refined" in lines
+    assert f"  sl-eval --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in lines
+    assert len(said.splitlines()) <= 30 and err == ""
+
+
+def test_everything_is_printed_on_request(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    train(monkeypatch, root, tmp_path, 1, "--verbose", True)
     said = capfd.readouterr().out
-    assert f"ns-viewer --load-config '{config}'" in said
-    assert f"sl-export --load-config '{config}' --output mesh.ply --poses refined/" in said
-    assert f"sl-eval   --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in said
+    assert "SLTrainerConfig(" in said and "ETA (time)" in said and "\ntrain       1 steps" in said
 
 
 def test_resumed_run_equals_an_uninterrupted_one(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -393,11 +407,27 @@ def test_export_cameras_gives_the_refined_poses(
         np.testing.assert_allclose([f["transform"] for f in frames], refined[:, :3].numpy(), atol=1e-5)
 
 
-def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline) -> None:
+def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command itself needs CUDA on any machine; these are the two attributes of a model that it uses."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert hasattr(pipeline.model.config, "sdf_field")
     p = torch.rand(100, 3) * 2 - 1
     torch.testing.assert_close(pipeline._sl_model.field.forward_geonetwork(p)[:, 0], pipeline._sl_model.sdf(p))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
+def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        call(
+            ns_export.entrypoint,
+            monkeypatch,
+            *("marching-cubes", "--load-config", config, "--output-dir", tmp_path),
+        )
+    err = capfd.readouterr().err
+    assert end.value.code == 1 and len(err.splitlines()) == 1
+    assert err.startswith("error: ns-export marching-cubes needs a GPU") and "sl-export --load-config" in err
 
 
 def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

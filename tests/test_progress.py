@@ -1,11 +1,12 @@
 import io
 import sys
+import time
 from collections.abc import Iterator
 
 import pytest
 
 from sl_nerfstudio import progress
-from sl_nerfstudio.progress import track
+from sl_nerfstudio.progress import Phase, phase, track
 
 
 class Terminal(io.StringIO):
@@ -65,3 +66,63 @@ def test_leaving_a_loop_early_releases_the_bar(monkeypatch: pytest.MonkeyPatch) 
         if item == 4:
             break
     assert progress._shown is False
+
+
+def wait_for(said: str, stream: Terminal) -> None:
+    until = time.monotonic() + 20
+    while said not in stream.getvalue() and time.monotonic() < until:
+        time.sleep(0.01)
+
+
+def test_a_phase_prints_lines_where_there_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", log)
+    monkeypatch.setattr(progress, "PLAIN_SECONDS", 0.01)
+    with phase("train") as shown:
+        shown.update(3, 100, "coordinates to 0.5 px")
+        wait_for("3 of 100", log)
+        for _ in track(range(7), "Reading frames"):
+            wait_for("reading frames", log)
+        shown.say("100 steps")
+    lines = log.getvalue().splitlines()
+    assert "train       3 of 100, coordinates to 0.5 px" in lines
+    assert any(line.startswith("train       0 of 7, reading frames") for line in lines)
+    assert capsys.readouterr().out == "train       100 steps\n"
+
+
+def test_a_phase_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    terminal = use_terminal(monkeypatch)
+    with phase("adjust") as shown:
+        shown.update(1, 4)
+        shown.update(2, 4)
+        wait_for("2 of 4", terminal)
+    assert "adjust" in terminal.getvalue() and "\n\n" not in terminal.getvalue()
+    assert "adjust      done" in capsys.readouterr().out + terminal.getvalue()
+
+
+def test_a_phase_that_fails_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ZeroDivisionError), phase("check") as shown:
+        shown.say("no faults")
+        raise ZeroDivisionError
+    assert capsys.readouterr() == ("", "")
+    assert progress._phase is None
+
+
+def test_the_time_left_follows_from_the_latest_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    shown = Phase("train", started=0.0)
+    assert shown.seconds_left is None and shown.state() == ""
+    now[0] = 25.0  # what came before the first step does not count
+    for step in range(101):
+        shown.update(step, 1000)
+        now[0] += 0.5
+    assert shown.seconds_left == pytest.approx(450)
+    for step in range(101, 301):
+        shown.update(step, 1000)
+        now[0] += 2.0
+    assert shown.seconds_left == pytest.approx(1400) and shown.state() == "300 of 1000, 23 min 20 s left"
+    shown.update(0, 20)  # another loop
+    assert shown.seconds_left is None

@@ -11,8 +11,9 @@ from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
+    from sl_nerfstudio.evaluation.completeness.next_view import NextView
     from sl_nerfstudio.evaluation.evaluate import Evaluation
-    from sl_nerfstudio.verdict.verdict import Verdict
+    from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 
 _JSON_MARK, _REPORT_MARK = b'"format": 1,\n  "verdict"', b"<title>Scan report: "  # by which earlier results are known
 
@@ -40,6 +41,8 @@ class EvalConfig:
     """Number of points spread over each surface to measure distances."""
     seed: int = 0
     """Random seed of these points; the same seed gives the same figures."""
+    verbose: bool = False
+    """Also print tables of all distances, pose errors and residuals."""
 
 
 def evaluate_scan(config: EvalConfig) -> None:
@@ -53,12 +56,14 @@ def evaluate_scan(config: EvalConfig) -> None:
 
 
 def _evaluate(config: EvalConfig) -> None:
+    from sl_nerfstudio.cli.evaluate_words import print_tables, summary
     from sl_nerfstudio.evaluation.evaluate import evaluate
     from sl_nerfstudio.evaluation.inputs import read_inputs
     from sl_nerfstudio.evaluation.judgement import judge
     from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
     from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
+    from sl_nerfstudio.evaluation.training_steps import trained_steps
     from sl_nerfstudio.files.atomic import write_atomic
 
     inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
@@ -67,10 +72,14 @@ def _evaluate(config: EvalConfig) -> None:
         inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
         config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
     )  # fmt: skip
-    judgement = judge(evaluation, intrinsics_hint(inputs.training, inputs.scan))
+    hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
+    capture = _next_capture(evaluation, inputs)
+    judgement = judge(evaluation, hint, steps, capture)
     results: dict[Path, str] = {}
     if config.json:
-        results[config.json] = json.dumps(to_json(evaluation, judgement.verdict), indent=2, allow_nan=False) + "\n"
+        results[config.json] = (
+            json.dumps(to_json(evaluation, judgement.verdict, capture), indent=2, allow_nan=False) + "\n"
+        )
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
@@ -79,7 +88,27 @@ def _evaluate(config: EvalConfig) -> None:
         )
     for path, text in results.items():
         write_atomic(path, text.encode())
-    print_summary(evaluation, judgement.verdict, list(results))
+    if config.verbose:
+        print_tables(evaluation)
+    print(summary(evaluation, judgement, inputs.pose_sigma))
+    for path in results:
+        print(f"written: {path}")
+
+
+def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "NextView | None":
+    from sl_nerfstudio.evaluation.completeness.knowledge import View
+    from sl_nerfstudio.evaluation.completeness.next_view import next_view
+    from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+
+    found = evaluation.completeness
+    if found is None:
+        return None
+    poses = zip(inputs.poses.T_world_camera, inputs.poses.T_world_projector, strict=True)
+    frames = [
+        View(frame.camera, T_c, inputs.scan.projector, T_p)
+        for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
+    ]
+    return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)
 
 
 def _check(config: EvalConfig) -> None:
@@ -102,62 +131,6 @@ def _check(config: EvalConfig) -> None:
         raise UserError(
             f"--reference: {config.reference} is an .npy file\n    remedy: give an .npz file with the key xyz"
         )
-
-
-def print_summary(evaluation: "Evaluation", verdict: "Verdict", written: list[Path]) -> None:
-    """Print the main figures as tables."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    units = evaluation.truth_units
-    if evaluation.surface:
-        table = Table(title=f"Distances in {units}", title_justify="left")
-        for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):
-            table.add_column(column, justify="right" if column.strip() else "left")
-        for name, score in evaluation.surface.items():
-            a, c = score.accuracy, score.completeness
-            chamfer, scale = f"{score.chamfer:.3g}", f"{score.scale:.5f}"
-            table.add_row(name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale)
-            table.add_row("", "completeness", *(f"{v:.3g}" for v in (c.mean, c.median, c.rmse, c.p95)), "", "")
-        console.print(table)
-    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
-    if any(errors for _, errors in rows):
-        table = Table(title=f"Pose errors, RMS, in {units}", title_justify="left")
-        for column in ("", "camera", "deg", "projector", "deg", "scale"):
-            table.add_column(column, justify="right" if column else "left")
-        for name, errors in rows:
-            if errors is not None:
-                values = [
-                    v for d in (errors.camera, errors.projector) for v in (d.translation_rmse, d.rotation_rmse_deg)
-                ]
-                table.add_row(name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %")
-        console.print(table)
-    agreement = evaluation.agreement
-    table = Table(title="Agreement with the captures", title_justify="left")
-    for column in (
-        "coordinates px (median)",
-        "95 %",
-        "epipolar px (median)",
-        "pattern cosine",
-        "covered",
-        "worst hole",
-    ):
-        table.add_column(column, justify="right")
-    table.add_row(
-        f"{agreement.coordinate_px_median:.3f}",
-        f"{agreement.coordinate_px_p95:.3f}",
-        f"{agreement.epipolar_px_median:.3f}",
-        f"{agreement.pattern_cosine:.4f}",
-        f"{agreement.hit_share:.1%}",
-        f"{max(frame.largest_hole for frame in agreement.frames):.1%}",
-    )
-    console.print(table)
-    console.print(f"verdict: {verdict.band}", highlight=False)
-    for reason in verdict.reasons:
-        console.print(f"  {reason}", highlight=False, soft_wrap=True, markup=False)
-    for path in written:
-        console.print(f"written: {path}", highlight=False, soft_wrap=True)
 
 
 def main() -> None:

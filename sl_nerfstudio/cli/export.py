@@ -1,7 +1,6 @@
 """sl-export: the surface and the refined poses of a training run, in the scan's own unit and axes."""
 
 import os
-import shlex
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import command, next_steps, short_path
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -150,9 +150,10 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
     lines.append(
         f"time: surface {exported.extraction_seconds:.1f} s, trimming and writing {exported.writing_seconds:.1f} s"
     )
-    flags = f"--mesh {shlex.quote(str(config.output))} --data {shlex.quote(str(scan.root))}"
-    flags += "" if poses is None else f" --poses {shlex.quote(str(poses))}"
-    return "\n".join([*lines, "next:", f"  sl-eval {flags} --report report.html"])
+    known = () if poses is None else ("--poses", poses)
+    given = ("--mesh", config.output, "--data", short_path(scan.root), *known)
+    evaluation = command("sl-eval", *given, "--report", "report.html")
+    return "\n".join([*lines, next_steps([evaluation])])
 
 
 def _removed(trimmed: "Trimmed | None") -> list[str]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import command, next_steps
 from sl_nerfstudio.processing.config import ProcessConfig
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def closing_words(result: "ProcessResult") -> str:
         f"report: {output / 'processing.html'}\n"
         f"decoded frames and poses are kept in {result.config.work_folder} for the next run; remove this folder once "
         "you are happy with the scan\n"
+        f"{next_steps([command('ns-train', 'sl-neus', '--data', output)])}\n"
     )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import command, next_steps
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 
@@ -40,6 +41,15 @@ def _synthesise() -> None:
         return
     synthesise(arguments.config, arguments.output)
     print(f"wrote {arguments.config.frames} frames to {arguments.output}")
+    print(next_steps([_next(arguments.output, arguments.config)]))
+
+
+def _next(output: Path, config: SynthConfig) -> str:
+    """The command that goes on with what was made."""
+    if not config.images_only:
+        return command("ns-train", "sl-neus", "--data", output)
+    files = ("--images", output / "images", "--pattern", output / "pattern.json")
+    return command("sl-process", *files, "--intrinsics", output / "intrinsics.json", "--output", "scan")
 
 
 if __name__ == "__main__":

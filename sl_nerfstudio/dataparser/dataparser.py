@@ -1,5 +1,6 @@
 """`sl-data`: a scan folder as nerfstudio's dataparser. Must not import datamanagers, trainer or methods."""
 
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,11 @@ from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import Scan, read_scan
 from sl_nerfstudio.scan.intrinsics import device_problems
+
+# nerfstudio 1.1.5 uses what torch has deprecated, and a user can do nothing about it. Every command of it imports this
+# module before those parts.
+warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.", FutureWarning, module="nerfstudio")
+warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimensional indexing", module="nerfstudio")
 
 
 @dataclass

@@ -15,6 +15,7 @@ from sl_nerfstudio.evaluation.capture_agreement import (
     FrameAgreement,
     compare_captures,
 )
+from sl_nerfstudio.evaluation.completeness.completeness import Completeness, assess_completeness
 from sl_nerfstudio.evaluation.frame_pixels import FramePixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
@@ -43,6 +44,7 @@ class Evaluation:
     initial_pose_errors: PoseErrors | None  # of the scan's own poses, if others were evaluated
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
     cross: CrossFrameAgreement | None = None  # of the frames with each other, under the evaluated poses
+    completeness: Completeness | None = None
 
     @property
     def truth_units(self) -> str:
@@ -90,6 +92,7 @@ def evaluate(
         initial_pose_errors=compare_poses(initial, true_poses) if true_poses and moved else None,
         starting_poses=not moved,
         cross=compare_scan_frames(scan, poses, sigma or [None] * len(scan.frames)),
+        completeness=assess_completeness(surface, agreement),
     )
 
 

@@ -2,31 +2,21 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
+from sl_nerfstudio.evaluation.advice import capture_next, disagreeing_frames
 from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
+from sl_nerfstudio.evaluation.completeness.figures import completeness_figures
+from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.figures import JudgedFigure, judged
 from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.evaluation.training_steps import TrainedSteps, training_figure
 from sl_nerfstudio.verdict.judge import cross_reasons
 from sl_nerfstudio.verdict.settings import VerdictSettings
 from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, worst
 
 ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
 _ORDER: dict[str, int] = {"good": 0, "unknown": 1, "acceptable": 1, "poor": 2}
-
-
-@dataclass(frozen=True)
-class JudgedFigure:
-    """One figure, with its judgement."""
-
-    name: str
-    value: float
-    text: str  # the value with its unit
-    band: Band | Literal["unknown"]  # unknown: the figure does not exist
-    good: str  # the limit of "good", in words
-    acceptable: str
-    meaning: str
-    advice: str  # what to do if it is not good
 
 
 @dataclass(frozen=True)
@@ -37,39 +27,44 @@ class Judgement:
     sentence: str
     figures: tuple[JudgedFigure, ...]
     hints: tuple[str, ...] = ()  # explanations that come before the advice of the figures
+    capture: str = ""  # the capture that would add most, "" if none would
 
     @property
     def next_steps(self) -> list[str]:
-        """What to do, most urgent first; empty for a good scan."""
+        """What to do, most urgent first; empty for a good scan that no further capture would complete."""
         bad = sorted((c for c in self.figures if _ORDER[c.band]), key=lambda c: -_ORDER[c.band])
-        return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad)]
+        return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad), *filter(None, [self.capture])]
 
 
-def judge(evaluation: Evaluation, intrinsics: str = "") -> Judgement:
+def judge(
+    evaluation: Evaluation, intrinsics: str = "", steps: TrainedSteps | None = None, capture: NextView | None = None
+) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
+
+    `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
     fit = evaluation.agreement
     figures = [
-        _judged(
+        judged(
             "Coordinate residual", fit.coordinate_px_median, "{:.2f} px", 0.6, 1.5, "≤ {} px",
             "Median distance between where the surface puts a pattern point and where it was decoded.",
             "the surface does not match the captures: train longer, check the poses and the lens data, or decode "
             "again",
         ),
-        _judged(
+        judged(
             "Epipolar residual", fit.epipolar_px_median, "{:.2f} px", 0.5, 1.2, "≤ {} px",
             "Median distance of decoded points from their epipolar curve: it depends on the pose of each projector "
             "relative to its camera, and not on the surface.",
             "refine the poses (refine-poses free), and check the intrinsics of camera and projector",
         ),
-        _judged(
+        judged(
             "Pattern agreement", fit.pattern_cosine, "{:.3f}", 0.9, 0.75, "≥ {}",
             "Cosine between captured and rendered pattern over all lit pixels; 1 is identical up to brightness.",
             "look at the pictures below: blur, ambient light or a wrong pattern file reduce it",
         ),
-        _judged(
+        judged(
             "Coverage", 100 * fit.hit_share, "{:.1f} %", 97.0, 85.0, "≥ {} %",
             "Share of the pixels with pattern on the object at which the mesh has a surface.",
             "export with --keep-unobserved to see whether too much of the surface was removed; otherwise add frames "
@@ -77,6 +72,8 @@ def judge(evaluation: Evaluation, intrinsics: str = "") -> Judgement:
         ),
         *(judge_worst(figure, evaluation) for figure in WORST_FRAME),
         _geometry(evaluation),
+        *([] if evaluation.completeness is None else completeness_figures(evaluation.completeness, evaluation.units)),
+        *([] if steps is None else [training_figure(steps)]),
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
@@ -87,26 +84,9 @@ def judge(evaluation: Evaluation, intrinsics: str = "") -> Judgement:
         reasons += cross_reasons(names, evaluation.cross, VerdictSettings())
     verdict = worst(reasons)
     return Judgement(
-        verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics)
-    )
-
-
-def _judged(
-    name: str, value: float, form: str, good: float, acceptable: float, limit: str, meaning: str, advice: str
-) -> JudgedFigure:
-    """Judge `value`; whether larger is better follows from the order of the limits."""
-    sign = 1 if good < acceptable else -1
-    band: Band | Literal["unknown"] = "poor"
-    if not math.isfinite(value):
-        band = "unknown"
-    elif sign * value <= sign * good:
-        band = "good"
-    elif sign * value <= sign * acceptable:
-        band = "acceptable"
-    text = form.format(value) if math.isfinite(value) else "none"
-    return JudgedFigure(
-        name, value, text, band, limit.format(f"{good:g}"), limit.format(f"{acceptable:g}"), meaning, advice
-    )
+        verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),
+        capture_next(evaluation, capture),
+    )  # fmt: skip
 
 
 def _accuracy(evaluation: Evaluation) -> JudgedFigure:
@@ -116,7 +96,7 @@ def _accuracy(evaluation: Evaluation) -> JudgedFigure:
     rmse = score.accuracy.rmse if exact else score.completeness.rmse
     percent = 100 * rmse / reference.size if reference is not None else math.nan
     way = "of the surface from the truth" if exact else "of the reference points from the surface"
-    return _judged(
+    return judged(
         "Accuracy" if exact else "Distance from reference", percent,
         f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.truth_units})", 0.25, 1.0,
         "≤ {} %", f"RMS distance {way} after {ALIGNED[evaluation.alignment]}, in percent of the size of the reference.",
@@ -183,15 +163,15 @@ def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation) -> JudgedFigur
         value, form, limit = value / usual if usual > 0 else math.nan, "{:.1f} times the median", "{} times"
     else:
         value, form, limit = 100 * value, "{:.1f} %", "{} %"
-    return _judged(
+    return judged(
         figure.name, value, f"{form} ({name})", figure.good, figure.acceptable, f"{'≤' if sign > 0 else '≥'} {limit}",
-        figure.meaning, f"look at {name or 'it'} below: {figure.advice}",
+        figure.meaning, f"look at {name or 'it'} in the report: {figure.advice}",
     )  # fmt: skip
 
 
 def _geometry(evaluation: Evaluation) -> JudgedFigure:
     fit = evaluation.agreement
-    return _judged(
+    return judged(
         "Ray angle", fit.ray_angle_deg, "{:.1f}°", 8.0, 4.0, "≥ {}°",
         f"Angle between camera ray and projector ray on the surface (median). Here one pattern pixel corresponds to "
         f"{fit.depth_per_px:.3g} {evaluation.units} of depth; where that is a lot, a low residual proves little.",
@@ -209,7 +189,7 @@ def _hints(evaluation: Evaluation, band: Band, intrinsics: str) -> tuple[str, ..
         )
     if intrinsics:
         hints.append(intrinsics)
-    return tuple(hints)
+    return (*hints, *disagreeing_frames(evaluation))
 
 
 def _sentence(band: Band, evaluation: Evaluation) -> str:

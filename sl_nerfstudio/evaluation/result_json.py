@@ -4,19 +4,21 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+from sl_nerfstudio.evaluation.completeness.completeness import Completeness
+from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
 from sl_nerfstudio.verdict.verdict import Verdict
 
 
-def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
+def to_json(evaluation: Evaluation, verdict: Verdict, capture: NextView | None = None) -> dict[str, Any]:
     """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
-    the captures, is always there, and so are `verdict` and `reasons`. `cross_frame` is the agreement of the frames with
-    each other.
+    the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
+    to capture next; `cross_frame` is the agreement of the frames with each other.
     """
     out: dict[str, Any] = {
         "format": 1,
@@ -35,9 +37,37 @@ def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
     if evaluation.initial_pose_errors is not None:
         out["initial"] = _poses(evaluation.initial_pose_errors)
     out["fit"] = asdict(evaluation.agreement)
+    if evaluation.completeness is not None:
+        out["coverage"] = _coverage(evaluation.completeness) | {"next_capture": _capture(capture)}
     if evaluation.cross is not None:
         out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
     return _finite(out)
+
+
+def _coverage(found: Completeness) -> dict[str, Any]:
+    o = found.openings
+    openings = {
+        "count": len(o),
+        "area": float(o.area.sum()),
+        "boundary_length": float(o.length.sum()),
+        "largest_area": found.rim_area,
+        "largest_boundary_length": float(o.length[:1].sum()),
+    }
+    return {"observed": found.observed, "surface_area": found.surface_area, "openings": openings}
+
+
+def _capture(view: NextView | None) -> dict[str, Any] | None:
+    if view is None:
+        return None
+    return {
+        "transform_matrix": view.T_world_camera.tolist(),
+        "projector_transform_matrix": view.T_world_projector.tolist(),
+        "new_area": view.new_area,
+        "unseen_area": view.unseen_area,
+        "removed_share": view.removed,
+        "degrees_from_nearest_frame": view.nearest_deg,
+        "elevation_deg": view.elevation_deg,
+    }
 
 
 def _surface(score: SurfaceScore) -> dict[str, Any]:

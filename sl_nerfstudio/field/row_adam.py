@@ -43,6 +43,16 @@ class RowAdam(Optimizer):
                     self._step(parameter, group["lr"], beta1, beta2, group["eps"])
         return loss
 
+    def state_dict(self) -> dict[str, Any]:  # pyright: ignore
+        """As torch's, but only with the rows that any step has touched: the others are zero."""
+        whole = super().state_dict()
+        return {**whole, "state": {key: _packed(state) for key, state in whole["state"].items()}}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue from a state, packed or whole."""
+        states = {key: _unpacked(state) for key, state in state_dict["state"].items()}
+        super().load_state_dict({**state_dict, "state": states})
+
     def _step(self, parameter: nn.Parameter, lr: float, beta1: float, beta2: float, eps: float) -> None:
         state = self.state[parameter]
         if not state:
@@ -54,6 +64,26 @@ class RowAdam(Optimizer):
             _step_marked(parameter, buffer, state, corrections, lr, beta1, beta2, eps)
         else:
             _step_any(parameter, state, torch.from_numpy(corrections), lr, beta1, beta2, eps)
+
+
+def _packed(state: dict[str, Tensor]) -> dict[str, Any]:
+    steps = state["steps"]
+    touched = steps.nonzero()[:, 0]
+    return {
+        "rows": len(steps),
+        "touched": touched.to(torch.int32),
+        "moments": state["moments"][touched],
+        "steps": steps[touched].to(torch.int32),
+    }
+
+
+def _unpacked(state: dict[str, Any]) -> dict[str, Tensor]:
+    if "touched" not in state:
+        return state
+    touched, some = state["touched"].long(), state["moments"]
+    moments, steps = some.new_zeros(state["rows"], *some.shape[1:]), some.new_zeros(state["rows"])
+    moments[touched], steps[touched] = some, state["steps"].to(some)
+    return {"moments": moments, "steps": steps}
 
 
 @lru_cache(maxsize=4)

@@ -39,6 +39,11 @@ class History(nn.Module):
             self.state[1] *= 2
         self.state[0] = used
 
+    def latest(self, name: str) -> float:
+        """The value of the last row, NaN if there is none."""
+        used = int(self.state[0])
+        return float(self.table[used - 1, 1 + self.names.index(name)]) if used else float("nan")
+
     def curves(self) -> dict[str, list[float]]:
         """Columns by name, `step` first."""
         rows = self.table[: int(self.state[0])].cpu()

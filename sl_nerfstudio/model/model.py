@@ -125,12 +125,12 @@ class SLModel(Model):
     # ---- training
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """`table` and `mlp` of the field, and the poses."""
+        """`table` and `mlp` of the field, and those poses that the rendering losses move."""
+        steps = {"camera_opt": self.device_poses.camera_step, "projector_opt": self.device_poses.projector_step}
         return {
             "table": [self.field.encoding.table],
             "mlp": list(self.field.mlp.parameters()),
-            "camera_opt": [self.device_poses.camera_step],
-            "projector_opt": [self.device_poses.projector_step],
+            **{name: [step] for name, step in steps.items() if step.requires_grad},
         }
 
     def get_training_callbacks(
@@ -144,21 +144,25 @@ class SLModel(Model):
         self.adjust_poses(samples)
         self.measure_noise(samples)
 
-    def adjust_poses(self, samples: Any) -> None:
-        """The first half of `start`, which takes longest: all poses together, if the settings say so."""
+    def adjust_poses(self, samples: Any) -> str:
+        """The first half of `start`, which takes longest: all poses together, if the settings say so.
+
+        Returns what was found, in words.
+        """
+        said: list[str] = []
         c, rig = self.config, scene_rig(self.scan, self.S_scene_world)
         if c.adjusts_poses and len(self.scan.frames) > 1:
             found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             rig = found.rig
             self.device_poses.note(found.sigma, found.intrinsics)
             cameras = [frame.camera for frame in self.scan.frames]
-            said = [poses_message(found)]
+            said.append(poses_message(found))
             if found.intrinsics is not None:
                 said.append(contradiction_message(found.intrinsics, cameras, self.scan.projector))
-            print("\n".join(filter(None, said)), flush=True)
         if c.renders_poses:
             rig = constrained(c.refine_poses, rig)
         self.device_poses.rebase(rig.T_world_camera, rig.T_world_projector)
+        return "\n".join(filter(None, said))
 
     def measure_noise(self, samples: Any) -> None:
         """The other half of `start`: how well the coordinates agree at the adjusted poses."""

@@ -1,7 +1,6 @@
 """The link between nerfstudio's commands and the model: reproducible steps, held-out evaluation, refined poses."""
 
 import math
-import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from nerfstudio.utils import comms
 from torch import Tensor
 from torchvision.utils import save_image
 
+from sl_nerfstudio.console import command, next_steps, paragraph, short_path
 from sl_nerfstudio.dataparser.datamanager import SLDataManager
 from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
@@ -184,16 +184,13 @@ def require_together(config: SLPipelineConfig, weights: Mapping[str, Any], root:
 
 def what_next(config: Path, scan: Path) -> str:
     """Where the result is, and the commands to continue with."""
-    settings, data = shlex.quote(str(config)), shlex.quote(str(scan))
-    return "\n".join(
-        [
-            f"Result: {config.parent}",
-            "To view it, and to export the surface and the refined poses in the scan's units:",
-            f"  ns-viewer --load-config {settings} --viewer.websocket-host 127.0.0.1",
-            f"  sl-export --load-config {settings} --output mesh.ply --poses refined/",
-            f"  sl-eval   --mesh mesh.ply --data {data} --poses refined/transforms.json --report report.html",
-        ]
-    )
+    settings, data, poses = short_path(config), short_path(scan), "refined/transforms.json"
+    steps = [
+        command("ns-viewer", "--load-config", settings, "--viewer.websocket-host", "127.0.0.1"),
+        command("sl-export", "--load-config", settings, "--output", "mesh.ply", "--poses", "refined"),
+        command("sl-eval", "--mesh", "mesh.ply", "--data", data, "--poses", poses, "--report", "report.html"),
+    ]
+    return "\n".join([paragraph("result", f"{settings.parent}"), next_steps(steps)])
 
 
 def mean_over_frames(per_frame: list[dict[str, float]], with_std: bool) -> dict[str, float]:

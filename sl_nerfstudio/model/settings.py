@@ -1,8 +1,10 @@
 """Settings of the model; the docstring of each field is its help on the command line."""
 
+import sys
 from dataclasses import dataclass, field
 from typing import Literal
 
+import torch
 from nerfstudio.models.base_model import ModelConfig
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
@@ -11,6 +13,8 @@ from sl_nerfstudio.field.sdf_field import FieldConfig
 from sl_nerfstudio.model.pose_refinement import PriorConfig
 from sl_nerfstudio.rendering.schedule import AnnealingConfig
 from sl_nerfstudio.rendering.settings import LossConfig, SamplingConfig
+
+RECOMMENDED_STEPS = {"sl-neus": 1000, "sl-neus-paper": 10_000}  # by method; the paper's is its own
 
 PoseMethod = Literal["adjust", "adjust-and-render", "render", "render-independently"]
 
@@ -52,7 +56,17 @@ class SLModelSettings(ModelConfig):
 
     @property
     def sdf_field(self) -> FieldConfig:
-        """`sdf` under the name that `ns-export marching-cubes` uses."""
+        """`sdf` under the name by which `ns-export marching-cubes` asks for it.
+
+        Only that command does. Without a GPU it would end in a traceback: here it ends with a sentence and status 1.
+        """
+        if not torch.cuda.is_available():
+            print(
+                "error: ns-export marching-cubes needs a GPU with CUDA. `sl-export --load-config config.yml --output "
+                "mesh.ply` does the same on any machine, in the scan's unit and cut to what was observed.",
+                file=sys.stderr,
+            )
+            raise SystemExit(1)
         return self.sdf
 
     @property

@@ -12,6 +12,7 @@ import yaml
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
+from sl_nerfstudio.console import short_path
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
@@ -26,7 +27,9 @@ from sl_nerfstudio.model.training.checkpoints import Checkpoint, checkpoints_in,
 from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION
 from sl_nerfstudio.model.training.loop import SLTrainer
+from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
+from sl_nerfstudio.progress import phase
 from sl_nerfstudio.scan import require_valid
 
 _TAKEN: dict[Path, RunFolder] = {}
@@ -43,14 +46,23 @@ class SLTrainerConfig(TrainerConfig):
     for a resumed run the length of the run that it resumes."""
     seconds_per_save: float = 60.0
     """A checkpoint is also written when this many seconds, and at least 100 steps, have passed since the last one."""
+    verbose: bool = False
+    """Also print all settings and nerfstudio's own messages and table."""
     last_step: tyro.conf.Suppress[int | None] = None
     """Number of the run's last step, set when the run begins; --load-config continues up to it."""
+
+    def __post_init__(self) -> None:
+        """Silence nerfstudio once a command line was read: it prints before it calls `set_timestamp`."""
+        if self.data is not None or self.load_config is not None:
+            quiet_nerfstudio(not self.verbose)
 
     def set_timestamp(self) -> None:
         """Check the run and take its folder; nerfstudio calls this first, before it writes anything.
 
         An error that the user can fix is printed without a traceback and ends the process with status 1.
         """
+        self.logging.local_writer.enable |= self.verbose
+        quiet_nerfstudio(not self.verbose)
         if self.machine.num_devices * self.machine.num_machines == 1:
             INTERRUPTION.install()
         try:
@@ -72,7 +84,10 @@ class SLTrainerConfig(TrainerConfig):
         _require_device(self.machine.device_type)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
-        require_valid(root)
+        with phase("check") as check:
+            require_valid(root)
+            frames = len(load_scan(root).scan.frames)
+            check.say(f"{short_path(root)}: {frames} frames, no faults{_resumed(begun)}")
         pipeline: SLPipelineConfig = self.pipeline  # type: ignore[assignment]
         pipeline.scan_fingerprint = load_scan(root).fingerprint
         if begun is not None:
@@ -112,6 +127,11 @@ class SLTrainerConfig(TrainerConfig):
         for flag, name in (("--timestamp", self.timestamp), ("--experiment-name", self.experiment_name)):
             if name is not None and (not name.strip() or Path(name).is_absolute() or ".." in Path(name).parts):
                 raise UserError(f"{flag} {name!r}: is not the name of a folder inside --output-dir")
+
+    def print_to_terminal(self) -> None:
+        """Print all settings on request; config.yml in the run's folder holds them in any case."""
+        if self.verbose:
+            super().print_to_terminal()
 
     def save_config(self) -> None:
         """Write config.yml, complete or not at all."""
@@ -204,10 +224,15 @@ def _intrinsics_change(
             "    remedy: leave out either these options or refine-intrinsics"
         )
     loaded = load_scan(root)
-    found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
     cameras = [frame.camera for frame in loaded.scan.frames]
-    print(refined_intrinsics_message(found, cameras, loaded.scan.projector), flush=True)
+    with phase("intrinsics") as shown:
+        found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
+        shown.say(refined_intrinsics_message(found, cameras, loaded.scan.projector))
     return found.change
+
+
+def _resumed(begun: Checkpoint | None) -> str:
+    return "" if begun is None else f"; goes on after step {begun.step} of {short_path(begun.path)}"
 
 
 def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConfig | None:

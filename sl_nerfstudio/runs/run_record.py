@@ -8,6 +8,7 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
+from sl_nerfstudio.model.settings import RECOMMENDED_STEPS
 from sl_nerfstudio.model.training.fingerprints import plain
 from sl_nerfstudio.runs.trained_run import TrainedRun
 
@@ -53,6 +54,7 @@ def run_settings(config: Any) -> dict[str, Any]:
     chosen = {name: plain(getattr(config, name)) for name in _SETTINGS if hasattr(config, name)}
     return {
         **chosen,
+        "recommended_steps": RECOMMENDED_STEPS.get(config.method_name),
         "data": str(config.pipeline.datamanager.data),
         "rays": config.pipeline.datamanager.train_num_rays_per_batch,
         "intrinsics_change": plain(config.pipeline.datamanager.dataparser.intrinsics_change),

@@ -77,7 +77,11 @@ def test_truth_and_true_poses_are_judged_perfect(scan: Path, tmp_path: Path, cap
     assert "initial" not in content
     assert page.stat().st_size < 10e6 and "Scan report: scan" in page.read_text()
     printed = capsys.readouterr().out
-    assert "rigid" in printed and str(out) in printed.replace("\n", "")
+    names = [line[:12].split(":")[0].strip() for line in printed.splitlines() if not line.startswith(" ")]
+    assert names == ["verdict", "surface", "captures", "coverage", "next", "written", "written"]
+    assert printed.startswith("verdict: good\n") and "rigid" in printed and str(out) in printed.replace("\n", "")
+    assert all(len(line) <= 80 for line in printed.splitlines() if not line.startswith("written"))
+    assert np.shape(content["coverage"]["next_capture"]["transform_matrix"]) == (4, 4)
     assert sorted(p.name for p in out.parent.iterdir()) == ["evaluation.json", "report.html"]
     with held_results(
         {out: b'"format": 1,\n  "verdict"', page: b"<title>Scan report: "}
@@ -130,7 +134,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
 def test_without_truth_the_fit_is_there_and_nothing_else(scan: Path, untrue: Path, tmp_path: Path) -> None:
     run("--mesh", mesh_of(scan), "--data", untrue, "--json", tmp_path / "out.json")
     content = json.loads((tmp_path / "out.json").read_text())
-    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "cross_frame"}
+    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "coverage", "cross_frame"}
     assert content["fit"]["coordinate_px_median"] < 1e-2
 
 

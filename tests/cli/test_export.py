@@ -32,7 +32,7 @@ def test_the_mesh_is_in_world_units_and_axes_and_cut(scan, tmp_path, suffix):
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTRE, axis=1), RADIUS, atol=5e-3)
     assert mesh.vertices[:, 2].min() > CENTRE[2] - 36  # the lower side is seen by nobody
     assert f"{len(mesh.vertices):,} vertices" in text and " mm" in text and "vertices that no frame saw" in text
-    assert f"sl-eval --mesh {config.output} --data {scan.root} --report report.html" in text
+    assert f"sl-eval --mesh {config.output} --data {scan.root} --report report.html" in text.replace(" \\\n     ", "")
 
 
 def test_keep_unobserved_keeps_the_whole_ball(scan, tmp_path):

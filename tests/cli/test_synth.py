@@ -31,7 +31,8 @@ def test_a_small_scan(monkeypatch, tmp_path, capsys):
         monkeypatch, "--output", out, "--frames", 2, "--resolution", 32, "--pose-error", 0, 0, "--units", "cm",
         "--autocalibration-error", 0, 0, 0, "--noise", 0, "--missing", 0, "--wrong", 0, "--projector-model", "DOE",
     )  # fmt: skip
-    assert capsys.readouterr().out == f"wrote 2 frames to {out}\n"
+    said = capsys.readouterr().out.replace(" \\\n     ", "")  # a long command continues on the next line
+    assert said == f"wrote 2 frames to {out}\nnext:\n  ns-train sl-neus --data '{out}'\n"
     scan = read_scan(out)
     assert len(scan.frames) == 2 and scan.units == "cm" and scan.projector.model == "DOE"
     assert scan.frames[0].camera.w == 32

@@ -99,7 +99,7 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path)
 def test_without_truth_only_the_fit_is_there(clean_scan: Path) -> None:
     scan = read_scan(clean_scan)
     content = as_json(evaluate(FacetedScan().truth(), scan, scan.poses))
-    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "cross_frame"}
+    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "coverage", "cross_frame"}
     assert content["fit"]["coordinate_px_median"] < 1e-3
 
 

@@ -81,3 +81,21 @@ def test_state_survives_a_checkpoint() -> None:
     step(1, resumed)
     assert torch.equal(fields[0].encoding.table, fields[1].encoding.table)
     assert resumed.step(lambda: 3.5) == 3.5
+
+
+def test_a_checkpoint_holds_only_rows_that_were_touched() -> None:
+    table = torch.nn.Parameter(torch.rand(1000, 4))
+    optimiser = RowAdam([table])
+    for touched in ([3, 4], [4, 900]):
+        table.grad = torch.zeros_like(table)
+        table.grad[touched] = torch.rand(2, 4)
+        optimiser.step()
+    (packed,) = optimiser.state_dict()["state"].values()
+    assert packed["touched"].tolist() == [3, 4, 900] and packed["steps"].tolist() == [1, 2, 1]
+    assert packed["moments"].shape == (3, 2, 4)
+    whole = dict(optimiser.state[table])
+    for stored in (packed, whole):  # earlier versions stored all rows
+        resumed = RowAdam([table])
+        resumed.load_state_dict({**optimiser.state_dict(), "state": {0: stored}})
+        for name, value in whole.items():
+            torch.testing.assert_close(resumed.state[table][name], value, rtol=0, atol=0)

@@ -32,7 +32,7 @@ def test_one_frame_has_a_deviation_of_zero() -> None:
 def test_commands_to_continue_with_are_quoted_for_a_shell() -> None:
     text = what_next(Path("/a b/it's/config.yml"), Path("/scan"))
     assert """ns-viewer --load-config '/a b/it'"'"'s/config.yml'""" in text
-    assert text.startswith("Result: /a b/it's\n")
+    assert text.startswith("result      /a b/it's\n") and max(map(len, text.splitlines())) <= 80
 
 
 def test_vertical_field_of_view() -> None:

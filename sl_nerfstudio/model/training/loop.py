@@ -1,19 +1,23 @@
 """nerfstudio's training loop, which may be stopped at any time without losing what was found."""
 
+import math
 import signal
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 
+from sl_nerfstudio.console import paragraph
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.model.training.checkpoints import SCHEDULE_KEY, checkpoint_name, checkpoints_in, write_checkpoint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
+from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
+from sl_nerfstudio.progress import Phase, phase
 
 if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel
@@ -22,50 +26,89 @@ LEAST_STEPS = 100  # between two checkpoints that are written because of the tim
 
 
 class SLTrainer(Trainer):
-    """nerfstudio's trainer with four differences.
+    """nerfstudio's trainer with six differences.
 
-    - The adjusted poses are saved before the first step.
+    - Poses are adjusted before the first step, whose time would otherwise include it, and saved.
+    - Each phase prints one line, with a bar or the time left while it runs; nerfstudio itself is quiet.
     - A checkpoint is also written when `seconds_per_save` seconds and 100 steps have passed, and on SIGINT and SIGTERM,
       which then end the process with status 130 or 143.
     - A checkpoint is complete or not there. Files in its folder that are no checkpoints are left alone.
     - A checkpoint that does not fit the model gives a message.
+    - When the schedule has ended, the optimisers forget their moments, two thirds of a checkpoint: what goes on from
+      there, at once or later, starts with new ones.
     """
 
+    config: Any
+    pipeline: Any
     _done: int | None = None  # the last step whose results the weights hold
     _saved: tuple[int | None, float] = (None, 0.0)  # the last step that was saved, and when
+
+    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
+        quiet_nerfstudio(not config.verbose)  # also in the processes of several GPUs
+        super().__init__(config, local_rank, world_size)
+        self._phases = ExitStack()
+        self._training = Phase("train")
 
     def setup(self, test_mode: Any = "val") -> None:
         """Make the pipeline and load the checkpoint; see nerfstudio's Trainer."""
         with self._ending():
             super().setup(test_mode)
+        for line in getattr(self.viewer_state, "viewer_info", []):
+            print(paragraph("viewer", line), flush=True)
 
     def train(self) -> None:
         """Train; see nerfstudio's Trainer. If interrupted, save what has been trained and say how to go on."""
         self._saved = (None, time.monotonic())
         try:
-            with self._ending():
+            with self._ending(), self._phases:
                 super().train()
             INTERRUPTION.remove()  # if interrupted they stay: a second signal ends the process at once
         finally:
             self._leave_folder()
 
+    @property
+    def _model(self) -> "SLModel":
+        return cast("SLModel", self.pipeline.model)
+
+    def _init_viewer_state(self) -> None:
+        """Show the scene and adjust the poses: nerfstudio calls this last before the first step."""
+        super()._init_viewer_state()
+        if self._start_step == 0 and self.config.load_checkpoint is None:
+            with self.train_lock:
+                self._adjust_poses()
+        self._training = self._phases.enter_context(_shown_phase("train"))
+
+    def _adjust_poses(self) -> None:
+        samples = self.pipeline.datamanager.samples
+        if self._model.config.adjusts_poses:
+            with _shown_phase("adjust") as shown:
+                shown.say(self._model.adjust_poses(samples))
+        else:
+            self._model.adjust_poses(samples)
+        with INTERRUPTION.held():
+            self._model.measure_noise(samples)
+            self.save_checkpoint(-1)
+
     def begin_step(self, step: int) -> None:
-        """Before each step, and before anything else in it: the first one begins with the adjustment of the poses."""
-        if step == 0 and self.config.load_checkpoint is None:
-            model, samples = cast("SLModel", self.pipeline.model), self.pipeline.datamanager.samples  # type: ignore[attr-defined]
-            model.adjust_poses(samples)
-            with INTERRUPTION.held():
-                model.measure_noise(samples)
-                self.save_checkpoint(-1)
+        """Before each step, and before anything else in it."""
         INTERRUPTION.hold()
+
+    def train_iteration(self, step: int) -> Any:
+        """One step; nerfstudio writes the losses to its log, and torch warns of those that have a gradient."""
+        loss, terms, metrics = super().train_iteration(step)
+        return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
 
     def eval_iteration(self, step: int) -> None:
         """Evaluate if it is due, as the last part of each step; a signal that came during the step counts now."""
         super().eval_iteration(step)
+        if step + 1 == self.config.schedule_iterations:
+            for optimizer in self.optimizers.optimizers.values():
+                optimizer.state.clear()
         self._done = step
+        self._training.update(step + 1, self._start_step + self.config.max_num_iterations, self._fit())
         saved, when = self._saved
         since = step - (self._start_step - 1 if saved is None else saved)
-        if since >= LEAST_STEPS and time.monotonic() - when >= self.config.seconds_per_save:  # type: ignore[attr-defined]
+        if since >= LEAST_STEPS and time.monotonic() - when >= self.config.seconds_per_save:
             self.save_checkpoint(step)
         INTERRUPTION.release()
 
@@ -81,7 +124,7 @@ class SLTrainer(Trainer):
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()},
             "schedulers": {name: scheduler.state_dict() for name, scheduler in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
-            SCHEDULE_KEY: self.config.schedule_iterations,  # type: ignore[attr-defined]
+            SCHEDULE_KEY: self.config.schedule_iterations,
         }
         path = self.checkpoint_dir / checkpoint_name(step)
         with INTERRUPTION.held():
@@ -102,9 +145,22 @@ class SLTrainer(Trainer):
                 "    remedy: give the settings of the run that wrote it, or train again"
             ) from error
 
+    def _fit(self) -> str:
+        """How well rendered and decoded coordinates agree, in words; "" before anything was rendered."""
+        px = self._model.history_table.latest("coordinate_px")
+        return f"coordinates to {px:.2g} px" if math.isfinite(px) else ""
+
+    def _after_train(self) -> None:
+        """Say what was trained, save it and say what to do next."""
+        self._training.say(", ".join(filter(None, [f"{self._training.done} steps", self._fit()])))
+        self._phases.close()
+        super()._after_train()
+
     def _train_complete_viewer(self) -> None:
         """Keep the viewer open until control-C, which is then the normal end."""
         INTERRUPTION.remove()
+        if self.viewer_state is not None:
+            print("The viewer stays open until control-C.", flush=True)
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             super()._train_complete_viewer()
@@ -132,3 +188,8 @@ class SLTrainer(Trainer):
         leave = getattr(self.config, "leave_folder", None)
         if leave is not None:
             leave()
+
+
+def _shown_phase(name: str) -> AbstractContextManager[Phase]:
+    """A phase that only the main process shows."""
+    return phase(name) if comms.is_main_process() else nullcontext(Phase(name))

@@ -65,6 +65,16 @@ def test_a_run_is_trained_further_in_its_own_folder(scan_root, tmp_path):
     require_equal(last_state(folder), last_state(folder_of(tmp_path, "whole")))
 
 
+def test_a_run_whose_schedule_has_ended_is_trained_further_as_if_it_had_not_stopped(scan_root, finished, tmp_path):
+    """Its checkpoint holds no moments of the optimisers, because a longer run forgets them there, too."""
+    assert not any(part["state"] for part in last_state(finished)["optimizers"].values())
+    train(settings(scan_root, tmp_path, "whole", steps=16, schedule_iterations=12))
+    whole = last_state(folder_of(tmp_path, "whole"))
+    assert all(part["state"] for part in whole["optimizers"].values())
+    train(settings(scan_root, tmp_path, "rest", steps=4, load_dir=finished / "nerfstudio_models"))
+    require_equal(last_state(folder_of(tmp_path, "rest")), whole)
+
+
 def test_the_papers_method_is_trained_further(scan_root, tmp_path):
     """Its learning rates end before its annealing does."""
     for more in ({}, {"load_dir": tmp_path / "sphere/sl-neus-paper/first/nerfstudio_models"}):
