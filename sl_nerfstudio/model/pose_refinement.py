@@ -14,6 +14,7 @@ from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
 from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance, joint_of_prior
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
@@ -21,6 +22,7 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.held_out import BLOCK
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan, measured_length
@@ -51,6 +53,7 @@ class ScanAdjustment:
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
+    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
     cross_validation: CrossValidation
     noise_px: float
     intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
@@ -109,8 +112,9 @@ def adjust_scan(
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
-        return ScanAdjustment(found.rig, found.sigma, decision, found.noise_px, found.intrinsics)
-    return ScanAdjustment(start, stated.sigma, decision, found.noise_px, found.intrinsics)
+        return ScanAdjustment(found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics)
+    joint = joint_of_prior(stated, start)
+    return ScanAdjustment(start, stated.sigma, joint, decision, found.noise_px, found.intrinsics)
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ class Found:
 
     rig: Rig
     sigma: Float[Tensor, "frames 12"]
+    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
     noise_px: float
     intrinsics: SelfCalibration | None
 
@@ -135,7 +140,15 @@ def adjusted(
     """Adjust the scan's poses from `start`, and restore the scan's lengths."""
     found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
-    return Found(rig, found.sigma, found.noise_px, found.intrinsics)
+    joint = JointCovariance(found.joint.numpy()).mapped(_motion(found.rig, rig))
+    return Found(rig, found.sigma, torch.from_numpy(joint.matrix), found.noise_px, found.intrinsics)
+
+
+def _motion(before: Rig, after: Rig) -> Similarity:
+    """The similarity that `restore` moved a rig by."""
+    scale = float(after.baseline[0] / before.baseline[0])
+    T = after.T_world_camera[0] @ inverse(before.scaled(scale).T_world_camera[0])
+    return Similarity(scale, T[:3, :3].numpy(), T[:3, 3].numpy())
 
 
 def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
