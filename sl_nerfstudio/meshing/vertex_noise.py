@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_views import VertexViews
 
-AVERAGED_CELLS = 6.0
+AVERAGED_CELLS = 2.0
 """Area over which the field averages, in squares of its finest cells; measured by `benchmarks.field_noise`."""
 _MOST_ROUNDS = 60  # of smoothing, for meshes that are much finer than the field
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.spacing import evenly_spaced

@@ -13,7 +13,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import constrained
-from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.field.cached_grid import CachedGrid
 from sl_nerfstudio.field.sdf_field import SDFField

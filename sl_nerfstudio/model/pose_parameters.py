@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance, packed, unpacked
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, packed, unpacked
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.model.settings import SLModelSettings

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.scan import FileError, Scan

@@ -17,7 +17,10 @@ from sl_nerfstudio.meshing.surface_derivatives import (
 from tests.bundle_adjustment.analytic import look_at
 
 CAMERA = Device(300, 300, 410.0, 400.0, 148.0, 152.0, k1=-0.1, p1=0.002)
-LIGHTS = (Device(400, 400, 520.0, 530.0, 200.0, 195.0, k1=0.05), Device(400, 400, 560.0, 560.0, 200.0, 200.0, model="DOE"))
+LIGHTS = (
+    Device(400, 400, 520.0, 530.0, 200.0, 195.0, k1=0.05),
+    Device(400, 400, 560.0, 560.0, 200.0, 200.0, model="DOE"),
+)
 STEP = 1e-5
 
 
@@ -43,9 +46,7 @@ def changed(d: FrameDevices, by: Tensor) -> FrameDevices:
         params[:2] = focal * (1 + share[0])
         params[2:4] = params[2:4] + focal[0] * share[1:]
         out.append(replace(devices, params=params))
-    return FrameDevices(
-        out[0], out[1], exp_se3(by[:6]) @ d.T_world_camera, exp_se3(by[6:12]) @ d.T_camera_projector
-    )
+    return FrameDevices(out[0], out[1], exp_se3(by[:6]) @ d.T_world_camera, exp_se3(by[6:12]) @ d.T_camera_projector)
 
 
 def on_plane(d: FrameDevices, uv: Tensor, p: Tensor, normal: Tensor) -> Tensor:
@@ -93,7 +94,9 @@ def test_a_point_is_seen_where_both_devices_project_it():
     def seen(devices: FrameDevices, q: Tensor) -> Tensor:
         T = inverse(devices.T_world_camera)
         light = inverse(devices.T_camera_projector) @ T
-        return torch.cat([project(devices.camera, transform(T, q))[0], project(devices.projector, transform(light, q))[0]], -1)
+        return torch.cat(
+            [project(devices.camera, transform(T, q))[0], project(devices.projector, transform(light, q))[0]], -1
+        )
 
     for column, way in enumerate(torch.eye(3, dtype=torch.float64)):
         there = (seen(d, p + STEP * way) - seen(d, p - STEP * way)) / (2 * STEP)

@@ -1,4 +1,4 @@
-"""Uncertainty of vertices: exact motions, a numerical refit of the surface, units, noise by formula, unseen vertices."""
+"""Uncertainty of vertices: exact motions, a surface that is fitted again, units, noise by formula, unseen vertices."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.se3 import exp_se3
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -134,10 +134,10 @@ def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views:
     noise = views.noise_px[views.frame[mine]]
     expected = (pixels * slope2 * noise**2).sum() / (pixels * slope2).sum() ** 2
     assert independent_variance(mesh, on_truth, area)[v] == pytest.approx(expected)
-    # a surface that lies 0.2 mm beside what the pixels say is that uncertain
-    beside = replace(on_truth, residual=0.2 * views.slope)
+    # a surface that lies 0.6 mm beside what the pixels say is that uncertain
+    beside = replace(on_truth, residual=0.6 * views.slope)
     inner = np.abs(mesh.vertices[seen]).max(1) < 20
-    np.testing.assert_allclose(np.sqrt(independent_variance(mesh, beside, area)[seen[inner]]), 0.2, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(independent_variance(mesh, beside, area)[seen[inner]]), 0.6, rtol=1e-6)
 
 
 def test_smoothing_averages_over_the_area_that_was_asked_for():
@@ -178,7 +178,7 @@ def test_vertices_that_no_frame_confirms_are_marked(scan: Scan):
         assert np.array_equal(np.isnan(values), found.views == 0)
     seen = found.views > 0
     assert (found.sigma[seen] > found.sigma_independent[seen]).all() and (found.sigma_independent[seen] > 0).all()
-    assert 8 < np.nanmin(found.ray_angle) and np.nanmax(found.ray_angle) < 12  # 20 degrees apart, 60 degrees up
+    assert np.nanmin(found.ray_angle) > 8 and np.nanmax(found.ray_angle) < 12  # 20 degrees apart, 60 degrees up
 
 
 def test_of_a_mesh_that_no_frame_sees_nothing_is_stated(scan: Scan):

@@ -1,0 +1,170 @@
+"""Whether sigma of the vertices is true: errors of exported meshes against the truth, in units of their sigma.
+
+    python -m benchmarks.vertex_coverage [--scenes ...] [--seeds 1 2] [--noise 0.2 0.5] [--again]
+
+Each scan has rough starting poses, and goes through `sl-synth`, `ns-train` and `sl-export` as a user would run them.
+The mesh is aligned with the truth as in `sl-eval`, rigidly. If sigma is right, 68 % of the vertices are closer to the
+truth than sigma, and 95 % closer than two sigma. Runs that are in the folder are not trained again, and rows that are
+in the result file are not measured again, so an interrupted benchmark continues; `--again` measures all of them.
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.machine import write_rows
+from benchmarks.common.whole_runs import run
+from sl_nerfstudio.evaluation.evaluate import score_alignments
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.inputs import read_inputs
+from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.meshing.ply import read_quality
+
+SCENES = ("cone-and-cylinder", "head", "frog", "dog", "vase", "medal")
+_SAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scan."""
+
+    scene: str
+    seed: int
+    noise: float  # of decoded coordinates, pattern pixels
+    frames: int
+    resolution: int
+    iterations: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.scene}-{self.seed}-{self.noise:g}-{self.frames}-{self.resolution}-{self.iterations}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Errors of the vertices of one mesh; lengths in mm, shares between 0 and 1."""
+
+    scene: str
+    seed: int
+    noise: float
+    frames: int
+    resolution: int
+    iterations: int
+    vertices: int  # with a sigma
+    unobserved: float  # share of vertices that are marked as not observed
+    error_rms: float
+    error_rms_unobserved: float  # of the marked ones
+    sigma_median: float
+    sigma_independent_median: float
+    within_1: float
+    within_2: float
+    within_1_independent: float  # if the shared part is left out
+    rank_correlation: float  # of |error| and sigma, over the vertices
+
+
+def train(case: Case, folder: Path) -> Path:
+    """Make the scan and train on it, unless that was done; returns the run's config.yml."""
+    scan, out = folder / case.name / "scan", folder / case.name / "runs"
+    if not (scan / "transforms.json").exists():
+        run(
+            *("sl-synth", "--output", str(scan), "--scene", case.scene, "--frames", str(case.frames)),
+            *("--resolution", str(case.resolution), "--seed", str(case.seed), "--noise", str(case.noise)),
+        )
+    config = out / "run/sl-neus/now/config.yml"
+    if not list(config.parent.glob(f"nerfstudio_models/step-*{case.iterations - 1}.ckpt")):
+        run(
+            *("ns-train", "sl-neus", "--data", str(scan), "--output-dir", str(out), "--experiment-name", "run"),
+            *("--timestamp", "now", "--max-num-iterations", str(case.iterations)),
+        )
+    return config
+
+
+def measure(case: Case, folder: Path) -> Row:
+    """Export the run and compare its vertices with the truth."""
+    config, here = train(case, folder), folder / case.name
+    mesh, refined = here / "mesh.ply", here / "refined"
+    run(
+        *("sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(refined)),
+        *("--resolution", "256", "--overwrite"),
+    )
+    inputs = read_inputs(mesh, here / "scan", refined / "transforms.json", None, _SAMPLES, 0)
+    quality, reference = read_quality(mesh), inputs.reference
+    assert quality is not None and isinstance(reference, MeshReference)
+    surface = IndexedMesh(inputs.mesh)
+    score = score_alignments(surface, reference, inputs.poses, inputs.true_poses, samples=_SAMPLES)["rigid"]
+    error = np.abs(reference.surface_errors(surface, score.S_truth_result, inputs.mesh.vertices))
+    seen = quality.views > 0
+    ratio, alone = error[seen] / quality.sigma[seen], error[seen] / quality.sigma_independent[seen]
+    return Row(
+        **asdict(case),
+        vertices=int(seen.sum()),
+        unobserved=float((~seen).mean()),
+        error_rms=_rms(error[seen]),
+        error_rms_unobserved=_rms(error[~seen]),
+        sigma_median=float(np.median(quality.sigma[seen])),
+        sigma_independent_median=float(np.median(quality.sigma_independent[seen])),
+        within_1=float((ratio < 1).mean()),
+        within_2=float((ratio < 2).mean()),
+        within_1_independent=float((alone < 1).mean()),
+        rank_correlation=float(np.corrcoef(_ranks(error[seen]), _ranks(quality.sigma[seen]))[0, 1]),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    return np.argsort(np.argsort(values)).astype(float)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--noise", nargs="+", type=float, default=[0.2, 0.5])
+    parser.add_argument("--frames", type=int, default=14)
+    parser.add_argument("--resolution", type=int, default=240)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/vertex_coverage"))
+    parser.add_argument("--again", action="store_true", help="measure also what is in the result file")
+    parser.add_argument("--train-only", action="store_true", help="make scans and runs, measure nothing")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/vertex_coverage.json"))
+    options = parser.parse_args()
+    size = (options.frames, options.resolution, options.iterations)
+    cases = [Case(a, b, c, *size) for b in options.seeds for c in options.noise for a in options.scenes]
+    if options.train_only:
+        for case in cases:
+            train(case, options.folder)
+            print(case.name, flush=True)
+        return
+    kept = [] if options.again or not options.output.exists() else json.loads(options.output.read_text())["rows"]
+    rows = [Row(**row) for row in kept]
+    done = {Case(*(row[name] for name in Case.__dataclass_fields__)) for row in kept}
+    for case in cases:
+        if case not in done:
+            rows.append(measure(case, options.folder))
+            write_rows(options.output, rows)
+            print(text(rows[-1]), flush=True)
+    ones = np.array([row.within_1 for row in rows])
+    inside = ((ones >= 0.6) & (ones <= 0.8)).sum()
+    print(f"within 1 sigma: mean {ones.mean():.0%}, {inside} of {len(ones)} scans in 60 to 80 %")
+
+
+def text(row: Row) -> str:
+    """One line."""
+    return (
+        f"{row.scene:18} {row.seed} noise {row.noise:.2f}  RMS {row.error_rms:.3f} mm  sigma {row.sigma_median:.3f} "
+        f"(independent {row.sigma_independent_median:.3f})  within 1: {row.within_1:.0%}  2: {row.within_2:.0%}  "
+        f"independent alone: {row.within_1_independent:.0%}  rank correlation {row.rank_correlation:.2f}  "
+        f"not observed {row.unobserved:.1%} (RMS {row.error_rms_unobserved:.2f})"
+    )
+
+
+if __name__ == "__main__":
+    main()
