@@ -1,22 +1,24 @@
 """The evaluation as JSON."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.lengths import Length
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
 from sl_nerfstudio.verdict.verdict import Verdict
 
 
-def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
+def to_json(evaluation: Evaluation, verdict: Verdict, lengths: Sequence[Length] = ()) -> dict[str, Any]:
     """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
     the captures, is always there, and so are `verdict` and `reasons`. `cross_frame` is the agreement of the frames with
-    each other.
+    each other, `lengths` are the distances that were asked for.
     """
     out: dict[str, Any] = {
         "format": 1,
@@ -37,6 +39,8 @@ def to_json(evaluation: Evaluation, verdict: Verdict) -> dict[str, Any]:
     out["fit"] = asdict(evaluation.agreement)
     if evaluation.cross is not None:
         out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
+    if lengths:
+        out["lengths"] = [asdict(length) for length in lengths]
     return _finite(out)
 
 

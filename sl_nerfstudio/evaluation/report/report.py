@@ -1,6 +1,7 @@
 """The report: one HTML file with which a person can judge a scan, without a network."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -13,6 +14,7 @@ from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 from sl_nerfstudio.evaluation.judgement import Judgement
+from sl_nerfstudio.evaluation.lengths import Length
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.report import charts
@@ -35,6 +37,7 @@ class ReportInput:
     inputs: EvaluationInputs
     thumbnails: list[FrameThumbnails]
     mesh_name: str
+    lengths: Sequence[Length] = ()
     made_at: datetime = field(default_factory=datetime.now)
 
     @property
