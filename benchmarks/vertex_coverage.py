@@ -17,14 +17,21 @@ import numpy as np
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.whole_runs import run
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.inputs import read_inputs
+from sl_nerfstudio.evaluation.inputs import EvaluationInputs, read_inputs
 from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.length_uncertainty import length_sigma
 from sl_nerfstudio.meshing.ply import read_quality
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
 
 SCENES = ("cone-and-cylinder", "head", "frog", "dog", "vase", "medal")
 _SAMPLES = 20_000
+_LENGTHS, _AWAY = 500, 0.8  # how many distances, and the least cosine of their ends' normals with them
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,9 @@ class Row:
     within_1: float
     within_2: float
     within_1_independent: float  # if the shared part is left out
+    within_1_exact_intrinsics: float  # if the doubt of the intrinsics, which are exact in these scans, is left out
+    lengths_within_1: float  # of distances between points of opposite sides
+    lengths_within_2: float
     rank_correlation: float  # of |error| and sigma, over the vertices
 
 
@@ -99,6 +109,8 @@ def measure(case: Case, folder: Path) -> Row:
     error = np.abs(reference.surface_errors(surface, score.S_truth_result, inputs.mesh.vertices))
     seen = quality.views > 0
     ratio, alone = error[seen] / quality.sigma[seen], error[seen] / quality.sigma_independent[seen]
+    certain = error[seen] / _with_exact_intrinsics(inputs, quality)[seen]
+    lengths = _length_errors(inputs, quality, reference, score.S_truth_result)
     return Row(
         **asdict(case),
         vertices=int(seen.sum()),
@@ -110,8 +122,45 @@ def measure(case: Case, folder: Path) -> Row:
         within_1=float((ratio < 1).mean()),
         within_2=float((ratio < 2).mean()),
         within_1_independent=float((alone < 1).mean()),
+        within_1_exact_intrinsics=float((certain < 1).mean()),
+        lengths_within_1=float((lengths < 1).mean()),
+        lengths_within_2=float((lengths < 2).mean()),
         rank_correlation=float(np.corrcoef(_ranks(error[seen]), _ranks(quality.sigma[seen]))[0, 1]),
     )
+
+
+def _with_exact_intrinsics(inputs: EvaluationInputs, quality: VertexQuality) -> np.ndarray:
+    """Sigma of each vertex under the covariance of the poses given the intrinsics."""
+    assert inputs.joint is not None
+    C, k = inputs.joint.matrix, len(inputs.joint.matrix) - UNKNOWNS
+    given = np.zeros_like(C)
+    given[:k, :k] = C[:k, :k] - C[:k, k:] @ np.linalg.solve(C[k:, k:], C[k:, :k])
+    found = vertex_uncertainty(inputs.mesh, inputs.scan, inputs.poses, JointCovariance(given), 1.0)
+    shared = found.sigma**2 - found.sigma_independent**2
+    return np.sqrt(quality.sigma_independent**2 + shared)
+
+
+def _length_errors(
+    inputs: EvaluationInputs, quality: VertexQuality, reference: MeshReference, S_truth_result: Similarity
+) -> np.ndarray:
+    """Errors of distances in units of their sigma, between vertices that face away from each other.
+
+    The nearest point of the truth then shows how far each end is off along the distance.
+    """
+    mesh, rng = inputs.mesh, np.random.default_rng(0)
+    seen, normals = np.flatnonzero(quality.views > 0), mesh.vertex_normals()
+    ends = rng.choice(seen, (40_000, 2))
+    along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        away = np.einsum("nej,nj->ne", normals[ends], along / length[:, None]) * [-1, 1]
+    ends = ends[(away > _AWAY).all(1) & (length > 0.1 * reference.size)][:_LENGTHS]
+    assert inputs.joint is not None
+    sigma = length_sigma(mesh, quality.sigma_independent, ends, inputs.scan, inputs.poses, inputs.joint)
+    true = reference.surface.closest(S_truth_result.points(mesh.vertices[ends.ravel()])).point.reshape(-1, 2, 3)
+    found = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
+    error = np.abs(found - np.linalg.norm(true[:, 1] - true[:, 0], axis=1))
+    return error / np.hypot(sigma.shared, sigma.independent)
 
 
 def _rms(values: np.ndarray) -> float:
@@ -161,7 +210,8 @@ def text(row: Row) -> str:
     return (
         f"{row.scene:18} {row.seed} noise {row.noise:.2f}  RMS {row.error_rms:.3f} mm  sigma {row.sigma_median:.3f} "
         f"(independent {row.sigma_independent_median:.3f})  within 1: {row.within_1:.0%}  2: {row.within_2:.0%}  "
-        f"independent alone: {row.within_1_independent:.0%}  rank correlation {row.rank_correlation:.2f}  "
+        f"independent alone: {row.within_1_independent:.0%}  exact intrinsics: {row.within_1_exact_intrinsics:.0%}  "
+        f"lengths {row.lengths_within_1:.0%} {row.lengths_within_2:.0%}  rank correlation {row.rank_correlation:.2f}  "
         f"not observed {row.unobserved:.1%} (RMS {row.error_rms_unobserved:.2f})"
     )
 

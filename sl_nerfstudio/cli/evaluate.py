@@ -80,14 +80,13 @@ def _evaluate(config: EvalConfig) -> None:
     judgement = judge(evaluation, intrinsics_hint(inputs.training, inputs.scan))
     results: dict[Path, str] = {}
     if config.json:
-        results[config.json] = (
-            json.dumps(to_json(evaluation, judgement.verdict, lengths), indent=2, allow_nan=False) + "\n"
-        )
+        document = to_json(evaluation, judgement.verdict, lengths)
+        results[config.json] = json.dumps(document, indent=2, allow_nan=False) + "\n"
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
         results[config.report] = render_report(
-            ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name, lengths)
+            ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name, lengths=lengths)
         )
     for path, text in results.items():
         write_atomic(path, text.encode())

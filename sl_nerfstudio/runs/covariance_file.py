@@ -33,7 +33,7 @@ def read_covariance(folder: Path, scan: Scan) -> JointCovariance | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             matrix, frames, units = archive["covariance"], archive["frames"].tolist(), str(archive["units"])
     except (*ARRAY_DAMAGE, KeyError) as error:
         raise FileError(path, f"cannot be read ({error})", "it is damaged or another file", _AGAIN) from error
