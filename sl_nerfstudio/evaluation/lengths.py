@@ -57,7 +57,7 @@ def parse_pair(text: str, where: str) -> PointPair:
             '    remedy: give x,y,z of both, in the unit and axes of the mesh: "12.5,-3,40 10,2,38", or '
             '"handle: 12.5,-3,40 10,2,38"'
         )
-    p, q = (tuple(float(v) for v in point.split(",")) for point in found.groups())
+    p, q = (_triple(np.array(point.split(","), dtype=np.float64)) for point in found.groups())
     return PointPair(name.strip() or f"{found[1]} to {found[2]}", p, q)
 
 

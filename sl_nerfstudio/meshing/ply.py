@@ -59,6 +59,7 @@ def read_quality(path: Path) -> VertexQuality | None:
         if any(kind not in _TYPES for kind, _ in fields) or not {"sigma", "views"} <= {name for _, name in fields}:
             return None
         stream.seek(len(head) + len(mark))
+        known = {name for _, name in fields}
         row = np.dtype([(name, _TYPES[kind]) for kind, name in fields])
         content = stream.read(int(count[1]) * row.itemsize)
     if len(content) < int(count[1]) * row.itemsize:
@@ -66,7 +67,7 @@ def read_quality(path: Path) -> VertexQuality | None:
     rows = np.frombuffer(content, row)
 
     def column(name: str) -> Float64[ndarray, "v"]:
-        return rows[name].astype(np.float64) if name in row.names else np.full(len(rows), np.nan)
+        return rows[name].astype(np.float64) if name in known else np.full(len(rows), np.nan)
 
     return VertexQuality(
         column("sigma"),
