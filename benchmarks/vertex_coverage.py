@@ -44,11 +44,13 @@ class Case:
     frames: int
     resolution: int
     iterations: int
+    intrinsics: float = 0.0  # 1 sigma of their error, as shares of the focal length; 0: exact, which nobody states
 
     @property
     def name(self) -> str:
         """Of its folder."""
-        return f"{self.scene}-{self.seed}-{self.noise:g}-{self.frames}-{self.resolution}-{self.iterations}"
+        wrong = f"-{self.intrinsics:g}" if self.intrinsics else ""
+        return f"{self.scene}-{self.seed}-{self.noise:g}-{self.frames}-{self.resolution}-{self.iterations}{wrong}"
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Row:
     frames: int
     resolution: int
     iterations: int
+    intrinsics: float
     vertices: int  # with a sigma
     unobserved: float  # share of vertices that are marked as not observed
     error_rms: float
@@ -84,13 +87,27 @@ def train(case: Case, folder: Path) -> Path:
             *("sl-synth", "--output", str(scan), "--scene", case.scene, "--frames", str(case.frames)),
             *("--resolution", str(case.resolution), "--seed", str(case.seed), "--noise", str(case.noise)),
         )
+        disturb_intrinsics(scan / "transforms.json", case)
     config = out / "run/sl-neus/now/config.yml"
+    stated = ("--pipeline.model.prior.intrinsics", str(case.intrinsics)) if case.intrinsics else ()
     if not list(config.parent.glob(f"nerfstudio_models/step-*{case.iterations - 1}.ckpt")):
         run(
             *("ns-train", "sl-neus", "--data", str(scan), "--output-dir", str(out), "--experiment-name", "run"),
-            *("--timestamp", "now", "--max-num-iterations", str(case.iterations)),
+            *("--timestamp", "now", "--max-num-iterations", str(case.iterations), *stated),
         )
     return config
+
+
+def disturb_intrinsics(path: Path, case: Case) -> None:
+    """Wrong focal lengths and principal points of both devices, of the size that the training is then told."""
+    document, rng = json.loads(path.read_text()), np.random.default_rng(case.seed)
+    for device in (document, document["projector"]):
+        focal, x, y = case.intrinsics * rng.standard_normal(3)
+        device["cx"] += device["fl_x"] * x
+        device["cy"] += device["fl_x"] * y
+        for key in ("fl_x", "fl_y"):
+            device[key] *= 1 + focal
+    path.write_text(json.dumps(document, indent=1))
 
 
 def measure(case: Case, folder: Path) -> Row:
@@ -180,12 +197,15 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=14)
     parser.add_argument("--resolution", type=int, default=240)
     parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument(
+        "--intrinsics", type=float, default=0.0, help="error of the intrinsics, share of the focal length"
+    )
     parser.add_argument("--folder", type=Path, default=Path("outputs/vertex_coverage"))
     parser.add_argument("--again", action="store_true", help="measure also what is in the result file")
     parser.add_argument("--train-only", action="store_true", help="make scans and runs, measure nothing")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/vertex_coverage.json"))
     options = parser.parse_args()
-    size = (options.frames, options.resolution, options.iterations)
+    size = (options.frames, options.resolution, options.iterations, options.intrinsics)
     cases = [Case(a, b, c, *size) for b in options.seeds for c in options.noise for a in options.scenes]
     if options.train_only:
         for case in cases:
