@@ -15,7 +15,8 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_views import VertexViews
 
 AVERAGED_CELLS = 2.0
-"""Area over which the field averages, in squares of its finest cells; measured by `benchmarks.field_noise`."""
+"""Area over which the field averages, in squares of its finest cells; measured with several draws of noise (1.4 to 3.8
+in benchmarks/log.md)."""
 _MOST_ROUNDS = 60  # of smoothing, for meshes that are much finer than the field
 
 
