@@ -36,6 +36,7 @@ class Adjustment:
 
     rig: Rig
     covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho), gauge projected out
+    joint: Float[Tensor, "joint joint"]  # the same with the six intrinsics after the poses
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
     noise_px: float  # estimated noise of one look-up, projector pixels
     iterations: int
@@ -200,6 +201,7 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     return Adjustment(
         rig=state.rig,
         covariance=known.covariance,
+        joint=known.joint,
         intrinsics=known.intrinsics,
         noise_px=found.noise,
         iterations=found.iterations,
@@ -213,4 +215,6 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor, settings: AdjustmentSettin
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
     noise = settings.kernel.noise_floor_px
-    return Adjustment(start, gauge_free(start, B, H, 1.0), None, noise, 0, nan, nan)
+    covariance = gauge_free(start, B, H, 1.0)
+    joint = torch.block_diag(covariance, (prior.intrinsics_sigma**2).diag())
+    return Adjustment(start, covariance, joint, None, noise, 0, nan, nan)

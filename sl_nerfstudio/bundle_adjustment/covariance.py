@@ -44,8 +44,13 @@ class Evidence:
 class PoseCovariance:
     """Covariance of the poses at the result, and the self-calibration of the intrinsics."""
 
-    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho); the gauge is projected out
+    joint: Float[Tensor, "joint joint"]  # of (delta, rho, intrinsics); the gauge is projected out
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
+
+    @property
+    def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
+        """That of (delta, rho) alone."""
+        return self.joint[:-UNKNOWNS, :-UNKNOWNS]
 
 
 def pose_covariance(
@@ -58,7 +63,8 @@ def pose_covariance(
     """
     e, n = evidence, evidence.rig.frames
     if B.shape[1] == 0:
-        return PoseCovariance(torch.zeros(12 * n, 12 * n, dtype=torch.float64), None)
+        poses_exact = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
+        return PoseCovariance(torch.block_diag(poses_exact, (prior.intrinsics_sigma**2).diag()), None)
     eye = torch.eye(UNKNOWNS, dtype=torch.float64)
     B = torch.block_diag(B, eye)
     poses_H, poses_g = prior_equations(prior, start, e.rig)
@@ -81,9 +87,9 @@ def pose_covariance(
     larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
     covariance = larger[:, None] * formal * larger
     step = -P @ B @ H_inverse @ B.T @ (equations.g + g_prior)
-    poses, intrinsics = slice(12 * n), slice(12 * n, None)
+    intrinsics = slice(12 * n, None)
     return PoseCovariance(
-        covariance[poses, poses] + torch.outer(step[poses], step[poses]),
+        covariance + torch.outer(step, step),
         SelfCalibration(step[intrinsics], covariance[intrinsics, intrinsics]),
     )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sl_nerfstudio.cli.lengths import print_lengths
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from sl_nerfstudio.evaluation.completeness.next_view import NextView
     from sl_nerfstudio.evaluation.evaluate import Evaluation
     from sl_nerfstudio.evaluation.inputs import EvaluationInputs
+    from sl_nerfstudio.evaluation.lengths import PointPair
 
 _JSON_MARK, _REPORT_MARK = b'"format": 1,\n  "verdict"', b"<title>Scan report: "  # by which earlier results are known
 
@@ -37,6 +39,11 @@ class EvalConfig:
     """Compare with this instead of ground_truth/mesh.ply: a mesh, or points in an .npz file under the key `xyz`."""
     f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D [D ...]")] = ()
     """Distances for the F-score, in the scan's unit; default: four round ones from 0.1 % to 1 % of the truth's size."""
+    distance: Annotated[tuple[str, ...], tyro.conf.arg(metavar='"P Q"')] = ()
+    """Distances to measure, each between two points of the surface: "12.5,-3,40 10,2,38" (x,y,z in the unit and axes of
+    the mesh), or "handle: 12.5,-3,40 10,2,38". With a mesh.ply of sl-export and --poses, each has its uncertainty."""
+    distances: Path | None = None
+    """A text file with such distances, one a line."""
     samples: int = 100_000
     """Number of points spread over each surface to measure distances."""
     seed: int = 0
@@ -60,13 +67,16 @@ def _evaluate(config: EvalConfig) -> None:
     from sl_nerfstudio.evaluation.evaluate import evaluate
     from sl_nerfstudio.evaluation.inputs import read_inputs
     from sl_nerfstudio.evaluation.judgement import judge
+    from sl_nerfstudio.evaluation.lengths import measure_lengths
     from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
     from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
     from sl_nerfstudio.evaluation.training_steps import trained_steps
     from sl_nerfstudio.files.atomic import write_atomic
 
+    pairs = _pairs(config)
     inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
+    lengths = measure_lengths(pairs, inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
     thumbnails = ResidualThumbnails()
     evaluation = evaluate(
         inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
@@ -77,19 +87,19 @@ def _evaluate(config: EvalConfig) -> None:
     judgement = judge(evaluation, hint, steps, capture)
     results: dict[Path, str] = {}
     if config.json:
-        results[config.json] = (
-            json.dumps(to_json(evaluation, judgement.verdict, capture), indent=2, allow_nan=False) + "\n"
-        )
+        document = to_json(evaluation, judgement.verdict, capture, lengths)
+        results[config.json] = json.dumps(document, indent=2, allow_nan=False) + "\n"
     if config.report:
         from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 
         results[config.report] = render_report(
-            ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name)
+            ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name, lengths=lengths)
         )
     for path, text in results.items():
         write_atomic(path, text.encode())
     if config.verbose:
         print_tables(evaluation)
+    print_lengths(lengths, inputs.scan.units)
     print(summary(evaluation, judgement, inputs.pose_sigma))
     for path in results:
         print(f"written: {path}")
@@ -109,6 +119,13 @@ def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "Next
         for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
     ]
     return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)
+
+
+def _pairs(config: EvalConfig) -> "list[PointPair]":
+    from sl_nerfstudio.evaluation.lengths import parse_pair, read_pairs
+
+    given = [parse_pair(text, "--distance") for text in config.distance]
+    return given + ([] if config.distances is None else read_pairs(config.distances))
 
 
 def _check(config: EvalConfig) -> None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from sl_nerfstudio.meshing.trim import Trimmed
+    from sl_nerfstudio.meshing.vertex_quality import VertexQuality
     from sl_nerfstudio.runs.export import Exported
     from sl_nerfstudio.runs.trained_run import TrainedRun
     from sl_nerfstudio.scan import Scan
@@ -141,6 +142,7 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         f"{config.output}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {extent} {unit}",
         *_removed(exported.trimmed),
         *_cut(exported.cut, unit),
+        *_uncertainty(exported.quality, unit),
     ]
     if poses is not None:
         known = ""
@@ -176,6 +178,21 @@ def _removed(trimmed: "Trimmed | None") -> list[str]:
     if trimmed.residual_px > _SUSPICIOUS_PX:
         lines.append("  warning: that is a lot. Poses or intrinsics are wrong, or the training has not converged.")
     return lines
+
+
+def _uncertainty(quality: "VertexQuality", unit: str) -> list[str]:
+    """How well the surface is known, and how much of it is not."""
+    import numpy as np
+
+    sigma = quality.sigma[quality.views > 0]
+    if not len(sigma):
+        return []
+    unseen = len(quality.sigma) - len(sigma)
+    without = f"; {unseen:,} vertices that no frame confirms have none" if unseen else ""
+    median, most = np.percentile(sigma, [50, 95])
+    return [
+        f"  uncertainty along the normal (1 sigma): {median:.2g} {unit} (median), 95 % below {most:.2g} {unit}{without}"
+    ]
 
 
 def _cut(cut: "ObjectCut | None", unit: str) -> list[str]:

@@ -8,10 +8,14 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.evaluation.reference import PointReference, Reference, mesh_reference
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.meshing.ply import read_quality
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.runs.covariance_file import read_covariance
 from sl_nerfstudio.scan import (
     FileError,
     PoseSigma,
@@ -41,6 +45,8 @@ class EvaluationInputs:
     poses_path: Path | None  # None: the scan's own poses are evaluated
     pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # one per frame, or empty
     training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
+    quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
+    joint: JointCovariance | None = None  # of the evaluated poses, if it is known
 
     @property
     def stated_sigma(self) -> list[PoseSigma | None]:
@@ -72,7 +78,14 @@ def read_inputs(
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
         training=None if path is None else _read_training(path.with_name("training.json")),
+        quality=_read_quality(mesh, result),
+        joint=None if path is None else read_covariance(path.parent, scan),
     )
+
+
+def _read_quality(path: Path, mesh: Mesh) -> VertexQuality | None:
+    quality = read_quality(path)
+    return quality if quality is not None and len(quality.sigma) == len(mesh.vertices) else None
 
 
 def read_refined_poses(path: Path, scan: Scan) -> DevicePoses:

@@ -1,24 +1,29 @@
 """The evaluation as JSON."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from sl_nerfstudio.evaluation.completeness.completeness import Completeness
 from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.lengths import Length
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import DeviceErrors, PoseErrors
 from sl_nerfstudio.verdict.verdict import Verdict
 
 
-def to_json(evaluation: Evaluation, verdict: Verdict, capture: NextView | None = None) -> dict[str, Any]:
+def to_json(
+    evaluation: Evaluation, verdict: Verdict, capture: NextView | None = None, lengths: Sequence[Length] = ()
+) -> dict[str, Any]:
     """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
     the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
-    to capture next; `cross_frame` is the agreement of the frames with each other.
+    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` are the distances that were
+    asked for.
     """
     out: dict[str, Any] = {
         "format": 1,
@@ -41,6 +46,8 @@ def to_json(evaluation: Evaluation, verdict: Verdict, capture: NextView | None =
         out["coverage"] = _coverage(evaluation.completeness) | {"next_capture": _capture(capture)}
     if evaluation.cross is not None:
         out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
+    if lengths:
+        out["lengths"] = [asdict(length) for length in lengths]
     return _finite(out)
 
 

@@ -10,6 +10,8 @@ from numpy import ndarray
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.ply import encode_ply
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.scan.file_error import FileError, check_file
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb")
@@ -28,12 +30,13 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def write_mesh(path: Path, mesh: Mesh) -> None:
+def write_mesh(path: Path, mesh: Mesh, quality: VertexQuality | None = None) -> None:
     """Write a mesh; `path` appears complete or not at all.
 
-    PLY keeps float64; OBJ has 8 decimals; STL and GLB hold float32, STL without shared vertices. Axes are not
-    changed, although GLB viewers may expect y up. Raises UserError for an unknown suffix, a mesh without
-    triangles, a vertex that is not a number, or a place where writing is impossible.
+    PLY keeps float64, and holds normals and the `quality` of each vertex, which the others leave out; OBJ has
+    8 decimals; STL and GLB hold float32, STL without shared vertices. Axes are not changed, although GLB viewers may
+    expect y up. Raises UserError for an unknown suffix, a mesh without triangles, a vertex that is not a number, or a
+    place where writing is impossible.
     """
     suffix = check_suffix(path)
     if len(mesh.faces) == 0:
@@ -48,18 +51,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
             "    cause:  the training diverged, or the scan's poses are wrong\n"
             "    remedy: check the scan with sl-check and train again"
         )
-    write_atomic(path, _ply(mesh) if suffix == ".ply" else _by_trimesh(mesh, suffix))
-
-
-def _ply(mesh: Mesh) -> bytes:
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    return header.encode("ascii") + mesh.vertices.astype("<f8").tobytes() + faces.tobytes()
+    write_atomic(path, encode_ply(mesh, quality) if suffix == ".ply" else _by_trimesh(mesh, suffix))
 
 
 def _by_trimesh(mesh: Mesh, suffix: str) -> bytes:

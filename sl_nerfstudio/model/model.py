@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import constrained
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.field.cached_grid import CachedGrid
 from sl_nerfstudio.field.sdf_field import SDFField
@@ -104,6 +105,16 @@ class SLModel(Model):
         sigma = self.device_poses.sigma
         return None if bool(sigma.isnan().any()) else sigmas_in_scan_units(sigma, self.S_scene_world)
 
+    @property
+    def cell(self) -> float:
+        """Length of the field's finest cells, in the scan's unit; the scene's box is two scene units wide."""
+        return 2 / self.config.sdf.max_resolution / self.S_scene_world.scale
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """Covariance of all poses and the intrinsics in the scan's world and units; None if it was not estimated."""
+        found = self.device_poses.joint_covariance()
+        return None if found is None else found.mapped(self.S_scene_world.inverse())
+
     def self_calibration(self) -> SelfCalibration | None:
         """How well the intrinsics agree with the captures; None if poses were not adjusted."""
         return self.device_poses.self_calibration()
@@ -154,7 +165,7 @@ class SLModel(Model):
         if c.adjusts_poses and len(self.scan.frames) > 1:
             found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             rig = found.rig
-            self.device_poses.note(found.sigma, found.intrinsics)
+            self.device_poses.note(found.sigma, found.joint, found.intrinsics)
             cameras = [frame.camera for frame in self.scan.frames]
             said.append(poses_message(found))
             if found.intrinsics is not None:

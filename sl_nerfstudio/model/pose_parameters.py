@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, packed, unpacked
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.model.settings import SLModelSettings
@@ -28,6 +29,7 @@ class PoseParameters(nn.Module):
     sigma: Tensor
     intrinsics_change: Tensor
     intrinsics_covariance: Tensor
+    joint_triangle: Tensor
 
     def __init__(
         self,
@@ -48,6 +50,9 @@ class PoseParameters(nn.Module):
         self.register_buffer("intrinsics_change", torch.full((UNKNOWNS,), float("nan"), dtype=torch.float64))
         covariance = torch.full((UNKNOWNS, UNKNOWNS), float("nan"), dtype=torch.float64)
         self.register_buffer("intrinsics_covariance", covariance)
+        # of all poses and the intrinsics, see JointCovariance: the lower triangle; NaN where not estimated
+        entries = (12 * n + UNKNOWNS) * (12 * n + UNKNOWNS + 1) // 2
+        self.register_buffer("joint_triangle", torch.full((entries,), float("nan"), dtype=torch.float64))
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
 
@@ -62,9 +67,15 @@ class PoseParameters(nn.Module):
         self.projector_step.zero_()
 
     @torch.no_grad()
-    def note(self, sigma: Float[Tensor, "frames 12"], intrinsics: SelfCalibration | None) -> None:
+    def note(
+        self,
+        sigma: Float[Tensor, "frames 12"],
+        joint: Float[Tensor, "joint joint"],
+        intrinsics: SelfCalibration | None,
+    ) -> None:
         """Store the adjustment's results other than the poses."""
         self.sigma.copy_(sigma)
+        self.joint_triangle.copy_(packed(joint))
         if intrinsics is not None:
             self.intrinsics_change.copy_(intrinsics.change)
             self.intrinsics_covariance.copy_(intrinsics.covariance)
@@ -73,6 +84,12 @@ class PoseParameters(nn.Module):
         """The adjustment's self-calibration of the intrinsics; None if nothing was adjusted."""
         found = SelfCalibration(self.intrinsics_change.cpu(), self.intrinsics_covariance.cpu())
         return found if found.known else None
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """The covariance of all poses and the intrinsics in the scene; None if it was not estimated."""
+        if bool(self.joint_triangle.isnan().any()):
+            return None
+        return JointCovariance(unpacked(self.joint_triangle.cpu()).numpy())
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""

@@ -14,6 +14,12 @@ from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
 from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, joint_of_prior
+from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import (
+    of_all_lengths,
+    of_baselines,
+    with_known_length,
+)
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
@@ -21,10 +27,12 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.held_out import BLOCK
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan, measured_length
 
+_STEP = 1e-5  # scene units and radian, of central differences
 _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable
 
 
@@ -51,6 +59,7 @@ class ScanAdjustment:
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
+    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
     cross_validation: CrossValidation
     noise_px: float
     intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
@@ -109,8 +118,9 @@ def adjust_scan(
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
-        return ScanAdjustment(found.rig, found.sigma, decision, found.noise_px, found.intrinsics)
-    return ScanAdjustment(start, stated.sigma, decision, found.noise_px, found.intrinsics)
+        return ScanAdjustment(found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics)
+    joint = joint_of_prior(stated, start)
+    return ScanAdjustment(start, stated.sigma, joint, decision, found.noise_px, found.intrinsics)
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,7 @@ class Found:
 
     rig: Rig
     sigma: Float[Tensor, "frames 12"]
+    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
     noise_px: float
     intrinsics: SelfCalibration | None
 
@@ -135,7 +146,16 @@ def adjusted(
     """Adjust the scan's poses from `start`, and restore the scan's lengths."""
     found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
-    return Found(rig, found.sigma, found.noise_px, found.intrinsics)
+    joint = torch.from_numpy(JointCovariance(found.joint.numpy()).mapped(_motion(found.rig, rig)).matrix)
+    known = known_length(scan, S_scene_world, refine, rig, prior)
+    return Found(rig, found.sigma, with_known_length(joint, rig, known), found.noise_px, found.intrinsics)
+
+
+def _motion(before: Rig, after: Rig) -> Similarity:
+    """The similarity that `restore` moved a rig by."""
+    scale = float(after.baseline[0] / before.baseline[0])
+    T = after.T_world_camera[0] @ inverse(before.scaled(scale).T_world_camera[0])
+    return Similarity(scale, T[:3, :3].numpy(), T[:3, 3].numpy())
 
 
 def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Rig, rig: Rig, prior: PosePrior) -> float:
@@ -149,6 +169,31 @@ def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Ri
         poses = DevicePoses(rig.T_world_camera.numpy(), rig.T_world_projector.numpy())
         return known.bar.length * S_scene_world.scale / measured_length(scan, known.bar, poses)
     return agreeing_scale(start, rig, prior)
+
+
+def known_length(
+    scan: Scan, S_scene_world: Similarity, refine: RefinePoses, rig: Rig, prior: PosePrior
+) -> Float[Tensor, "unknowns"]:
+    """Derivative, by (delta, rho), of the logarithm of the length at which the scan's scale is held."""
+    known = scan.scale
+    if known.baseline_of is not None:
+        return of_baselines(rig, scan.index_of(known.baseline_of))
+    if not known.known or refine == "known-rig":
+        return of_baselines(rig, None)
+    if known.bar is None:
+        return of_all_lengths(rig, prior)
+    bar, columns = known.bar, torch.eye(12 * rig.frames, dtype=torch.float64)
+
+    def log_length(step: Float[Tensor, "unknowns"]) -> float:
+        poses = rig.moved(*step.reshape(2, rig.frames, 6)).poses(S_scene_world.inverse())
+        return float(np.log(measured_length(scan, bar, poses)))
+
+    out = torch.zeros(12 * rig.frames, dtype=torch.float64)
+    for frame in {scan.index_of(pixel.frame) for pixel in bar.ends}:
+        for first in (6 * frame, 6 * (rig.frames + frame)):
+            for k in range(first, first + 6):
+                out[k] = (log_length(_STEP * columns[k]) - log_length(-_STEP * columns[k])) / (2 * _STEP)
+    return out
 
 
 def maps_and_held_out(

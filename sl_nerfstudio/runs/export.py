@@ -12,6 +12,9 @@ from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
 from sl_nerfstudio.meshing.trim import Trimmed, trim_to_observed
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
+from sl_nerfstudio.runs.covariance_file import write_covariance
 from sl_nerfstudio.runs.object_cut import ObjectCut, cut_object
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
@@ -36,11 +39,12 @@ class Exported:
     """What was written; lengths in the scan's unit."""
 
     mesh: Mesh
+    quality: VertexQuality  # of the mesh's vertices
     trimmed: Trimmed | None  # None: nothing was removed for not being observed
     cut: ObjectCut | None  # None: surroundings were not looked for
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
     extraction_seconds: float
-    writing_seconds: float  # trimming and writing
+    writing_seconds: float  # trimming, uncertainty and writing
 
 
 def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
@@ -55,11 +59,14 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     mesh = closed if trimmed is None else trimmed.mesh
     cut = cut_object(mesh, model.scan, model.poses()) if settings.object_only else None
     mesh = mesh if cut is None else cut.mesh
-    write_mesh(settings.mesh, mesh)
+    joint = model.joint_covariance()
+    quality = vertex_uncertainty(mesh, model.scan, model.poses(), joint, model.cell)
+    write_mesh(settings.mesh, mesh, quality)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
+        write_covariance(settings.pose_folder, model.scan, joint)
         write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
-    return Exported(mesh, trimmed, cut, model.pose_sigma(), extracted - start, time.perf_counter() - extracted)
+    return Exported(mesh, quality, trimmed, cut, model.pose_sigma(), extracted - start, time.perf_counter() - extracted)
 
 
 def _write_poses(path: Path, model: TrainedModel) -> None:

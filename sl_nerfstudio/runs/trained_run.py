@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.geometry.device_poses import DevicePoses
@@ -33,6 +34,11 @@ class TrainedModel(Protocol):
     S_scene_world: Similarity
 
     @property
+    def cell(self) -> float:
+        """Length of the field's finest cells, in the scan's unit."""
+        ...
+
+    @property
     def device(self) -> torch.device:
         """Where the field is evaluated."""
         ...
@@ -47,6 +53,10 @@ class TrainedModel(Protocol):
 
     def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
         """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
+        ...
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
         ...
 
     def self_calibration(self) -> SelfCalibration | None:

@@ -11,13 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 import yaml
 
+from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan
 from sl_nerfstudio.cli.export import main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.meshing.ply import read_quality
 from sl_nerfstudio.runs.trained_run import load_run
 from sl_nerfstudio.scan import read_devices, read_poses, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
@@ -61,6 +64,12 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
     assert np.median(off_mm) < 0.05 * RADIUS  # 40 steps; in wrong units or axes it would be off by 0.5 and more
     towards = (mesh.vertices - S_WORLD_MM.t) @ np.diag([1.0, -1.0, -1.0])
     assert towards[:, 2].max() > 3.5 > -2.5 > towards[:, 2].min() - 1  # cut at the back, which no frame saw
+    quality = read_quality(mesh_path)
+    assert quality is not None and len(quality.sigma) == len(mesh.vertices)
+    seen = quality.views > 0
+    assert seen.mean() > 0.9 and np.array_equal(seen, np.isfinite(quality.sigma))
+    assert (quality.sigma[seen] >= quality.sigma_independent[seen]).all() and 0 < np.median(quality.sigma[seen]) < 1
+    assert "uncertainty along the normal (1 sigma): " in said
     scan = read_scan(scan_root)
     found = read_poses(refined / "transforms.json", scan)
     np.testing.assert_allclose(found.T_world_camera[:, :3, 3], scan.poses.T_world_camera[:, :3, 3], atol=0.5)  # cm
@@ -74,6 +83,18 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
         " \\\n     ", ""
     )
     assert " cm\n" in said
+    measured(mesh_path, mesh.vertices[seen][[0, -1]], scan_root, refined, tmp_path)
+    assert "Distances between points, in cm" in capsys.readouterr().out
+
+
+def measured(mesh: Path, ends: np.ndarray, scan: Path, refined: Path, folder: Path) -> None:
+    """`sl-eval --distance` of two vertices."""
+    p, q = (",".join(map(str, end)) for end in ends.tolist())
+    flags = ("--mesh", mesh, "--data", scan, "--poses", refined, "--json", folder / "eval.json", "--samples", 2000)
+    evaluate_scan(tyro.cli(EvalConfig, args=[*map(str, flags), "--distance", f"across: {p} {q}"]))
+    (length,) = json.loads((folder / "eval.json").read_text())["lengths"]
+    assert length["length"] == pytest.approx(np.linalg.norm(ends[1] - ends[0]), rel=1e-4)
+    assert 0 < length["sigma_shared"] < length["sigma"] < 2 and min(length["views"]) > 0
 
 
 def test_a_run_with_changed_intrinsics_exports_them(scan_root, tmp_path, monkeypatch):

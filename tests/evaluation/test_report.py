@@ -11,6 +11,7 @@ from sl_nerfstudio.evaluation.evaluate import evaluate
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 from sl_nerfstudio.evaluation.judgement import judge
+from sl_nerfstudio.evaluation.lengths import Length
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.report.charts import nice_limit
 from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
@@ -19,6 +20,7 @@ from sl_nerfstudio.evaluation.report.plot3d import decimated
 from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
 from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
 from .faceted_scan import FacetedScan
@@ -90,7 +92,17 @@ def full_report(clean_scan: Path) -> str:
     evaluation = evaluate(made.truth(), scan, moved, reference, true, samples=5000, on_frame=thumbnails)
     sigma = PoseSigma(0.11, 0.022, 0.033, 0.044)
     path = Path("refined/transforms.json")
-    inputs = EvaluationInputs(made.truth(), scan, moved, true, reference, path, [sigma, None, sigma], TRAINING)
+    truth = made.truth()
+    count = len(truth.vertices)
+    views = np.arange(count) % 3  # a third of the vertices is not observed
+    stated = np.where(views > 0, 0.05, np.nan)
+    quality = VertexQuality(stated, 0.5 * stated, views, 4 * stated, 300 * stated)
+    inputs = EvaluationInputs(truth, scan, moved, true, reference, path, [sigma, None, sigma], TRAINING, quality)
+    end = (0.0, 0.0, 1.0)
+    lengths = [
+        Length("width <of> it", end, end, 12.3456, 0.0123, 0.0111, 0.0055, (3, 2)),
+        Length("height", end, end, 7.0, None, None, None, (3, 0)),
+    ]
     made_at = datetime(2026, 1, 2, 3, 4)
     return render_report(
         ReportInput(
@@ -100,6 +112,7 @@ def full_report(clean_scan: Path) -> str:
             thumbnails.frames,
             "<mesh & co>.ply",
             made_at,
+            lengths,
         )
     )
 
@@ -130,6 +143,7 @@ def test_report_tells_everything(full_report: str) -> None:
         "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
         "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
         "known (by construction)", "σ frame", "The intrinsics contradict the captures (chi square 412, by chance 6)",
+        "width <of> it 12.346 0.0123 0.0111 0.00550 3 and 2", "height 7 unknown unknown unknown 3 and 0",
         "focal length of the camera +1.00 %, of the projector -0.50 %", "camera: focal length +0.20 ± 0.01 %",
     ):  # fmt: skip
         assert what in text, what
@@ -142,7 +156,18 @@ def test_interactive_surface_is_complete(full_report: str) -> None:
     assert found
     figure = json.loads(found.group(1))
     assert [trace["type"] for trace in figure["data"]] == ["mesh3d", "scatter3d", "scatter3d"]
-    assert "intensity" in figure["data"][0]
+    (menu,) = figure["layout"]["updatemenus"]
+    names = ["error", "uncertainty (1 sigma)", "views", "residual", "ray angle"]
+    assert [button["label"] for button in menu["buttons"]] == names
+    changes = [button["args"][0] for button in menu["buttons"]]
+    count = len(FacetedScan().truth().vertices)
+    assert all(len(change["intensity"][0]) == count and button["args"][1] == [0]
+               for change, button in zip(changes, menu["buttons"], strict=True))  # fmt: skip
+    assert changes[0]["intensity"][0] == figure["data"][0]["intensity"]
+    sigma, views = (np.array(changes[k]["intensity"][0]) for k in (1, 2))
+    assert np.array_equal(views, np.arange(count) % 3)
+    assert np.allclose(sigma[views > 0], 0.05) and (sigma[views == 0] > changes[1]["cmax"]).all()  # marked
+    assert [change["colorbar.title.text"] for change in changes] == ["mm", "mm", "frames", "px", "degrees"]
 
 
 def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:

@@ -1,5 +1,6 @@
 """Poses as parameters: the meaning of an increment, derivatives, other base poses, and what each choice keeps fixed."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -183,7 +184,10 @@ def test_results_of_the_adjustment_are_saved_with_the_poses():
     poses = make(RigPoseParameters)
     assert poses.self_calibration() is None
     sigma, found = torch.rand(FRAMES, 12), SelfCalibration(torch.rand(6).double(), torch.eye(6).double())
-    poses.note(sigma, found)
+    factor = torch.randn(12 * FRAMES + 6, 12 * FRAMES + 6).double()
+    joint = factor + factor.T
+    assert poses.joint_covariance() is None
+    poses.note(sigma, joint, found)
     other = make(RigPoseParameters)
     other.load_state_dict(poses.state_dict())
     kept = other.self_calibration()
@@ -191,3 +195,5 @@ def test_results_of_the_adjustment_are_saved_with_the_poses():
         kept is not None and torch.equal(kept.change, found.change) and torch.equal(kept.covariance, found.covariance)
     )
     assert torch.equal(other.sigma, sigma.double())
+    both = other.joint_covariance()
+    assert both is not None and np.array_equal(both.matrix, joint.numpy())

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
+from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import with_known_length
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
@@ -27,6 +29,7 @@ from sl_nerfstudio.model.pose_refinement import (
     PriorConfig,
     adjust_scan,
     adjusted,
+    known_length,
     maps_and_held_out,
     pose_prior,
     scene_rig,
@@ -319,3 +322,32 @@ def test_intrinsics_are_not_refined_without_poses(scan, settings):
     config = settings_for(scan, refine_intrinsics=True, **settings)
     with pytest.raises(UserError, match=r"--pipeline\.model\.refine-intrinsics: .*but the poses are not adjusted"):
         config.prepare()
+
+
+BAR = ScaleBar((PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0))), 1.0)
+
+
+@pytest.mark.parametrize("scale", [
+    Scale(True, "a ruler", baseline_of="frame_00002"), Scale(False), Scale(True, "a bar", bar=BAR), Scale(True, "all"),
+])  # fmt: skip
+def test_the_length_that_fixes_the_scale_has_no_uncertainty(scan, true, scale):
+    """Its logarithm, by differences; the covariance of everything else is that of errors less a growth."""
+    said = replace(scan, scale=scale)
+    prior = pose_prior(said, S_SCENE_WORLD, PriorConfig())
+    known = known_length(said, S_SCENE_WORLD, "free", true, prior)
+    growth = gauge_directions(true)
+    assert known @ growth[:, 6] == pytest.approx(1, abs=1e-6)
+    assert (known @ growth[:, :6]).abs().max() < 1e-6  # a motion of the whole scene changes no length
+    generator = torch.Generator().manual_seed(0)
+    errors = torch.randn(200, 12 * FRAMES + 6, generator=generator, dtype=torch.float64)
+    found = with_known_length(errors.T @ errors, true, known)
+    assert known @ found[:-6, :-6] @ known == pytest.approx(0, abs=1e-6)
+    grown = torch.cat([growth[:, 6], torch.zeros(6)])
+    kept = errors - (errors[:, :-6] @ known)[:, None] * grown
+    assert torch.allclose(found, kept.T @ kept, atol=1e-6)
+    if scale.baseline_of is not None or not scale.known:
+        step = 1e-6 * torch.randn(2, FRAMES, 6, generator=generator, dtype=torch.float64)
+        lengths = [torch.log(rig.baseline) for rig in (true.moved(*step), true.moved(*-step))]
+        change = (lengths[0] - lengths[1]) / 2
+        expected = change[2] if scale.known else change.mean()
+        assert known @ step.reshape(-1) == pytest.approx(float(expected), rel=1e-5)

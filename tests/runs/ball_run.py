@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.extract import extract_mesh
@@ -25,6 +26,7 @@ class BallModel:
     scan: Scan
     sigma: np.ndarray | None = None
     S_scene_world: Similarity = S_SCENE_WORLD
+    cell: float = 1.0
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     def sdf(self, p_scene):
@@ -36,6 +38,9 @@ class BallModel:
 
     def pose_sigma(self):
         return self.sigma
+
+    def joint_covariance(self):
+        return None if self.sigma is None else JointCovariance(1e-6 * np.eye(12 * len(self.scan.frames) + 6))
 
     def self_calibration(self):
         return SelfCalibration(torch.full((6,), 0.01).double(), 1e-6 * torch.eye(6).double())

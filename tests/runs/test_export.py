@@ -34,6 +34,7 @@ def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
     assert json.loads((tmp_path / "refined/training.json").read_text()) == json.loads(json.dumps(training_record(run)))
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [
         "mesh.ply",
+        "pose_covariance.npz",
         "training.json",
         "transforms.json",
     ]

@@ -10,12 +10,14 @@ import trimesh
 from sl_nerfstudio.cli.export import ExportConfig, summary
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.runs.export import Exported
 from sl_nerfstudio.runs.object_cut import cut_object
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
 
 RADIUS = 25.0
+NO_QUALITY = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
 
 
 def _mesh(*parts: trimesh.Trimesh) -> Mesh:
@@ -58,7 +60,7 @@ def test_the_table_goes_and_the_ball_stays(scan):
 
 def test_the_summary_says_what_was_removed_and_why(scan):
     cut = cut_object(_mesh(BALL, TABLE), scan, scan.poses)
-    exported = Exported(cut.mesh, None, cut, None, 1.0, 1.0)
+    exported = Exported(cut.mesh, NO_QUALITY, None, cut, None, 1.0, 1.0)
     text = summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported)
     assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
     assert "of the points left out: all cameras are in front of it, nothing is behind it" in text

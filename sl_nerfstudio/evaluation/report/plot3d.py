@@ -2,16 +2,19 @@
 
 import base64
 import gzip
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import open3d as o3d
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.report.pictures import CLAY, ColourScale
+from sl_nerfstudio.evaluation.report.colour_layers import ColourLayer
+from sl_nerfstudio.evaluation.report.pictures import CLAY
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 
@@ -38,35 +41,19 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
     return Mesh(vertices, np.asarray(small.triangles).astype(np.int64)), nearest
 
 
-def mesh_figure(
-    mesh: Mesh,
-    values: Float[ndarray, "v"] | None,
-    scale: ColourScale | None,
-    units: str,
-    poses: DevicePoses,
-) -> str:
-    """Plotly figure (JSON): the surface, coloured by `values` if given, with cameras and projectors as dots."""
+def mesh_figure(mesh: Mesh, layers: Sequence[ColourLayer], poses: DevicePoses) -> str:
+    """Plotly figure (JSON): the surface with cameras and projectors as dots, and a menu of what colours it.
+
+    The first of the layers colours it at the start; without layers it is clay, and there is no menu.
+    """
     import plotly.graph_objects as go
 
     small, nearest = decimated(mesh)
     x, y, z = small.vertices.astype(np.float32).T
     i, j, k = small.faces.astype(np.int32).T
-    look: dict[str, Any] = {"color": f"rgb{tuple(int(255 * c) for c in CLAY)}"}
-    if values is not None and scale is not None:
-        stops = np.linspace(0, 1, 11)
-        colours = scale(scale.lower + stops * (scale.upper - scale.lower))
-        look = {
-            "intensity": values[nearest].astype(np.float32),
-            "colorscale": [
-                [float(s), f"rgb{tuple(int(255 * c) for c in rgb)}"] for s, rgb in zip(stops, colours, strict=True)
-            ],
-            "cmin": scale.lower,
-            "cmax": scale.upper,
-            "colorbar": {"title": {"text": units, "side": "right"}, "thickness": 12, "len": 0.7},
-            "hovertemplate": f"%{{intensity:.3g}} {units}<extra></extra>",
-        }
-    else:
-        look["hoverinfo"] = "skip"
+    look: dict[str, Any] = {"color": f"rgb{tuple(int(255 * c) for c in CLAY)}", "hoverinfo": "skip"}
+    if layers:
+        look = _look(layers[0], nearest)
     figure = go.Figure(
         go.Mesh3d(
             x=x, y=y, z=z, i=i, j=j, k=k, name="surface", showlegend=False, flatshading=False,
@@ -95,7 +82,38 @@ def mesh_figure(
         legend={"orientation": "h", "x": 0, "y": 0},
         font={"family": "inherit", "size": 12},
     )  # fmt: skip
+    if len(layers) > 1:
+        figure.update_layout(updatemenus=[_menu(layers, nearest)])
     return str(figure.to_json()).replace("<", "\\u003c")  # it goes into a <script> element
+
+
+def _look(layer: ColourLayer, nearest: Int[ndarray, "n"]) -> dict[str, Any]:
+    """The colours of the surface's trace."""
+    scale, stops = layer.scale, np.linspace(0, 1, 11)
+    colours = scale(scale.lower + stops * (scale.upper - scale.lower))
+    digits = max(0, 3 - math.floor(math.log10(max(abs(scale.lower), abs(scale.upper), 1e-12))))
+    return {
+        "intensity": np.round(layer.values[nearest], digits).tolist(),  # a menu cannot hold Plotly's packed arrays
+        "colorscale": [
+            [float(s), f"rgb{tuple(int(255 * c) for c in rgb)}"] for s, rgb in zip(stops, colours, strict=True)
+        ],
+        "cmin": scale.lower,
+        "cmax": scale.upper,
+        "colorbar": {"title": {"text": layer.units, "side": "right"}, "thickness": 12, "len": 0.7},
+        "hovertemplate": f"%{{intensity:.3g}} {layer.units}<extra></extra>",
+    }
+
+
+def _menu(layers: Sequence[ColourLayer], nearest: Int[ndarray, "n"]) -> dict[str, Any]:
+    """The menu that changes the colours of the first trace."""
+    buttons = []
+    for layer in layers:
+        look = _look(layer, nearest)
+        nested = {key: [look[key]] for key in ("intensity", "colorscale")}
+        plain = {key: look[key] for key in ("cmin", "cmax", "hovertemplate")}
+        change = {**nested, **plain, "colorbar.title.text": layer.units}
+        buttons.append({"label": layer.name, "method": "restyle", "args": [change, [0]]})
+    return {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "top", "bgcolor": "white"}
 
 
 def _xyz(v: Float[ndarray, "3"]) -> dict[str, float]:

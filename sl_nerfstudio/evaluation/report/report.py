@@ -1,6 +1,7 @@
 """The report: one HTML file with which a person can judge a scan, without a network."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -13,9 +14,11 @@ from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import EvaluationInputs
 from sl_nerfstudio.evaluation.judgement import Judgement
+from sl_nerfstudio.evaluation.lengths import Length
 from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.colour_layers import colour_layers
 from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
 from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, camera_views, data_uri, render
@@ -36,6 +39,7 @@ class ReportInput:
     thumbnails: list[FrameThumbnails]
     mesh_name: str
     made_at: datetime = field(default_factory=datetime.now)
+    lengths: Sequence[Length] = ()
 
     @property
     def poses_name(self) -> str:
@@ -51,6 +55,7 @@ class SurfacePictures:
     views: list[str]  # data addresses
     figure: str  # Plotly's JSON
     scale: ColourScale | None
+    layers: list[str]  # names of what the interactive view can be coloured by
     histogram: str  # SVG, "" without a reference
 
 
@@ -76,6 +81,7 @@ def render_report(report: ReportInput) -> str:
         "residual_chart": _residual_chart(evaluation),
         "outliers": _outliers(evaluation),
         "changes": _pose_changes(report),
+        "lengths": report.lengths,
         "truth": _truth_rows(evaluation),
         "training": _training(report.inputs.training),
         "summary": _summary(report),
@@ -89,14 +95,21 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictu
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
-    figure = mesh_figure(report.inputs.mesh, values, scale, units, report.inputs.poses)
+    layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
+    figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses)
     histogram = ""
     if scale is not None:
         errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])
         if errors is not None:
             title = "Signed distance of the surface from the reference"
             histogram = charts.histogram(title, units, errors, scale.lower, scale.upper)
-    return SurfacePictures([data_uri(render(surface, v, colours)) for v in views], figure, scale, histogram)
+    return SurfacePictures(
+        [data_uri(render(surface, v, colours)) for v in views],
+        figure,
+        scale,
+        [layer.name for layer in layers],
+        histogram,
+    )
 
 
 def _errors(

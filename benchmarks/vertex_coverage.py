@@ -1,0 +1,240 @@
+"""Whether sigma of the vertices is true: errors of exported meshes against the truth, in units of their sigma.
+
+    python -m benchmarks.vertex_coverage [--scenes ...] [--seeds 1 2] [--noise 0.2 0.5] [--again]
+
+Each scan has rough starting poses, and goes through `sl-synth`, `ns-train` and `sl-export` as a user would run them.
+The mesh is aligned with the truth as in `sl-eval`, rigidly. If sigma is right, 68 % of the vertices are closer to the
+truth than sigma, and 95 % closer than two sigma. Runs that are in the folder are not trained again, and rows that are
+in the result file are not measured again, so an interrupted benchmark continues; `--again` measures all of them.
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.machine import write_rows
+from benchmarks.common.whole_runs import run
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
+from sl_nerfstudio.evaluation.evaluate import score_alignments
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.inputs import EvaluationInputs, read_inputs
+from sl_nerfstudio.evaluation.reference import MeshReference
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.length_uncertainty import length_sigma
+from sl_nerfstudio.meshing.ply import read_quality
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
+
+SCENES = ("cone-and-cylinder", "head", "frog", "dog", "vase", "medal")
+_SAMPLES = 20_000
+_LENGTHS, _AWAY = 500, 0.8  # how many distances, and the least cosine of their ends' normals with them
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scan."""
+
+    scene: str
+    seed: int
+    noise: float  # of decoded coordinates, pattern pixels
+    frames: int
+    resolution: int
+    iterations: int
+    intrinsics: float = 0.0  # 1 sigma of their error, as shares of the focal length; 0: exact, which nobody states
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        wrong = f"-{self.intrinsics:g}" if self.intrinsics else ""
+        return f"{self.scene}-{self.seed}-{self.noise:g}-{self.frames}-{self.resolution}-{self.iterations}{wrong}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Errors of the vertices of one mesh; lengths in mm, shares between 0 and 1."""
+
+    scene: str
+    seed: int
+    noise: float
+    frames: int
+    resolution: int
+    iterations: int
+    intrinsics: float
+    vertices: int  # with a sigma
+    unobserved: float  # share of vertices that are marked as not observed
+    error_rms: float
+    error_rms_unobserved: float  # of the marked ones
+    sigma_median: float
+    sigma_independent_median: float
+    within_1: float
+    within_2: float
+    within_1_independent: float  # if the shared part is left out
+    within_1_exact_intrinsics: float  # if the doubt of the intrinsics, which are exact in these scans, is left out
+    lengths_within_1: float  # of distances between points of opposite sides
+    lengths_within_2: float
+    rank_correlation: float  # of |error| and sigma, over the vertices
+
+
+def train(case: Case, folder: Path) -> Path:
+    """Make the scan and train on it, unless that was done; returns the run's config.yml."""
+    scan, out = folder / case.name / "scan", folder / case.name / "runs"
+    if not (scan / "transforms.json").exists():
+        run(
+            *("sl-synth", "--output", str(scan), "--scene", case.scene, "--frames", str(case.frames)),
+            *("--resolution", str(case.resolution), "--seed", str(case.seed), "--noise", str(case.noise)),
+        )
+        disturb_intrinsics(scan / "transforms.json", case)
+    config = out / "run/sl-neus/now/config.yml"
+    stated = ("--pipeline.model.prior.intrinsics", str(case.intrinsics)) if case.intrinsics else ()
+    if not list(config.parent.glob(f"nerfstudio_models/step-*{case.iterations - 1}.ckpt")):
+        run(
+            *("ns-train", "sl-neus", "--data", str(scan), "--output-dir", str(out), "--experiment-name", "run"),
+            *("--timestamp", "now", "--max-num-iterations", str(case.iterations), *stated),
+        )
+    return config
+
+
+def disturb_intrinsics(path: Path, case: Case) -> None:
+    """Wrong focal lengths and principal points of both devices, of the size that the training is then told."""
+    document, rng = json.loads(path.read_text()), np.random.default_rng(case.seed)
+    for device in (document, document["projector"]):
+        focal, x, y = case.intrinsics * rng.standard_normal(3)
+        device["cx"] += device["fl_x"] * x
+        device["cy"] += device["fl_x"] * y
+        for key in ("fl_x", "fl_y"):
+            device[key] *= 1 + focal
+    path.write_text(json.dumps(document, indent=1))
+
+
+def measure(case: Case, folder: Path) -> Row:
+    """Export the run and compare its vertices with the truth."""
+    config, here = train(case, folder), folder / case.name
+    mesh, refined = here / "mesh.ply", here / "refined"
+    run(
+        *("sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(refined)),
+        *("--resolution", "256", "--overwrite"),
+    )
+    inputs = read_inputs(mesh, here / "scan", refined / "transforms.json", None, _SAMPLES, 0)
+    quality, reference = read_quality(mesh), inputs.reference
+    assert quality is not None and isinstance(reference, MeshReference)
+    surface = IndexedMesh(inputs.mesh)
+    score = score_alignments(surface, reference, inputs.poses, inputs.true_poses, samples=_SAMPLES)["rigid"]
+    error = np.abs(reference.surface_errors(surface, score.S_truth_result, inputs.mesh.vertices))
+    seen = quality.views > 0
+    ratio, alone = error[seen] / quality.sigma[seen], error[seen] / quality.sigma_independent[seen]
+    certain = error[seen] / _with_exact_intrinsics(inputs, quality)[seen]
+    lengths = _length_errors(inputs, quality, reference, score.S_truth_result)
+    return Row(
+        **asdict(case),
+        vertices=int(seen.sum()),
+        unobserved=float((~seen).mean()),
+        error_rms=_rms(error[seen]),
+        error_rms_unobserved=_rms(error[~seen]),
+        sigma_median=float(np.median(quality.sigma[seen])),
+        sigma_independent_median=float(np.median(quality.sigma_independent[seen])),
+        within_1=float((ratio < 1).mean()),
+        within_2=float((ratio < 2).mean()),
+        within_1_independent=float((alone < 1).mean()),
+        within_1_exact_intrinsics=float((certain < 1).mean()),
+        lengths_within_1=float((lengths < 1).mean()),
+        lengths_within_2=float((lengths < 2).mean()),
+        rank_correlation=float(np.corrcoef(_ranks(error[seen]), _ranks(quality.sigma[seen]))[0, 1]),
+    )
+
+
+def _with_exact_intrinsics(inputs: EvaluationInputs, quality: VertexQuality) -> np.ndarray:
+    """Sigma of each vertex under the covariance of the poses given the intrinsics."""
+    assert inputs.joint is not None
+    C, k = inputs.joint.matrix, len(inputs.joint.matrix) - UNKNOWNS
+    given = np.zeros_like(C)
+    given[:k, :k] = C[:k, :k] - C[:k, k:] @ np.linalg.solve(C[k:, k:], C[k:, :k])
+    found = vertex_uncertainty(inputs.mesh, inputs.scan, inputs.poses, JointCovariance(given), 1.0)
+    shared = found.sigma**2 - found.sigma_independent**2
+    return np.sqrt(quality.sigma_independent**2 + shared)
+
+
+def _length_errors(
+    inputs: EvaluationInputs, quality: VertexQuality, reference: MeshReference, S_truth_result: Similarity
+) -> np.ndarray:
+    """Errors of distances in units of their sigma, between vertices that face away from each other.
+
+    The nearest point of the truth then shows how far each end is off along the distance.
+    """
+    mesh, rng = inputs.mesh, np.random.default_rng(0)
+    seen, normals = np.flatnonzero(quality.views > 0), mesh.vertex_normals()
+    ends = rng.choice(seen, (40_000, 2))
+    along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        away = np.einsum("nej,nj->ne", normals[ends], along / length[:, None]) * [-1, 1]
+    ends = ends[(away > _AWAY).all(1) & (length > 0.1 * reference.size)][:_LENGTHS]
+    assert inputs.joint is not None
+    sigma = length_sigma(mesh, quality.sigma_independent, ends, inputs.scan, inputs.poses, inputs.joint)
+    true = reference.surface.closest(S_truth_result.points(mesh.vertices[ends.ravel()])).point.reshape(-1, 2, 3)
+    found = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
+    error = np.abs(found - np.linalg.norm(true[:, 1] - true[:, 0], axis=1))
+    return error / np.hypot(sigma.shared, sigma.independent)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean())) if len(values) else 0.0
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    return np.argsort(np.argsort(values)).astype(float)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--noise", nargs="+", type=float, default=[0.2, 0.5])
+    parser.add_argument("--frames", type=int, default=14)
+    parser.add_argument("--resolution", type=int, default=240)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument(
+        "--intrinsics", type=float, default=0.0, help="error of the intrinsics, share of the focal length"
+    )
+    parser.add_argument("--folder", type=Path, default=Path("outputs/vertex_coverage"))
+    parser.add_argument("--again", action="store_true", help="measure also what is in the result file")
+    parser.add_argument("--train-only", action="store_true", help="make scans and runs, measure nothing")
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/vertex_coverage.json"))
+    options = parser.parse_args()
+    size = (options.frames, options.resolution, options.iterations, options.intrinsics)
+    cases = [Case(a, b, c, *size) for b in options.seeds for c in options.noise for a in options.scenes]
+    if options.train_only:
+        for case in cases:
+            train(case, options.folder)
+            print(case.name, flush=True)
+        return
+    kept = [] if options.again or not options.output.exists() else json.loads(options.output.read_text())["rows"]
+    rows = [Row(**row) for row in kept]
+    done = {Case(*(row[name] for name in Case.__dataclass_fields__)) for row in kept}
+    for case in cases:
+        if case not in done:
+            rows.append(measure(case, options.folder))
+            write_rows(options.output, rows)
+            print(text(rows[-1]), flush=True)
+    ones = np.array([row.within_1 for row in rows])
+    inside = ((ones >= 0.6) & (ones <= 0.8)).sum()
+    print(f"within 1 sigma: mean {ones.mean():.0%}, {inside} of {len(ones)} scans in 60 to 80 %")
+
+
+def text(row: Row) -> str:
+    """One line."""
+    return (
+        f"{row.scene:18} {row.seed} noise {row.noise:.2f}  RMS {row.error_rms:.3f} mm  sigma {row.sigma_median:.3f} "
+        f"(independent {row.sigma_independent_median:.3f})  within 1: {row.within_1:.0%}  2: {row.within_2:.0%}  "
+        f"independent alone: {row.within_1_independent:.0%}  exact intrinsics: {row.within_1_exact_intrinsics:.0%}  "
+        f"lengths {row.lengths_within_1:.0%} {row.lengths_within_2:.0%}  rank correlation {row.rank_correlation:.2f}  "
+        f"not observed {row.unobserved:.1%} (RMS {row.error_rms_unobserved:.2f})"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""What is uncertain once the scale is fixed by a length, or by many.
+
+The covariance of an adjustment says nothing about the scale, which no residual determines. A rule then fixes it: some
+logarithm of a length, `log l`, is known. An error x of poses and intrinsics becomes `x - g (c . x)`, where g is the
+growth of everything by a factor, and c the derivative of `log l`, so that `c . g = 1`. Lengths that are badly known
+relative to the known one become uncertain in this way.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+
+
+def with_known_length(
+    joint: Float[Tensor, "joint joint"], rig: Rig, log_length: Float[Tensor, "unknowns"]
+) -> Float[Tensor, "joint joint"]:
+    """The covariance under the scale at which a length does not err; `log_length` is its derivative by the poses."""
+    growth = torch.zeros(len(joint), dtype=torch.float64)
+    growth[: len(log_length)] = gauge_directions(rig)[:, 6]
+    known = torch.zeros_like(growth)
+    known[: len(log_length)] = log_length
+    P = torch.eye(len(joint), dtype=torch.float64) - torch.outer(growth, known) / (known @ growth)
+    return P @ joint @ P.T
+
+
+def of_baselines(rig: Rig, frame: int | None) -> Float[Tensor, "unknowns"]:
+    """Derivative of the logarithm of one frame's baseline; for None, of the geometric mean of all."""
+    n, t = rig.frames, rig.T_camera_projector[:, :3, 3]
+    each = t / (t * t).sum(-1, keepdim=True)
+    out = torch.zeros(2, n, 6, dtype=torch.float64)
+    if frame is None:
+        out[1, :, :3] = each / n
+    else:
+        out[1, frame, :3] = each[frame]
+    return out.reshape(12 * n)
+
+
+def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
+    """That of the scale which agrees best with the starting poses (`gauge.agreeing_scale`)."""
+    H, _ = prior_equations(prior, rig, rig)
+    G = gauge_directions(rig)
+    return torch.linalg.solve(G.T @ H @ G, G.T @ H)[6]

@@ -1,0 +1,112 @@
+"""Uncertainty of every vertex along its normal, by linear propagation.
+
+Near a vertex the surface minimises the residuals of all pixels that see it. So it moves along its normal by
+`s = -sum(a . r) / sum(a . a)` when residuals change by r, with a the residuals' slope along the normal. Two kinds of
+errors change them. Decoding noise is independent from one vertex to another that is farther away than the field
+averages (`sigma_independent`). Errors of poses and intrinsics are shared by the whole surface: their joint covariance
+is propagated, less the rigid motion of the whole surface, which changes no shape.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from numpy import ndarray
+
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.surface_derivatives import by_poses_and_intrinsics, view_surface
+from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, independent_variance
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
+from sl_nerfstudio.scan.types import Scan
+
+_CHUNK = 4096  # vertices whose derivatives are in memory at a time
+_GAUGE_VERTICES = 4000  # of which the rigid motion of the whole surface is fitted
+
+
+def vertex_uncertainty(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, joint: JointCovariance | None, cell: float
+) -> VertexQuality:
+    """Uncertainty of a mesh in the scan's world.
+
+    `joint` is the covariance of `poses` and intrinsics; None if they are exact. `cell` is the length of the field's
+    finest cells.
+    """
+    views, count = collect_views(mesh, scan, poses), len(mesh.vertices)
+    independent = independent_variance(mesh, views, AVERAGED_CELLS * cell**2)
+    shared = np.zeros(count) if joint is None else _shared_variance(mesh, scan, poses, views, joint)
+    number = np.bincount(views.vertex, minlength=count)
+    angle = np.full(count, np.nan)
+    np.fmax.at(angle, views.vertex, np.degrees(views.ray_angle))
+    distance = np.bincount(views.vertex, np.linalg.norm(views.residual, axis=1), count)
+    seen = number > 0
+    return VertexQuality(
+        sigma=np.where(seen, np.sqrt(independent + shared), np.nan),
+        sigma_independent=np.where(seen, np.sqrt(independent), np.nan),
+        views=number,
+        residual=np.where(seen, distance / np.maximum(number, 1), np.nan),
+        ray_angle=angle,
+    )
+
+
+def _shared_variance(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, views: VertexViews, joint: JointCovariance
+) -> Float[ndarray, "v"]:
+    """Variance along the normal from the errors of poses and intrinsics, up to a rigid motion of the surface."""
+    seen, normals = np.unique(views.vertex), mesh.vertex_normals()
+    out = np.full(len(mesh.vertices), np.nan)
+    if len(seen) == 0:
+        return out
+    points = mesh.vertices - mesh.vertices[seen].mean(0)
+    rigid = np.concatenate([normals, np.cross(points, normals)], 1)
+    some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
+    rows = surface_rows(mesh.vertices, normals, scan, poses, views, some)
+    motion = np.linalg.lstsq(rigid[some], rows, rcond=None)[0]
+    for first in range(0, len(seen), _CHUNK):
+        part = seen[first : first + _CHUNK]
+        rows = surface_rows(mesh.vertices, normals, scan, poses, views, part) - rigid[part] @ motion
+        out[part] = np.einsum("vi,vi->v", rows @ joint.matrix, rows)
+    return np.maximum(out, 0.0)
+
+
+def surface_rows(
+    points: Float[ndarray, "n 3"],
+    normals: Float[ndarray, "n 3"],
+    scan: Scan,
+    poses: DevicePoses,
+    views: VertexViews,
+    vertices: Int64[ndarray, "v"],
+) -> Float[ndarray, "v joint"]:
+    """Derivatives of vertices along their normals by (delta, rho, intrinsics); `vertices` ascend, each has a view."""
+    n = len(scan.frames)
+    pairs, row = pairs_of(views, vertices)
+    out, total = np.zeros((len(vertices), 12 * n + UNKNOWNS)), np.zeros(len(vertices))
+    for k in np.unique(views.frame[pairs]).tolist():
+        mine = views.frame[pairs] == k
+        at, weight = pairs[mine], views.pixels_per_area[pairs[mine]]
+        p, normal = (torch.from_numpy(x[views.vertex[at]]) for x in (points, normals))
+        devices = devices_of(scan, poses, k)
+        view = view_surface(devices, p, normal)
+        B, slope = by_poses_and_intrinsics(devices, p, normal, view).numpy(), view.slope.numpy()
+        pull = -weight[:, None] * np.einsum("mi,mij->mj", slope, B)
+        columns = columns_of(k, n)
+        out[row[mine][:, None], columns] += pull[:, :12]
+        out[row[mine], 12 * n :] += pull[:, 12:]
+        total[row[mine]] += weight * (slope**2).sum(1)
+    return out / total[:, None]
+
+
+def pairs_of(views: VertexViews, vertices: Int64[ndarray, "v"]) -> tuple[Int64[ndarray, "m"], Int64[ndarray, "m"]]:
+    """Positions in `views` of ascending vertices, and for each position which of the vertices it belongs to."""
+    first, last = np.searchsorted(views.vertex, vertices), np.searchsorted(views.vertex, vertices, side="right")
+    number = last - first
+    row = np.repeat(np.arange(len(vertices)), number)
+    return np.arange(number.sum()) + np.repeat(first - np.cumsum(number) + number, number), row
+
+
+def columns_of(frame: int, frames: int) -> Int64[ndarray, "12"]:
+    """Where delta and rho of a frame are among the unknowns."""
+    return np.r_[6 * frame : 6 * frame + 6, 6 * (frames + frame) : 6 * (frames + frame) + 6]

@@ -1,0 +1,147 @@
+"""For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from numpy import ndarray
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
+from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.surface_derivatives import FrameDevices, SurfaceView, view_surface
+from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX, Occluder, visible_vertices
+from sl_nerfstudio.progress import track
+from sl_nerfstudio.scan.types import Frame, Scan
+
+_LOOKED_UP = 2000  # vertices of a frame, to compare the noise of windows with that of pixels
+_FEWEST = 20  # values of which a spread is stated
+
+
+@dataclass(frozen=True)
+class VertexViews:
+    """Pairs of a vertex and a frame that confirms it, by vertex; lengths in the scan's unit."""
+
+    vertex: Int64[ndarray, "m"]
+    frame: Int64[ndarray, "m"]
+    slope: Float[ndarray, "m 2"]  # of the residual along the normal, projector pixels per unit of length
+    residual: Float[ndarray, "m 2"]  # predicted minus decoded coordinate, projector pixels
+    pixels_per_area: Float[ndarray, "m"]
+    ray_angle: Float[ndarray, "m"]  # between the rays of camera and projector, radian
+    noise_px: Float[ndarray, "frames"]  # 1 sigma of one pixel's coordinate, each component; NaN if unknown
+    correlation: float  # how many neighbouring pixels share an error: 1 if their errors are independent
+
+
+@dataclass(frozen=True)
+class _FrameViews:
+    """The same of one frame."""
+
+    vertex: Int64[ndarray, "m"]
+    view: SurfaceView
+    residual: Float[ndarray, "m 2"]
+    noise_px: float
+    window_ratio: float  # variance of a window's value over that of a pixel; NaN if unknown
+
+
+def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
+    """The devices of one frame at the given poses."""
+    T_camera = torch.from_numpy(poses.T_world_camera[frame])
+    T_projector = torch.from_numpy(poses.T_world_projector[frame])
+    camera = Intrinsics.of(scan.frames[frame].camera, torch.float64)
+    return FrameDevices(
+        camera, Intrinsics.of(scan.projector, torch.float64), T_camera, torch.linalg.inv(T_camera) @ T_projector
+    )
+
+
+def collect_views(mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None = None) -> VertexViews:
+    """All frames that see, light and confirm each vertex (or each of the `chosen` ones).
+
+    A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
+    predicts. One frame's images are in memory at a time.
+    """
+    chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
+    points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
+    occluder = Occluder(mesh)
+    found = [
+        _views_of(points, normals, occluder, frame, scan, poses, k)
+        for k, frame in enumerate(track(scan.frames, "uncertainty of the surface"))
+    ]
+    vertex = np.concatenate([f.vertex for f in found])
+    order = np.argsort(vertex, kind="stable")
+    frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
+    ratios = np.array([f.window_ratio for f in found])
+    usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
+
+    def joined(name: str) -> ndarray:
+        return np.concatenate([getattr(f.view, name).numpy() for f in found])[order]
+
+    return VertexViews(
+        vertex=chosen[vertex[order]],
+        frame=frame[order],
+        slope=joined("slope"),
+        residual=np.concatenate([f.residual for f in found])[order],
+        pixels_per_area=joined("pixels_per_area"),
+        ray_angle=joined("ray_angle"),
+        noise_px=np.array([f.noise_px for f in found]),
+        correlation=max(1.0, window_pixels() * usual),
+    )
+
+
+def _views_of(
+    points: Float[ndarray, "v 3"],
+    normals: Float[ndarray, "v 3"],
+    occluder: Occluder,
+    frame: Frame,
+    scan: Scan,
+    poses: DevicePoses,
+    k: int,
+) -> _FrameViews:
+    seen = visible_vertices(
+        points, normals, occluder, frame, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k]
+    ).vertex
+    devices, coords = devices_of(scan, poses, k), frame.read_coords()
+    view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+    uv = view.uv_camera.numpy()
+    column, row = np.floor(uv).astype(np.int64).T
+    at_pixel = np.einsum("nij,nj->ni", view.by_pixel.numpy(), np.stack([column, row], 1) + 0.5 - uv)
+    residual = view.uv_projector.numpy() + at_pixel - coords[row, column]
+    size = np.linalg.norm(residual, axis=1)
+    known = np.isfinite(size)
+    usual = float(np.median(size[known])) if known.any() else 0.0
+    good = known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX))
+    view = SurfaceView(**{name: value[torch.from_numpy(good)] for name, value in vars(view).items()})
+    residual = residual[good]
+    noise = _spread(_across(view, residual))
+    return _FrameViews(seen[good], view, residual, noise, _window_ratio(coords, view, noise))
+
+
+def _across(view: SurfaceView, residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
+    """The component of residuals that no motion of the surface changes: noise, and errors of the poses."""
+    a = view.slope.numpy()
+    return (a[:, 0] * residual[:, 1] - a[:, 1] * residual[:, 0]) / np.linalg.norm(a, axis=1)
+
+
+def _spread(values: Float[ndarray, "n"]) -> float:
+    return float(np.median(np.abs(values))) * MAD_TO_SIGMA if len(values) >= _FEWEST else float("nan")
+
+
+def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, noise: float) -> float:
+    """Variance of look-ups, which average a window, over that of single pixels."""
+    some = evenly_spaced(len(view.uv_camera), min(_LOOKED_UP, len(view.uv_camera)))
+    part = SurfaceView(**{name: value[some] for name, value in vars(view).items()})
+    maps = CoordinateMaps.of([torch.from_numpy(coords)])
+    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), part.uv_camera)
+    across = _across(part, (part.uv_projector - seen.uv_projector).numpy())
+    return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
+
+
+def window_pixels(half: int = LookUpSettings().half_window) -> float:
+    """How many independent pixels have the variance of one look-up in a window that is decoded throughout."""
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1).astype(float)
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+    return 1 / float(np.linalg.inv(basis.T @ basis)[0, 0])

@@ -1,0 +1,187 @@
+"""Uncertainty of vertices: exact motions, a surface that is fitted again, units, noise by formula, unseen vertices."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.se3 import exp_se3
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.surface_derivatives import view_surface
+from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, Smoothing, independent_variance
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_uncertainty import surface_rows, vertex_uncertainty
+from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
+from sl_nerfstudio.scan import Scan
+
+from .ray_cast_scan import pairs_around, scan_of
+from .test_visibility import plate
+
+FRAMES, NOISE, CELL = 4, 0.4, 2.0
+
+
+def hill() -> Mesh:
+    """A plate of 60 mm with a bump, so that normals differ."""
+    flat = plate(30.0, 1.5)
+    x, y, z = (flat.vertices + [0.137, 0.071, 0.0]).T  # no vertex lies exactly between pixels
+    return Mesh(np.stack([x, y, z + 10 * np.exp(-(x**2 + (y - 5) ** 2) / 300)], 1), flat.faces)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    generator = np.random.default_rng(0)
+
+    def noisy(_: int, coords: np.ndarray) -> np.ndarray:
+        return (coords + generator.normal(0, NOISE, coords.shape)).astype(np.float32)
+
+    root: Path = tmp_path_factory.mktemp("hill") / "scan"
+    return scan_of(hill(), pairs_around(FRAMES, 60), root, noisy)
+
+
+@pytest.fixture(scope="module")
+def views(scan: Scan) -> VertexViews:
+    return collect_views(hill(), scan, scan.poses)
+
+
+def rows_of(scan: Scan, views: VertexViews) -> tuple[np.ndarray, np.ndarray]:
+    mesh = hill()
+    vertices = np.unique(views.vertex)[::7]
+    return vertices, surface_rows(mesh.vertices, mesh.vertex_normals(), scan, scan.poses, views, vertices)
+
+
+def random_joint() -> JointCovariance:
+    size = 12 * FRAMES + 6
+    factor = np.random.default_rng(1).normal(size=(size, size)) / size**0.5
+    scale = np.r_[np.tile([0.02] * 3 + [1e-4] * 3, 2 * FRAMES), [1e-4] * 6]  # mm and radian
+    return JointCovariance(scale[:, None] * (factor @ factor.T) * scale)
+
+
+def test_noise_and_its_independence_are_measured_from_the_scan(views: VertexViews):
+    np.testing.assert_allclose(views.noise_px, NOISE, rtol=0.1)
+    assert 1 <= views.correlation < 1.4
+
+
+def test_the_surface_moves_with_all_poses_and_grows_with_them(scan: Scan, views: VertexViews):
+    vertices, rows = rows_of(scan, views)
+    mesh = hill()
+    p, n = mesh.vertices[vertices], mesh.vertex_normals()[vertices]
+    motion = np.random.default_rng(2).normal(size=6)
+    all_frames = np.r_[np.tile(motion, FRAMES), np.zeros(6 * FRAMES + 6)]
+    np.testing.assert_allclose(rows @ all_frames, ((motion[:3] + np.cross(motion[3:], p)) * n).sum(1), rtol=1e-9)
+    growth = np.zeros((2, FRAMES, 6))
+    growth[0, :, :3] = scan.poses.T_world_camera[:, :3, 3]
+    growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
+    np.testing.assert_allclose(rows @ np.r_[growth.ravel(), np.zeros(6)], (p * n).sum(1), rtol=1e-8, atol=1e-8)
+
+
+def moved(scan: Scan, step: np.ndarray) -> DevicePoses:
+    """Poses with (delta, rho) of all frames."""
+    delta, rho = torch.from_numpy(step[: 12 * FRAMES]).reshape(2, FRAMES, 6)
+    camera = exp_se3(delta) @ torch.from_numpy(scan.poses.T_world_camera)
+    relative = exp_se3(rho) @ torch.from_numpy(scan.poses.T_camera_projector)
+    return DevicePoses(camera.numpy(), (camera @ relative).numpy())
+
+
+def test_vertices_move_as_surfaces_that_are_fitted_again(scan: Scan, views: VertexViews):
+    """With disturbed poses, each vertex is moved along its normal to where its pixels fit best, by iteration."""
+    vertices, rows = rows_of(scan, views)
+    mesh = hill()
+    p, n = (torch.from_numpy(x[vertices]) for x in (mesh.vertices, mesh.vertex_normals()))
+    seen = [np.isin(vertices, views.vertex[views.frame == k]) for k in range(FRAMES)]
+    decoded = [view_surface(devices_of(scan, scan.poses, k), p, n) for k in range(FRAMES)]
+
+    def fitted(poses: DevicePoses) -> np.ndarray:
+        s = torch.zeros(len(p), dtype=torch.float64)
+        for _ in range(3):
+            pull, total = torch.zeros_like(s), torch.zeros_like(s)
+            for k in range(FRAMES):
+                view = view_surface(devices_of(scan, poses, k), p + s[:, None] * n, n)
+                away = decoded[k].uv_camera - view.uv_camera  # the prediction at the pixel that was decoded
+                r = view.uv_projector + (view.by_pixel @ away[..., None]).squeeze(-1) - decoded[k].uv_projector
+                weight = torch.from_numpy(seen[k].astype(float)) * decoded[k].pixels_per_area
+                pull += weight * (view.slope * r).sum(-1)
+                total += weight * (view.slope**2).sum(-1)
+            s = s - pull / total
+        return s.numpy()
+
+    joint = random_joint().matrix[: 12 * FRAMES, : 12 * FRAMES]
+    for draw in np.random.default_rng(3).multivariate_normal(np.zeros(len(joint)), joint, 8):
+        found = (fitted(moved(scan, draw)) - fitted(moved(scan, -draw))) / 2
+        np.testing.assert_allclose(rows[:, : 12 * FRAMES] @ draw, found, rtol=1e-3, atol=1e-6)  # of about 0.03 mm
+
+
+def test_a_common_rigid_motion_is_no_uncertainty_of_the_shape(scan: Scan):
+    motion = np.r_[np.tile([1.0, 2.0, -1.0, 0.01, -0.02, 0.03], FRAMES), np.zeros(6 * FRAMES + 6)]
+    rigid = vertex_uncertainty(hill(), scan, scan.poses, JointCovariance(np.outer(motion, motion)), CELL)
+    exact = vertex_uncertainty(hill(), scan, scan.poses, None, CELL)
+    np.testing.assert_allclose(rigid.sigma, exact.sigma, rtol=1e-6)
+    assert np.array_equal(exact.sigma, exact.sigma_independent, equal_nan=True)
+
+
+def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views: VertexViews):
+    mesh, seen = hill(), np.unique(views.vertex)
+    on_truth = replace(views, residual=np.zeros_like(views.residual), correlation=1.0)
+    area = AVERAGED_CELLS * CELL**2
+    v = seen[len(seen) // 2]
+    mine = views.vertex == v
+    pixels = area * views.pixels_per_area[mine]
+    slope2 = (views.slope[mine] ** 2).sum(1)
+    noise = views.noise_px[views.frame[mine]]
+    expected = (pixels * slope2 * noise**2).sum() / (pixels * slope2).sum() ** 2
+    assert independent_variance(mesh, on_truth, area)[v] == pytest.approx(expected)
+    # a surface that lies 0.6 mm beside what the pixels say is that uncertain
+    beside = replace(on_truth, residual=0.6 * views.slope)
+    inner = np.abs(mesh.vertices[seen]).max(1) < 20
+    np.testing.assert_allclose(np.sqrt(independent_variance(mesh, beside, area)[seen[inner]]), 0.6, rtol=1e-6)
+
+
+def test_smoothing_averages_over_the_area_that_was_asked_for():
+    mesh = plate(30.0, 1.0)
+    one = np.zeros(len(mesh.vertices))
+    one[len(one) // 2] = 1.0
+    spread = Smoothing(mesh, 40.0)(one)
+    assert spread.sum() == pytest.approx(1)
+    assert 1.0 / (spread**2).sum() == pytest.approx(40.0, rel=0.25)  # each vertex stands for 1 mm^2
+
+
+def test_units_and_axes_of_the_world_do_not_matter(scan: Scan):
+    S = Similarity(1e-3, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.3, -0.1, 0.2]))
+    poses = scan.poses.mapped(S)
+    frames = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
+    metres = replace(scan, frames=tuple(replace(f, T_world_camera=c, T_world_projector=p) for f, c, p in frames))
+    found = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
+    other = vertex_uncertainty(hill().mapped(S), metres, poses, random_joint().mapped(S), CELL * 1e-3)
+    assert np.array_equal(found.views, other.views)
+    for name in ("sigma", "sigma_independent"):
+        np.testing.assert_allclose(1e3 * getattr(other, name), getattr(found, name), rtol=1e-4, err_msg=name)
+    np.testing.assert_allclose(other.residual, found.residual, rtol=1e-5)
+
+
+def test_vertices_that_no_frame_confirms_are_marked(scan: Scan):
+    """The plate goes on where nothing was decoded, and has an underside."""
+    x = plate(45.0, 1.5)
+    height = 10 * np.exp(-(x.vertices[:, 0] ** 2 + (x.vertices[:, 1] - 5) ** 2) / 300)
+    top = Mesh(x.vertices + height[:, None] * [0, 0, 1], x.faces)
+    count = len(top.vertices)
+    below = top.vertices - [0.0, 0.0, 5.0]
+    mesh = Mesh(np.concatenate([top.vertices, below]), np.concatenate([top.faces, top.faces[:, ::-1] + count]))
+    found: VertexQuality = vertex_uncertainty(mesh, scan, scan.poses, random_joint(), CELL)
+    inside = np.abs(top.vertices[:, :2]).max(1)
+    assert (found.views[:count][inside < 25] > 0).all() and (found.views[:count][inside > 33] == 0).all()
+    assert (found.views[count:] == 0).all()
+    for values in (found.sigma, found.sigma_independent, found.residual, found.ray_angle):
+        assert np.array_equal(np.isnan(values), found.views == 0)
+    seen = found.views > 0
+    assert (found.sigma[seen] > found.sigma_independent[seen]).all() and (found.sigma_independent[seen] > 0).all()
+    assert np.nanmin(found.ray_angle) > 8 and np.nanmax(found.ray_angle) < 12  # 20 degrees apart, 60 degrees up
+
+
+def test_of_a_mesh_that_no_frame_sees_nothing_is_stated(scan: Scan):
+    away = hill().mapped(Similarity(1.0, np.eye(3), np.array([500.0, 0.0, 0.0])))
+    found = vertex_uncertainty(away, scan, scan.poses, random_joint(), CELL)
+    assert (found.views == 0).all() and np.isnan(found.sigma).all()
