@@ -18,8 +18,9 @@ class SynthConfig:
     """A synthetic scan. Lengths in flags are in millimetres, fractions are between 0 and 1."""
 
     scene: str = "cone-and-cylinder"
-    """cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal, or a mesh file (.ply .obj .stl .glb) whose lengths
-    are in --units; chessboard, charuco: photographs of a calibration board under a pattern, for sl-calibrate"""
+    """cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal; with weak geometry: staircase, bottle, spheres,
+    bump, relief, rod; or a mesh file (.ply .obj .stl .glb) whose lengths are in --units; chessboard, charuco:
+    photographs of a calibration board under a pattern, for sl-calibrate"""
     appearance: Literal["plain", "realistic", "hard"] = "plain"
     """plain: grey images of a matte surface; realistic: colour photographs with texture, gloss, defocus, motion, room
     light, interreflection, changing exposure, gamma, JPEG and, among --images-only, a few useless frames; hard: all of

@@ -16,6 +16,7 @@ from sl_nerfstudio.synthesis.scenes.medal import medal
 from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
 from sl_nerfstudio.synthesis.scenes.sdf import capsule, carve, cylinder, ellipsoid, half_space, mesh_of, mirrored, union
 from sl_nerfstudio.synthesis.scenes.vase import vase
+from sl_nerfstudio.synthesis.scenes.weak_geometry import bottle, bump, relief, rod, spheres, staircase
 
 
 def _mesh(scene):
@@ -33,6 +34,12 @@ def scenes():
         "dog": dog(cell=1.5),
         "vase": vase(),
         "medal": medal(cell=1.0),
+        "staircase": staircase(cell=2.0),
+        "bottle": bottle(cell=2.0),
+        "spheres": spheres(cell=2.0),
+        "bump": bump(cell=2.0),
+        "relief": relief(cell=2.0),
+        "rod": rod(),
     }
 
 
@@ -64,6 +71,12 @@ def test_the_cone_and_the_cylinder_have_their_volume_and_size(scenes):
         ("dog", (36, 147, 108)),
         ("vase", (84, 84, 129)),
         ("medal", (96, 96, 8)),
+        ("staircase", (90, 60, 40)),
+        ("bottle", (60, 60, 124)),
+        ("spheres", (92, 60, 60)),
+        ("bump", (100, 80, 12)),
+        ("relief", (120, 90, 8)),
+        ("rod", (158, 13, 14)),
     ],
 )
 def test_free_forms_have_their_size_and_stand_on_the_ground(scenes, name, size):
@@ -72,7 +85,7 @@ def test_free_forms_have_their_size_and_stand_on_the_ground(scenes, name, size):
     assert abs(scene.vertices[:, 2].min()) < 0.5
 
 
-@pytest.mark.parametrize("name", ["head", "frog", "chair", "leaf", "dog", "vase", "medal"])
+@pytest.mark.parametrize("name", ["head", "frog", "chair", "leaf", "dog", "vase", "medal", "bottle", "spheres", "rod"])
 def test_normals_of_free_forms_point_outwards(scenes, name):
     scene = scenes[name]
     agree = (scene.vertex_normals[scene.faces].mean(1) * scene.face_normals).sum(1)
@@ -154,7 +167,7 @@ def test_a_written_mesh_comes_back_exactly(tmp_path, scenes):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal. nor"),
+        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal, .*rod. nor"),
         ("absent.ply", None, "there is no such file"),
         ("text.ply", b"hello", "cannot be read as a mesh"),
         ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"

@@ -16,6 +16,7 @@ from sl_nerfstudio.synthesis.scenes.leaf import leaf
 from sl_nerfstudio.synthesis.scenes.medal import medal
 from sl_nerfstudio.synthesis.scenes.scene import Scene
 from sl_nerfstudio.synthesis.scenes.vase import vase
+from sl_nerfstudio.synthesis.scenes.weak_geometry import bottle, bump, relief, rod, spheres, staircase
 
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 BUILT_IN: dict[str, Callable[[], Scene]] = {
@@ -27,6 +28,12 @@ BUILT_IN: dict[str, Callable[[], Scene]] = {
     "dog": dog,
     "vase": vase,
     "medal": medal,
+    "staircase": staircase,
+    "bottle": bottle,
+    "spheres": spheres,
+    "bump": bump,
+    "relief": relief,
+    "rod": rod,
 }
 
 

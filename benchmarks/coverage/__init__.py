@@ -1,0 +1,1 @@
+"""Does the stated uncertainty of poses and lengths cover the errors?"""
