@@ -1,7 +1,6 @@
 """Scans in memory: exact coordinates of a scene, disturbed as a decoder, a calibration and a registration do it."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.noise import Cells, CoordinateNoise, disturb_coords
 from sl_nerfstudio.synthesis.setup import Setup, make_setup
 
-FRAMES, RESOLUTION = 12, 240
+FRAMES, RESOLUTION = 8, 240
 SHARED_PIXELS = 2.0  # standard deviation of the blur of noise that neighbouring pixels share
 INTRINSICS = 0.001  # 1 sigma of the calibration, as a share of the focal length: stated, and drawn
 NOISES = {

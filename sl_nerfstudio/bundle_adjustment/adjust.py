@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, free_pa
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
-from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise
+from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import Observations, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
@@ -42,6 +42,7 @@ class Adjustment:
     iterations: int
     median_before_px: float
     median_after_px: float
+    unplaced: tuple[int, ...]  # frames that do not agree with the others: neither their poses nor their sigma hold
 
     @property
     def sigma(self) -> Float[Tensor, "frames 12"]:
@@ -207,6 +208,7 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
         iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
+        unplaced=unplaced_frames(state.rig, problem.maps, found.noise, problem.settings),
     )
 
 
@@ -217,4 +219,4 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor, settings: AdjustmentSettin
     noise = settings.kernel.noise_floor_px
     covariance = gauge_free(start, B, H, 1.0)
     joint = torch.block_diag(covariance, (prior.intrinsics_sigma**2).diag())
-    return Adjustment(start, covariance, joint, None, noise, 0, nan, nan)
+    return Adjustment(start, covariance, joint, None, noise, 0, nan, nan, ())

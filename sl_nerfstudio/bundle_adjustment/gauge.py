@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.se3 import pose, rotate
+from sl_nerfstudio.geometry.se3 import hat, pose, rotate
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
 _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
@@ -61,6 +61,27 @@ def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
     out[0, :, :3, 6] = rig.T_world_camera[:, :3, 3]
     out[1, :, :3, 6] = rig.T_camera_projector[:, :3, 3]
     return out.reshape(12 * n, 7)
+
+
+def gauge_projection(rig: Rig, frame: int | None = None) -> Float[Tensor, "unknowns unknowns"]:
+    """Projection of increments (delta, rho) onto those that `restore` leaves: no motion and no growth as a whole.
+
+    The length that is known is the baseline of `frame`, or for None the geometric mean of all baselines. (An
+    S-transformation: Baarda 1973.)
+    """
+    n, G = rig.frames, gauge_directions(rig)
+    fixed = torch.zeros(7, 12 * n, dtype=torch.float64)
+    ahead = rig.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
+    points = _axes_points(rig, ahead).reshape(2, n, 3)
+    J = torch.cat([torch.eye(3, dtype=torch.float64).expand(2, n, 3, 3), -hat(points)], -1)
+    fixed[:6, : 6 * n] = (J.transpose(-1, -2) @ J).sum(0).transpose(0, 1).reshape(6, 6 * n)
+    baseline = rig.T_camera_projector[:, :3, 3]
+    by_log = torch.zeros(n, 6, dtype=torch.float64)
+    by_log[:, :3] = baseline / (baseline**2).sum(-1, keepdim=True)
+    if frame is not None:
+        by_log[torch.arange(n) != frame] = 0.0
+    fixed[6, 6 * n :] = by_log.flatten()
+    return torch.eye(12 * n, dtype=torch.float64) - G @ torch.linalg.solve(fixed @ G, fixed)
 
 
 def _axes_points(rig: Rig, distance: Float[Tensor, "frames 1"]) -> Float[Tensor, "n 3"]:

@@ -36,21 +36,38 @@ class _Problem:
     projector_steps: int  # after those of the frame as a whole
 
     def support(self, rig: Rig, rows: Observations) -> Float[Tensor, "frames"]:
-        """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
-        r = residuals_of(rig, self.anchors, rows, self.maps)
-        inlier = r.cross.norm(dim=-1) < self.settings.relocalisation.inlier_noises * self.noise
-        out = torch.full((rig.frames,), float("nan"), dtype=torch.float64)
-        for k in range(rig.frames):
-            mine = r.cross_valid & ((self.anchors.frame[rows.anchor] == k) | (rows.frame == k))
-            if mine.any():
-                out[k] = inlier[mine].double().mean()
-        return out
+        """See support_of."""
+        return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
         """Every anchor in every other frame that may see it."""
         return observe(
             rig, self.anchors, self.maps, rig.frames, float("inf"), self.settings.least_cosine, self.generator, around
         )
+
+
+def support_of(
+    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, within_px: float
+) -> Float[Tensor, "frames"]:
+    """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
+    r = residuals_of(rig, anchors, rows, maps)
+    inlier = r.cross.norm(dim=-1) < within_px
+    out = torch.full((rig.frames,), float("nan"), dtype=torch.float64)
+    for k in range(rig.frames):
+        mine = r.cross_valid & ((anchors.frame[rows.anchor] == k) | (rows.frame == k))
+        if mine.any():
+            out[k] = inlier[mine].double().mean()
+    return out
+
+
+def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
+    """Frames that see too little of the surface on which the others agree, in order."""
+    s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
+    anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
+    rows = observe(rig, anchors, maps, rig.frames, float("inf"), settings.least_cosine, generator)
+    support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
+    wrong = support.isnan() | (support < s.least_share * support.nanmedian())
+    return tuple(wrong.nonzero().squeeze(-1).tolist())
 
 
 def least_support(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> float:

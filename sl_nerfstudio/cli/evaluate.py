@@ -84,7 +84,7 @@ def _evaluate(config: EvalConfig) -> None:
     )  # fmt: skip
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
     capture = _next_capture(evaluation, inputs)
-    judgement = judge(evaluation, hint, steps, capture)
+    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced)
     results: dict[Path, str] = {}
     if config.json:
         document = to_json(evaluation, judgement.verdict, capture, lengths)

@@ -25,6 +25,7 @@ from sl_nerfstudio.scan import (
     read_pose_sigmas,
     read_poses,
     read_scan,
+    read_unplaced,
 )
 from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import TRANSFORMS, read_document
@@ -44,6 +45,7 @@ class EvaluationInputs:
     reference: Reference | None
     poses_path: Path | None  # None: the scan's own poses are evaluated
     pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # one per frame, or empty
+    unplaced: list[str] = field(default_factory=list)  # frames that the poses file says do not agree with the others
     training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
     quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
     joint: JointCovariance | None = None  # of the evaluated poses, if it is known
@@ -77,6 +79,7 @@ def read_inputs(
         reference=read_reference(reference or truth.mesh_path, scan, truth.poses or evaluated, samples, seed),
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
+        unplaced=[] if path is None else read_unplaced(path, scan),
         training=None if path is None else _read_training(path.with_name("training.json")),
         quality=_read_quality(mesh, result),
         joint=None if path is None else read_covariance(path.parent, scan),

@@ -1,6 +1,7 @@
 """How the figures of an evaluation are judged, what that makes of the verdict, and what to do next."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sl_nerfstudio.evaluation.advice import capture_next, disagreeing_frames
@@ -37,11 +38,16 @@ class Judgement:
 
 
 def judge(
-    evaluation: Evaluation, intrinsics: str = "", steps: TrainedSteps | None = None, capture: NextView | None = None
+    evaluation: Evaluation,
+    intrinsics: str = "",
+    steps: TrainedSteps | None = None,
+    capture: NextView | None = None,
+    unplaced: Sequence[str] = (),
 ) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
     `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
+    `unplaced`: frames that the training could not place; a surface that they took part in is poor.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -82,6 +88,10 @@ def judge(
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:
         reasons += cross_reasons(names, evaluation.cross, VerdictSettings())
+    reasons += [
+        Reason("poor", f"{name}: could not be placed; leave it out or register it again, and train again")
+        for name in unplaced
+    ]
     verdict = worst(reasons)
     return Judgement(
         verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),

@@ -20,6 +20,17 @@ def poses_message(found: ScanAdjustment) -> str:
     )
 
 
+def unplaced_message(names: Sequence[str]) -> str:
+    """Which frames do not agree with the others, and what to do; "" if all do."""
+    if not names:
+        return ""
+    return (
+        f"Frames that cannot be placed: {', '.join(names)}. They do not see the surface on which the others agree.\n"
+        "    cause:  their starting poses are far off, or their coordinates are decoded wrongly\n"
+        "    remedy: remove them from transforms.json, or register the captures again (sl-process)"
+    )
+
+
 def contradiction_message(found: SelfCalibration, cameras: Sequence[Device], projector: Device) -> str:
     """Which intrinsics would agree better, for the person who calibrated; "" if the captures agree with them."""
     if not found.contradicts():

@@ -24,7 +24,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model.decoding_noise import measure_decoding
 from sl_nerfstudio.model.history import History
 from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
-from sl_nerfstudio.model.messages import contradiction_message, poses_message
+from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
 from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, ray_outputs, residual_output
 from sl_nerfstudio.model.pose_parameters import make_pose_parameters
 from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
@@ -115,6 +115,10 @@ class SLModel(Model):
         found = self.device_poses.joint_covariance()
         return None if found is None else found.mapped(self.S_scene_world.inverse())
 
+    def unplaced(self) -> list[bool]:
+        """Of each frame, whether it does not agree with the others, so that neither its poses nor their sigma hold."""
+        return self.device_poses.unplaced.tolist()
+
     def self_calibration(self) -> SelfCalibration | None:
         """How well the intrinsics agree with the captures; None if poses were not adjusted."""
         return self.device_poses.self_calibration()
@@ -165,9 +169,9 @@ class SLModel(Model):
         if c.adjusts_poses and len(self.scan.frames) > 1:
             found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             rig = found.rig
-            self.device_poses.note(found.sigma, found.joint, found.intrinsics)
+            self.device_poses.note(found.sigma, found.joint, found.intrinsics, found.unplaced)
             cameras = [frame.camera for frame in self.scan.frames]
-            said.append(poses_message(found))
+            said += [poses_message(found), unplaced_message([self.scan.frames[k].name for k in found.unplaced])]
             if found.intrinsics is not None:
                 said.append(contradiction_message(found.intrinsics, cameras, self.scan.projector))
         if c.renders_poses:

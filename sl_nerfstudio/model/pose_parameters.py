@@ -9,6 +9,8 @@ All start from a *base* that may be replaced (by the bundle adjustment) before t
 increments to it.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -30,6 +32,7 @@ class PoseParameters(nn.Module):
     intrinsics_change: Tensor
     intrinsics_covariance: Tensor
     joint_triangle: Tensor
+    unplaced: Tensor
 
     def __init__(
         self,
@@ -53,6 +56,7 @@ class PoseParameters(nn.Module):
         # of all poses and the intrinsics, see JointCovariance: the lower triangle; NaN where not estimated
         entries = (12 * n + UNKNOWNS) * (12 * n + UNKNOWNS + 1) // 2
         self.register_buffer("joint_triangle", torch.full((entries,), float("nan"), dtype=torch.float64))
+        self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
 
@@ -72,10 +76,13 @@ class PoseParameters(nn.Module):
         sigma: Float[Tensor, "frames 12"],
         joint: Float[Tensor, "joint joint"],
         intrinsics: SelfCalibration | None,
+        unplaced: Sequence[int] = (),
     ) -> None:
         """Store the adjustment's results other than the poses."""
         self.sigma.copy_(sigma)
         self.joint_triangle.copy_(packed(joint))
+        self.unplaced.zero_()
+        self.unplaced[list(unplaced)] = True
         if intrinsics is not None:
             self.intrinsics_change.copy_(intrinsics.change)
             self.intrinsics_covariance.copy_(intrinsics.covariance)

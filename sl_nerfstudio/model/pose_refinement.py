@@ -63,6 +63,7 @@ class ScanAdjustment:
     cross_validation: CrossValidation
     noise_px: float
     intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
+    unplaced: tuple[int, ...] = ()  # frames that do not agree with the others
 
     @property
     def adjusted(self) -> bool:
@@ -118,9 +119,11 @@ def adjust_scan(
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
-        return ScanAdjustment(found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics)
+        return ScanAdjustment(
+            found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics, found.unplaced
+        )
     joint = joint_of_prior(stated, start)
-    return ScanAdjustment(start, stated.sigma, joint, decision, found.noise_px, found.intrinsics)
+    return ScanAdjustment(start, stated.sigma, joint, decision, found.noise_px, found.intrinsics, found.unplaced)
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,7 @@ class Found:
     joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
     noise_px: float
     intrinsics: SelfCalibration | None
+    unplaced: tuple[int, ...]  # frames that do not agree with the others
 
 
 def adjusted(
@@ -148,7 +152,9 @@ def adjusted(
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     joint = torch.from_numpy(JointCovariance(found.joint.numpy()).mapped(_motion(found.rig, rig)).matrix)
     known = known_length(scan, S_scene_world, refine, rig, prior)
-    return Found(rig, found.sigma, with_known_length(joint, rig, known), found.noise_px, found.intrinsics)
+    return Found(
+        rig, found.sigma, with_known_length(joint, rig, known), found.noise_px, found.intrinsics, found.unplaced
+    )
 
 
 def _motion(before: Rig, after: Rig) -> Similarity:

@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float
 from numpy import ndarray
@@ -71,6 +72,10 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
 
 def _write_poses(path: Path, model: TrainedModel) -> None:
     """The scan's transforms.json with the refined poses and, if it was estimated, their uncertainty."""
-    sigma = model.pose_sigma()
-    extra = None if sigma is None else [{"sl_pose_sigma": sigma_fields(PoseSigma(*row))} for row in sigma.tolist()]
+    sigma, unplaced = model.pose_sigma(), model.unplaced()
+    extra: list[dict[str, Any]] = [{"sl_unplaced": True} if lost else {} for lost in unplaced]
+    if sigma is not None:
+        for fields, row in zip(extra, sigma.tolist(), strict=True):
+            if not fields:  # where a frame cannot be placed, its sigma says nothing
+                fields["sl_pose_sigma"] = sigma_fields(PoseSigma(*row))
     write_transforms(path, model.scan, model.poses(), extra_frame_fields=extra)

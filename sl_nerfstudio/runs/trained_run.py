@@ -59,6 +59,10 @@ class TrainedModel(Protocol):
         """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
         ...
 
+    def unplaced(self) -> list[bool]:
+        """Of each frame, whether it does not agree with the others."""
+        ...
+
     def self_calibration(self) -> SelfCalibration | None:
         """How well the intrinsics agree with the captures; None where poses were not adjusted."""
         ...

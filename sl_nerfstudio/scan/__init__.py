@@ -13,6 +13,7 @@ from sl_nerfstudio.scan.pose_files import (
     read_ground_truth,
     read_pose_sigmas,
     read_poses,
+    read_unplaced,
     write_transforms,
 )
 from sl_nerfstudio.scan.reading import read_scan
@@ -39,6 +40,7 @@ __all__ = [
     "read_pose_sigmas",
     "read_poses",
     "read_scan",
+    "read_unplaced",
     "require_valid",
     "write_transforms",
 ]

@@ -36,8 +36,9 @@ def write_transforms(
 ) -> None:
     """Write a copy of the scan's transforms.json with other poses, and with the scan's intrinsics if they were changed.
 
-    Everything else is kept, unknown keys too, except `sl_pose_sigma`, which describes the poses replaced here. Paths
-    are kept as they are, relative to the scan folder: to use the copy, put it there in place of the original.
+    Everything else is kept, unknown keys too, except `sl_pose_sigma` and `sl_unplaced`, which describe the poses
+    replaced here. Paths are kept as they are, relative to the scan folder: to use the copy, put it there in place of
+    the original.
     `extra_frame_fields` (one per frame, in the scan's order) and `extra_fields` add or replace keys. The file appears
     complete or not at all. Raises ValueError for poses that are not rigid motions or not one per frame, ScanError if
     the scan's file was changed meanwhile.
@@ -52,6 +53,7 @@ def write_transforms(
     document.pop("sl_pose_sigma", None)
     for index, record in enumerate(document["frames"]):
         record.pop("sl_pose_sigma", None)
+        record.pop("sl_unplaced", None)
         record.update(pose_fields(poses.T_world_camera[index], poses.T_world_projector[index]))
         record.update(extras[index])
     if scan.intrinsics_change:
@@ -142,6 +144,13 @@ def read_pose_sigmas(path: Path, scan: Scan) -> list[PoseSigma | None]:
         if isinstance(sigma, dict) and all(isinstance(sigma.get(key), int | float) for key in SIGMA_KEYS):
             found[frame_label(record, index)] = PoseSigma(**{key: float(sigma[key]) for key in SIGMA_KEYS})
     return [found.get(frame.name) for frame in scan.frames]
+
+
+def read_unplaced(path: Path, scan: Scan) -> list[str]:
+    """Names of the scan's frames that a transforms.json marks as not agreeing with the others (`sl_unplaced`)."""
+    records = enumerate(_read(path, str(path.parent))["frames"])
+    marked = {frame_label(record, index) for index, record in records if record.get("sl_unplaced") is True}
+    return [frame.name for frame in scan.frames if frame.name in marked]
 
 
 def _read_both_kinds(

@@ -4,12 +4,18 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.gauge import (
+    agreeing_scale,
+    baseline_scale,
+    gauge_directions,
+    gauge_projection,
+    restore,
+)
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.se3 import exp_se3
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3
 
 from .analytic import disturbed, images_of, rig_of
 
@@ -82,3 +88,21 @@ def test_no_residual_changes():
     assert before.cross_valid.sum() > 30 and torch.equal(before.cross_valid, after.cross_valid)
     assert torch.allclose(before.own, after.own, atol=1e-9)
     assert torch.allclose(before.cross[before.cross_valid], after.cross[before.cross_valid], atol=1e-8)
+
+
+@pytest.mark.parametrize("frame", [None, 1])
+def test_the_projection_is_what_restoring_leaves_of_small_increments(frame):
+    true, generator = rig_of(4, 80), torch.Generator().manual_seed(3)
+    x = 1e-6 * torch.randn(48, generator=generator, dtype=torch.float64)
+    moved = true.moved(*x.reshape(2, 4, 6))
+    back = restore(true, moved, baseline_scale(true, moved, frame))
+    left = [
+        log_se3(now @ inverse(then)).reshape(-1)
+        for now, then in (
+            (back.T_world_camera, true.T_world_camera),
+            (back.T_camera_projector, true.T_camera_projector),
+        )
+    ]
+    P = gauge_projection(true, frame)
+    assert torch.allclose(P @ x, torch.cat(left), atol=1e-10)
+    assert (P @ gauge_directions(true)).abs().max() < 1e-9 and torch.allclose(P @ P, P, atol=1e-9)

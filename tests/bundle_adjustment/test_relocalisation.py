@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.relocalisation import find_lost_frames, relocalise
+from sl_nerfstudio.bundle_adjustment.relocalisation import find_lost_frames, relocalise, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
 
@@ -54,3 +54,12 @@ def test_lost_frames_are_those_with_little_support_best_first():
     assert not len(find_lost_frames(alike, SETTINGS))  # 2.5 % below equally good frames is not lost
     alike[2] = 0.7
     assert find_lost_frames(alike, SETTINGS).tolist() == [2]
+
+
+def test_a_frame_that_is_far_off_is_named_and_no_other(true):
+    maps = ExactMaps.around(true, SIZE)
+    assert unplaced_frames(true, maps, 0.05, AdjustmentSettings()) == ()
+    cameras = true.T_world_camera.clone()
+    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(60)
+    cameras[LOST] = exp_se3(turn) @ cameras[LOST]
+    assert unplaced_frames(replace(true, T_world_camera=cameras), maps, 0.05, AdjustmentSettings()) == (LOST,)

@@ -29,6 +29,11 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
 
+def test_a_frame_that_training_could_not_place_makes_the_scan_poor() -> None:
+    verdict = judge(GOOD, unplaced=["frame_00001"]).verdict
+    assert verdict.band == "poor" and verdict.reasons[0].startswith("frame_00001: could not be placed")
+
+
 def _with(**changes) -> dict:
     """Five good frames and one that is not."""
     return {"frames": (*[FRAME] * 5, replace(FRAME, name="frame_00007", **changes))}

@@ -5,7 +5,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
-from sl_nerfstudio.model.messages import contradiction_message, poses_message
+from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment
 
 from ..bundle_adjustment.analytic import rig_of
@@ -38,3 +38,9 @@ def test_both_residuals_are_in_the_message():
     text = poses_message(ScanAdjustment(rig, torch.zeros(3, 12), torch.zeros(42, 42), chance, 0.1))
     assert text.startswith("Poses NOT changed") and text.endswith("starting poses are kept.")
     assert "0.29 px, before 0.3 px" in text
+
+
+def test_frames_that_cannot_be_placed_are_named():
+    assert unplaced_message([]) == ""
+    text = unplaced_message(["frame_3", "frame_5"])
+    assert text.startswith("Frames that cannot be placed: frame_3, frame_5.") and "remedy:" in text

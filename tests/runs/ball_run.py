@@ -27,6 +27,7 @@ class BallModel:
     sigma: np.ndarray | None = None
     S_scene_world: Similarity = S_SCENE_WORLD
     cell: float = 1.0
+    last_unplaced: bool = False
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
     def sdf(self, p_scene):
@@ -41,6 +42,9 @@ class BallModel:
 
     def joint_covariance(self):
         return None if self.sigma is None else JointCovariance(1e-6 * np.eye(12 * len(self.scan.frames) + 6))
+
+    def unplaced(self):
+        return [False] * (len(self.scan.frames) - 1) + [self.last_unplaced]
 
     def self_calibration(self):
         return SelfCalibration(torch.full((6,), 0.01).double(), 1e-6 * torch.eye(6).double())

@@ -8,7 +8,7 @@ import pytest
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.runs.export import ExportSettings, export_run
 from sl_nerfstudio.runs.run_record import training_record
-from sl_nerfstudio.scan import PoseSigma, Scan, read_pose_sigmas, read_poses
+from sl_nerfstudio.scan import PoseSigma, Scan, read_pose_sigmas, read_poses, read_unplaced
 
 from .ball_run import CENTRE, RADIUS, ball_scan, run_of
 
@@ -62,3 +62,11 @@ def test_the_area_of_the_trimmed_surface_does_not_depend_on_the_resolution(scan:
         for n in (64, 96)
     ]
     assert areas[0] == pytest.approx(areas[1], rel=0.03)
+
+
+def test_a_frame_that_cannot_be_placed_is_marked_and_states_no_uncertainty(scan: Scan, tmp_path):
+    run = run_of(scan, np.ones((6, 4)))
+    run.model.last_unplaced = True
+    export_run(run, ExportSettings(tmp_path / "mesh.ply", tmp_path, resolution=32))
+    assert read_unplaced(tmp_path / "transforms.json", scan) == [scan.frames[-1].name]
+    assert [s is None for s in read_pose_sigmas(tmp_path / "transforms.json", scan)] == [False] * 5 + [True]

@@ -150,6 +150,7 @@ class PoseChanges:
 
     change: PoseErrors
     sigma: list[PoseSigma | None]
+    unplaced: list[str]  # frames that do not agree with the others
     charts: list[str]
 
 
@@ -179,7 +180,7 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
                 for key, label in zip(keys, labels, strict=True)
             ]
             figures.append(charts.frame_bars(title, unit, series))
-    return PoseChanges(change, sigma, figures)
+    return PoseChanges(change, sigma, report.inputs.unplaced, figures)
 
 
 def _truth_rows(evaluation: Evaluation) -> list[tuple[str, PoseErrors]]:
