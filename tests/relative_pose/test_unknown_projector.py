@@ -130,11 +130,10 @@ def test_a_wrong_principal_point_is_named(noisy):
 DOUBT = (0.004, 0.003, 0.005)  # of the camera, shares of its focal length
 
 
-@pytest.mark.parametrize("signs", [(1, 1, -1), (-1, 1, 1)])
-def test_an_uncertain_camera_makes_the_projector_as_uncertain_as_it_moves_it(signs):
+def test_an_uncertain_camera_makes_the_projector_as_uncertain_as_it_moves_it():
     """Exact coordinates, so that nothing else moves it: within what three values of 1 sigma each can do together."""
-    change = DeviceChange(*(sign * sigma for sign, sigma in zip(signs, DOUBT, strict=True)))
-    frames = [replace(f, camera=change.applied(f.camera)) for f in frames_of(SHIFTED, 6)]
+    change = DeviceChange(-DOUBT[0], DOUBT[1], DOUBT[2])
+    frames = [replace(f, camera=change.applied(f.camera)) for f in frames_of(SHIFTED, 4)]
     found = estimate_projector(frames, SHIFTED, True, 0, QUICK, DOUBT)
     certain = estimate_projector(frames, SHIFTED, True, 0, QUICK)
     assert not isinstance(found, NoProjector) and not isinstance(certain, NoProjector)
