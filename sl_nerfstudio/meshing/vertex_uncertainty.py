@@ -23,7 +23,7 @@ from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
 from sl_nerfstudio.scan.types import Scan
 
-_CHUNK = 4096  # vertices whose derivatives are in memory at a time
+_ENTRIES = 8_000_000  # derivatives that are in memory at a time
 _GAUGE_VERTICES = 4000  # of which the rigid motion of the whole surface is fitted
 
 
@@ -65,8 +65,9 @@ def _shared_variance(
     some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
     rows = surface_rows(mesh.vertices, normals, scan, poses, views, some)
     motion = np.linalg.lstsq(rigid[some], rows, rcond=None)[0]
-    for first in range(0, len(seen), _CHUNK):
-        part = seen[first : first + _CHUNK]
+    chunk = max(_ENTRIES // len(joint.matrix), 1)
+    for first in range(0, len(seen), chunk):
+        part = seen[first : first + chunk]
         rows = surface_rows(mesh.vertices, normals, scan, poses, views, part) - rigid[part] @ motion
         out[part] = np.einsum("vi,vi->v", rows @ joint.matrix, rows)
     return np.maximum(out, 0.0)
