@@ -367,7 +367,7 @@ def test_export_pointcloud_in_the_scans_units(config: Path, tmp_path: Path, monk
     call(
         ns_export.entrypoint,
         monkeypatch,
-        *("pointcloud", "--load-config", config, "--output-dir", tmp_path, "--num-points", 3000),
+        *("pointcloud", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
         *("--num-rays-per-batch", 2000, "--save-world-frame", True),
     )
     cloud = trimesh.load(tmp_path / "point_cloud.ply")
@@ -378,7 +378,7 @@ def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     call(
         ns_export.entrypoint,
         monkeypatch,
-        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 3000),
+        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
         *("--num-rays-per-batch", 2000, "--texture-method", "point_cloud"),
     )
     assert len(trimesh.load(tmp_path / "poisson_mesh.ply").faces) > 100

@@ -97,7 +97,9 @@ def full_report(clean_scan: Path) -> str:
     views = np.arange(count) % 3  # a third of the vertices is not observed
     stated = np.where(views > 0, 0.05, np.nan)
     quality = VertexQuality(stated, 0.5 * stated, views, 4 * stated, 300 * stated)
-    inputs = EvaluationInputs(truth, scan, moved, true, reference, path, [sigma, None, sigma], TRAINING, quality)
+    inputs = EvaluationInputs(
+        truth, scan, moved, true, reference, path, [sigma, None, sigma], [scan.frames[1].name], TRAINING, quality
+    )
     end = (0.0, 0.0, 1.0)
     lengths = [
         Length("width <of> it", end, end, 12.3456, 0.0123, 0.0111, 0.0055, (3, 2)),
@@ -126,6 +128,10 @@ def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) 
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, not addresses
     assert "default-src 'none'" in full_report  # and the browser enforces it
     assert len(full_report) < 10e6
+
+
+def test_a_frame_that_cannot_be_placed_is_named(full_report: str, clean_scan: Path) -> None:
+    assert f"Frames that cannot be placed: {read_scan(clean_scan).frames[1].name}." in full_report
 
 
 def test_report_is_accessible_and_its_links_lead_somewhere(full_report: str) -> None:

@@ -73,9 +73,8 @@ def share_apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.quantile(both, 0.99) / size)
 
 
-@pytest.mark.parametrize(("units", "mm"), [("cm", 10.0), ("m", 1000.0)])
-def test_units_do_not_matter(in_mm, tmp_path, units, mm):
-    other = surface(small_scan(tmp_path / units, units=units)) * mm
+def test_units_do_not_matter(in_mm, tmp_path):
+    other = surface(small_scan(tmp_path / "m", units="m")) * 1000
     assert share_apart(in_mm, other) < 0.01
 
 
