@@ -101,9 +101,14 @@ def _covariance(
 
 
 def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None) -> FoundProjector:
-    """The refined values; their uncertainty never exceeds that of the start."""
+    """The refined values; their uncertainty never exceeds that of the start.
+
+    It stays that of the start where aspect or k1 were found, too: the adjustment takes them as exact.
+    """
     if covariance is None:
         return found
+    if found.sigma[4] > 0 or found.sigma[1] > found.sigma[0]:
+        return replace(found, projector=projector)
     shares = np.sqrt(covariance.diagonal().clamp_min(0).numpy())
     focal, x, y = np.minimum(shares, found.sigma_share) * projector.fl_x
     aspect = max(found.sigma[1] - found.sigma[0], 0.0)
