@@ -107,14 +107,11 @@ def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tens
     """
     if covariance is None:
         return found
-    if found.sigma[4] > 0 or found.sigma[1] > found.sigma[0]:
+    if found.sigma[4] > 0 or found.sigma[1] != found.sigma[0]:
         return replace(found, projector=projector)
     shares = np.sqrt(covariance.diagonal().clamp_min(0).numpy())
     focal, x, y = np.minimum(shares, found.sigma_share) * projector.fl_x
-    aspect = max(found.sigma[1] - found.sigma[0], 0.0)
-    return replace(
-        found, projector=projector, sigma=(float(focal), float(focal + aspect), float(x), float(y), found.sigma[4])
-    )
+    return replace(found, projector=projector, sigma=(float(focal), float(focal), float(x), float(y), 0.0))
 
 
 def with_projector(clouds: Sequence[FrameCloud], consistent: ConsistentFrames, projector: Device) -> list[FrameCloud]:
