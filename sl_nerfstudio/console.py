@@ -39,6 +39,11 @@ def figure(value: float) -> str:
     return f"{float(f'{value:.3g}'):,.0f}" if 1000 <= abs(value) < 1e9 else f"{value:.3g}"
 
 
+def unit_word(units: str) -> str:
+    """The unit of a scan after a number."""
+    return "units" if units == "arbitrary" else units
+
+
 def command(*words: object, indent: str = "  ") -> str:
     """A command to copy, quoted for a shell; one that is longer than 80 columns continues at its flags."""
     quoted = [shlex.quote(str(word)) for word in words]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.coverage.cases import Case
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, gauge_projection, restore
+from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, gauge_projection, of_baselines, restore
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3
 
@@ -50,7 +50,7 @@ def errors_of(case: Case, found: Adjustment) -> Errors:
     others = torch.arange(n) != _KNOWN
     relative = (rho / C.diagonal()[6 * n :].clamp_min(1e-30).sqrt().reshape(n, 6))[others]
     baseline = torch.log(rig.baseline / truth.baseline)[others]
-    stated = _sigma(_by_baseline(rig), C)[others]
+    stated = _sigma(torch.stack([of_baselines(rig, k) for k in range(n)]), C)[others]
     J, lengths = _between_cameras(rig)
     apart = (lengths - _between_cameras(truth)[1]) / _sigma(J, C)
     mm = 1 / case.exact.S_scene_world.scale
@@ -83,16 +83,6 @@ def _by_camera(rig: Rig) -> Float[Tensor, "k unknowns"]:
         J[k, :, own] = torch.eye(6, dtype=torch.float64)
         J[k, :3, 6 * k + 3 : 6 * k + 6] = -hat(rig.T_world_camera[k, :3, 3])
     return J.flatten(0, 1)
-
-
-def _by_baseline(rig: Rig) -> Float[Tensor, "frames unknowns"]:
-    """Derivatives of the logarithms of the baselines."""
-    n = rig.frames
-    J = torch.zeros(n, 12 * n, dtype=torch.float64)
-    for k in range(n):
-        t = rig.T_camera_projector[k, :3, 3]
-        J[k, 6 * (n + k) : 6 * (n + k) + 3] = t / t.dot(t)
-    return J
 
 
 def _between_cameras(rig: Rig) -> tuple[Float[Tensor, "pairs unknowns"], Float[Tensor, "pairs"]]:

@@ -22,7 +22,7 @@ from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_
 from sl_nerfstudio.bundle_adjustment.residuals import Observations, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration, linearise_with_intrinsics
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration, linearise_with_intrinsics
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread
@@ -35,14 +35,18 @@ class Adjustment:
     """What the bundle adjustment found."""
 
     rig: Rig
-    covariance: Float[Tensor, "unknowns unknowns"]  # of (delta, rho), gauge projected out
-    joint: Float[Tensor, "joint joint"]  # the same with the six intrinsics after the poses
+    joint: Float[Tensor, "joint joint"]  # covariance of (delta, rho, intrinsics), gauge projected out
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
     noise_px: float  # estimated noise of one look-up, projector pixels
     iterations: int
     median_before_px: float
     median_after_px: float
     unplaced: tuple[int, ...]  # frames that do not agree with the others: neither their poses nor their sigma hold
+
+    @property
+    def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
+        """That of (delta, rho) alone."""
+        return self.joint[:-UNKNOWNS, :-UNKNOWNS]
 
     @property
     def sigma(self) -> Float[Tensor, "frames 12"]:
@@ -201,7 +205,6 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     known = pose_covariance(evidence, B, problem.start, problem.prior, found.noise)
     return Adjustment(
         rig=state.rig,
-        covariance=known.covariance,
         joint=known.joint,
         intrinsics=known.intrinsics,
         noise_px=found.noise,
@@ -217,6 +220,5 @@ def _unmoved(start: Rig, prior: PosePrior, B: Tensor, settings: AdjustmentSettin
     H = B.T @ prior_equations(prior, start, start)[0] @ B
     nan = float("nan")
     noise = settings.kernel.noise_floor_px
-    covariance = gauge_free(start, B, H, 1.0)
-    joint = torch.block_diag(covariance, (prior.intrinsics_sigma**2).diag())
-    return Adjustment(start, covariance, joint, None, noise, 0, nan, nan, ())
+    joint = torch.block_diag(gauge_free(start, B, H, 1.0), (prior.intrinsics_sigma**2).diag())
+    return Adjustment(start, joint, None, noise, 0, nan, nan, ())

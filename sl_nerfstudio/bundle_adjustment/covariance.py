@@ -47,11 +47,6 @@ class PoseCovariance:
     joint: Float[Tensor, "joint joint"]  # of (delta, rho, intrinsics); the gauge is projected out
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
 
-    @property
-    def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
-        """That of (delta, rho) alone."""
-        return self.joint[:-UNKNOWNS, :-UNKNOWNS]
-
 
 def pose_covariance(
     evidence: Evidence, B: Float[Tensor, "unknowns k"], start: Rig, prior: PosePrior, noise: float

@@ -63,6 +63,18 @@ def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:
     return out.reshape(12 * n, 7)
 
 
+def of_baselines(rig: Rig, frame: int | None) -> Float[Tensor, "unknowns"]:
+    """Derivative of the logarithm of one frame's baseline; for None, of the geometric mean of all."""
+    n, t = rig.frames, rig.T_camera_projector[:, :3, 3]
+    each = t / (t * t).sum(-1, keepdim=True)
+    out = torch.zeros(2, n, 6, dtype=torch.float64)
+    if frame is None:
+        out[1, :, :3] = each / n
+    else:
+        out[1, frame, :3] = each[frame]
+    return out.reshape(12 * n)
+
+
 def gauge_projection(rig: Rig, frame: int | None = None) -> Float[Tensor, "unknowns unknowns"]:
     """Projection of increments (delta, rho) onto those that `restore` leaves: no motion and no growth as a whole.
 
@@ -75,12 +87,7 @@ def gauge_projection(rig: Rig, frame: int | None = None) -> Float[Tensor, "unkno
     points = _axes_points(rig, ahead).reshape(2, n, 3)
     J = torch.cat([torch.eye(3, dtype=torch.float64).expand(2, n, 3, 3), -hat(points)], -1)
     fixed[:6, : 6 * n] = (J.transpose(-1, -2) @ J).sum(0).transpose(0, 1).reshape(6, 6 * n)
-    baseline = rig.T_camera_projector[:, :3, 3]
-    by_log = torch.zeros(n, 6, dtype=torch.float64)
-    by_log[:, :3] = baseline / (baseline**2).sum(-1, keepdim=True)
-    if frame is not None:
-        by_log[torch.arange(n) != frame] = 0.0
-    fixed[6, 6 * n :] = by_log.flatten()
+    fixed[6] = of_baselines(rig, frame)
     return torch.eye(12 * n, dtype=torch.float64) - G @ torch.linalg.solve(fixed @ G, fixed)
 
 

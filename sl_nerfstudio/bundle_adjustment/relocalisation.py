@@ -40,10 +40,20 @@ class _Problem:
         return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
-        """Every anchor in every other frame that may see it."""
-        return observe(
-            rig, self.anchors, self.maps, rig.frames, float("inf"), self.settings.least_cosine, self.generator, around
-        )
+        """See _every_row."""
+        return _every_row(rig, self.anchors, self.maps, self.settings, self.generator, around)
+
+
+def _every_row(
+    rig: Rig,
+    anchors: Anchors,
+    maps: CoordinateMaps,
+    settings: AdjustmentSettings,
+    generator: torch.Generator,
+    around: int | None = None,
+) -> Observations:
+    """Every anchor in every other frame that may see it."""
+    return observe(rig, anchors, maps, rig.frames, float("inf"), settings.least_cosine, generator, around)
 
 
 def support_of(
@@ -64,7 +74,7 @@ def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: Adju
     """Frames that see too little of the surface on which the others agree, in order."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = observe(rig, anchors, maps, rig.frames, float("inf"), settings.least_cosine, generator)
+    rows = _every_row(rig, anchors, maps, settings, generator)
     support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
     wrong = support.isnan() | (support < s.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())

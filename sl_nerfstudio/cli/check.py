@@ -8,6 +8,7 @@ import tyro
 
 from sl_nerfstudio.cli.check_run import check_run_folder, is_run
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import unit_word
 
 if TYPE_CHECKING:
     from sl_nerfstudio.scan.check.folder import FolderCheck
@@ -74,7 +75,7 @@ def summary(result: "FolderCheck") -> str:
     if scan is None or fit is None:
         raise ValueError("a scan with faults has no summary")
     sizes = sorted({(frame.camera.w, frame.camera.h) for frame in scan.frames})
-    unit = "units" if scan.units == "arbitrary" else scan.units
+    unit = unit_word(scan.units)
     decoded = [content.decoded for content in result.contents]
     lines = [
         f"{scan.root}: no faults",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from sl_nerfstudio.console import figure, paragraph
+from sl_nerfstudio.console import figure, paragraph, unit_word
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.judgement import ALIGNED, Judgement
 from sl_nerfstudio.scan import PoseSigma
@@ -67,7 +67,7 @@ def _coverage(evaluation: Evaluation) -> str:
     found = evaluation.completeness
     if found is None:
         return f"{evaluation.agreement.hit_share:.1%} of the pixels with pattern"
-    o, unit = found.openings, "units" if evaluation.units == "arbitrary" else evaluation.units
+    o, unit = found.openings, unit_word(evaluation.units)
     text = f"{found.observed:.1%} of what the frames decoded"
     if not len(o):
         return f"{text}; closed all around"

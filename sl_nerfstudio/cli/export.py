@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, next_steps, short_path
+from sl_nerfstudio.console import command, next_steps, short_path, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _require_other_files(paths: tuple[Path, ...], scan: Path) -> None:
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
     """What was written, what was removed, how long it took and what to do next."""
-    unit = "units" if scan.units == "arbitrary" else scan.units
+    unit = unit_word(scan.units)
     mesh, sigma = exported.mesh, exported.pose_sigma
     poses = next(iter(_pose_files(config)), None)
     extent = " x ".join(f"{side:.4g}" for side in mesh.vertices.max(0) - mesh.vertices.min(0))

@@ -2,7 +2,7 @@
 
 import math
 
-from sl_nerfstudio.console import figure
+from sl_nerfstudio.console import figure, unit_word
 from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
 from sl_nerfstudio.evaluation.completeness.next_view import NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation
@@ -51,7 +51,7 @@ def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
     whole = found.surface_area + float(found.openings.area.sum())
     if view.new_area < _WORTH * whole:
         return ""
-    unit = "units" if evaluation.units == "arbitrary" else evaluation.units
+    unit = unit_word(evaluation.units)
     nearest = evaluation.agreement.frames[view.nearest].name
     side, way = f"the side {view.nearest_deg:.0f}° from {nearest}, the nearest frame", "it"
     if view.elevation_deg < -_STEEP_DEG:

@@ -30,8 +30,10 @@ class FrameDevices:
 class SurfaceView:
     """Points of a surface as one frame sees them."""
 
+    p_camera: Float[Tensor, "n 3"]
     uv_camera: Float[Tensor, "n 2"]
     uv_projector: Float[Tensor, "n 2"]  # predicted
+    by_point: Float[Tensor, "n 2 3"]  # of the predicted coordinate by the point in the camera's axes
     slope: Float[Tensor, "n 2"]  # of the residual, projector pixels per unit of length along the normal
     by_pixel: Float[Tensor, "n 2 2"]  # of the predicted coordinate by the camera pixel, along the surface
     pixels_per_area: Float[Tensor, "n"]  # camera pixels on a unit of the surface's area
@@ -40,13 +42,16 @@ class SurfaceView:
 
 def view_surface(d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> SurfaceView:
     """The view of points with unit normals, which must be in front of both devices and face the camera."""
-    p, n = _in_camera(d, p_world, normal)
+    T_camera_world = inverse(d.T_world_camera)
+    p, n = transform(T_camera_world, p_world), rotate(T_camera_world, normal)
     ray = torch.nn.functional.normalize(p, dim=-1)
     by_point = _projector_jacobian(d, p)
     slope = (by_point @ ray[..., None]).squeeze(-1) / (ray * n).sum(-1, keepdim=True)
     K = project_jacobian(d.camera, p)
     back = p - d.T_camera_projector[:3, 3]
     return SurfaceView(
+        p_camera=p,
+        by_point=by_point,
         uv_camera=project(d.camera, p)[0],
         uv_projector=project(d.projector, transform(inverse(d.T_camera_projector), p))[0],
         slope=slope,
@@ -60,11 +65,9 @@ def by_poses_and_intrinsics(
     d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], view: SurfaceView
 ) -> Float[Tensor, "n 2 18"]:
     """Derivatives of the residual by delta and rho of the frame, then by the six intrinsics."""
-    p, _ = _in_camera(d, p_world, normal)
-    by_point = _projector_jacobian(d, p)
     # A frame that moves carries along what it measured: only the motion across the surface changes the residual.
     by_delta = -view.slope[:, :, None] * torch.cat([normal, torch.linalg.cross(p_world, normal)], -1)[:, None]
-    by_rho = torch.cat([-by_point, by_point @ hat(p)], -1)
+    by_rho = torch.cat([-view.by_point, view.by_point @ hat(view.p_camera)], -1)
     by_camera = -view.by_pixel @ by_intrinsics(d.camera, view.uv_camera)
     return torch.cat([by_delta, by_rho, by_camera, by_intrinsics(d.projector, view.uv_projector)], -1)
 
@@ -87,11 +90,6 @@ def point_equations(d: FrameDevices, p_world: Float[Tensor, "n 3"]) -> tuple[Ten
     camera = torch.cat([by_intrinsics(d.camera, uv_camera), zero], 1)
     projector = torch.cat([zero, by_intrinsics(d.projector, uv_projector)], 1)
     return by_point, torch.cat([by_delta, by_rho, camera, projector], -1)
-
-
-def _in_camera(d: FrameDevices, p_world: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    T = inverse(d.T_world_camera)
-    return transform(T, p_world), rotate(T, normal)
 
 
 def _projector_jacobian(d: FrameDevices, p_camera: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:

@@ -13,11 +13,10 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, of_baselines, restore
 from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, joint_of_prior
 from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import (
     of_all_lengths,
-    of_baselines,
     with_known_length,
 )
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior

@@ -27,18 +27,6 @@ def with_known_length(
     return P @ joint @ P.T
 
 
-def of_baselines(rig: Rig, frame: int | None) -> Float[Tensor, "unknowns"]:
-    """Derivative of the logarithm of one frame's baseline; for None, of the geometric mean of all."""
-    n, t = rig.frames, rig.T_camera_projector[:, :3, 3]
-    each = t / (t * t).sum(-1, keepdim=True)
-    out = torch.zeros(2, n, 6, dtype=torch.float64)
-    if frame is None:
-        out[1, :, :3] = each / n
-    else:
-        out[1, frame, :3] = each[frame]
-    return out.reshape(12 * n)
-
-
 def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
     """That of the scale which agrees best with the starting poses (`gauge.agreeing_scale`)."""
     H, _ = prior_equations(prior, rig, rig)

@@ -1,13 +1,13 @@
 """How completeness is judged: by shares of what was observed, and of the surface."""
 
-from sl_nerfstudio.console import figure
+from sl_nerfstudio.console import figure, unit_word
 from sl_nerfstudio.evaluation.completeness.completeness import Completeness
 from sl_nerfstudio.evaluation.figures import JudgedFigure, judged
 
 
 def completeness_figures(found: Completeness, units: str) -> list[JudgedFigure]:
     """What is missing of the observed surface is a fault; what nobody observed is at most a weakness."""
-    o, unit = found.openings, "units" if units == "arbitrary" else units
+    o, unit = found.openings, unit_word(units)
     size = f"{len(o)}, {figure(o.area.sum())} {unit}² in all, borders {figure(o.length.sum())} {unit} long"
     return [
         judged(

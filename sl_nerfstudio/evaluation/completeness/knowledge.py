@@ -18,7 +18,6 @@ from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.observed import faces_and_falls_inside
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.se3 import inverse, transform
-from sl_nerfstudio.meshing.mesh import Mesh
 
 _LEAST_COSINE = 0.2  # between normal and ray of either device: what is seen at a flatter angle is hardly decoded
 _SEED = 0
@@ -51,8 +50,7 @@ class Occluders:
     def __init__(self, surface: IndexedMesh, openings: Openings) -> None:
         self._meshes = [surface]
         if len(openings.fan):
-            corners = openings.fan.reshape(-1, 3)
-            self._meshes.append(IndexedMesh(Mesh(corners, np.arange(len(corners)).reshape(-1, 3))))
+            self._meshes.append(IndexedMesh(openings.closing_mesh()))
 
     def hides(self, points: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]) -> Bool[ndarray, "n"]:
         """Whether something is between each point and the eye."""
@@ -70,7 +68,7 @@ def places(surface: IndexedMesh, openings: Openings, count: int) -> Places:
     wide = openings.area > 0
     if not wide.any():
         return found
-    share = np.where(wide[openings.opening], _triangle_areas(openings.fan), 0.0)
+    share = np.where(wide[openings.opening], openings.closing_mesh().face_areas(), 0.0)
     rng = np.random.default_rng(_SEED)
     triangle = rng.choice(len(share), count, p=share / share.sum())
     weights = rng.dirichlet(np.ones(3), count)
@@ -126,7 +124,3 @@ def _cosine(
 ) -> Float[ndarray, "n"]:
     way = T[:3, 3] - points
     return (way * normals).sum(1) / np.maximum(np.linalg.norm(way, axis=1), 1e-300)
-
-
-def _triangle_areas(corners: Float[ndarray, "m 3 3"]) -> Float[ndarray, "m"]:
-    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

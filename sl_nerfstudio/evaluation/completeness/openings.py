@@ -26,6 +26,11 @@ class Openings:
     def __len__(self) -> int:
         return len(self.area)
 
+    def closing_mesh(self) -> Mesh:
+        """The closing triangles, in the order of `fan`."""
+        corners = self.fan.reshape(-1, 3)
+        return Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
+
 
 def find_openings(mesh: Mesh) -> Openings:
     """All borders of the mesh; those that meet in a vertex count as one."""
