@@ -26,6 +26,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Frame, PoseSigma, Scan
+from sl_nerfstudio.threads import one_library_thread
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
 
@@ -57,6 +58,7 @@ class Evaluation:
         return "similarity" if self.units == "arbitrary" else "rigid"
 
 
+@one_library_thread()
 def evaluate(
     mesh: Mesh,
     scan: Scan,

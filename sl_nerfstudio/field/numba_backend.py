@@ -16,7 +16,7 @@ from sl_nerfstudio.field.kernels.grid import POINTS, Grid, scatter_level
 from sl_nerfstudio.field.kernels.mlp import Network, Scratch, Weights, make_scratch
 from sl_nerfstudio.field.kernels.pack import pack_grid, pack_network, unpack_gradients, zero_gradients
 from sl_nerfstudio.field.kernels.simd import FEATURES
-from sl_nerfstudio.threads import parallel, split
+from sl_nerfstudio.threads import parallel, split, threads
 
 _BATCH = 16384  # points whose feature gradients are kept (in cache) between the MLP and the table
 
@@ -196,5 +196,5 @@ def _array(t: Tensor) -> np.ndarray:
 
 def _ranges(n: int) -> list[tuple[int, int]]:
     """Twice as many ranges as threads, so that other threads can take over work from a slow one."""
-    threads = torch.get_num_threads()
-    return split(n, 1 if threads == 1 else 2 * threads, POINTS)
+    count = threads()
+    return split(n, 1 if count == 1 else 2 * count, POINTS)

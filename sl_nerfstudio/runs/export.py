@@ -22,6 +22,7 @@ from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import PoseSigma, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.writing import encode_json, sigma_fields
+from sl_nerfstudio.threads import one_library_thread
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Exported:
     writing_seconds: float  # trimming, uncertainty and writing
 
 
+@one_library_thread()
 def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     """Extract the surface, trim it to what was observed, cut out the object, as the settings say, and write the files.
 

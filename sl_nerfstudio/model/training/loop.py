@@ -18,6 +18,7 @@ from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
 from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
 from sl_nerfstudio.progress import Phase, phase
+from sl_nerfstudio.threads import one_library_thread
 
 if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel
@@ -60,7 +61,7 @@ class SLTrainer(Trainer):
         """Train; see nerfstudio's Trainer. If interrupted, save what has been trained and say how to go on."""
         self._saved = (None, time.monotonic())
         try:
-            with self._ending(), self._phases:
+            with self._ending(), self._phases, one_library_thread():
                 super().train()
             INTERRUPTION.remove()  # if interrupted they stay: a second signal ends the process at once
         finally:
