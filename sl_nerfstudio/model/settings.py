@@ -16,7 +16,7 @@ from sl_nerfstudio.rendering.settings import LossConfig, SamplingConfig
 
 RECOMMENDED_STEPS = {"sl-neus": 1000, "sl-neus-paper": 10_000}  # by method; the paper's is its own
 
-PoseMethod = Literal["adjust", "adjust-and-render", "render", "render-independently"]
+PoseMethod = Literal["adjust", "render", "render-independently"]
 
 
 @dataclass
@@ -33,9 +33,8 @@ class SLModelSettings(ModelConfig):
     """What is refined: `free` (camera and projector of every frame), `rigid-rig` (frames, and one relative pose for
     all of them), `known-rig` (frames only), `static-projector` (frames, and a projector that never moves), `off`."""
     pose_method: PoseMethod = "adjust"
-    """How poses are refined: `adjust` (bundle adjustment before the first step), `adjust-and-render` (the rendering
-    losses then continue to refine them), `render` (only the rendering losses), `render-independently` (the same, with
-    each device independent of the others)."""
+    """How poses are refined: `adjust` (bundle adjustment before the first step), `render` (only the rendering losses),
+    `render-independently` (the same, with each device independent of the others)."""
     refine_intrinsics: bool = False
     """If the captures contradict focal lengths and principal points, change these before training, provided that
     held-out pixels then agree better; the scan folder is not changed."""
@@ -72,7 +71,7 @@ class SLModelSettings(ModelConfig):
     @property
     def adjusts_poses(self) -> bool:
         """Whether poses are adjusted together before the first step."""
-        return self.refine_poses != "off" and self.pose_method in ("adjust", "adjust-and-render")
+        return self.refine_poses != "off" and self.pose_method == "adjust"
 
     @property
     def renders_poses(self) -> bool:
