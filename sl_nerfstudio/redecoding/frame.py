@@ -1,0 +1,185 @@
+"""One frame decoded again."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter
+
+from sl_nerfstudio.decoding.regions import drop_small_regions
+from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.redecoding.acceptance import AGREES, Limits, confirmed, learn
+from sl_nerfstudio.redecoding.ambiguity import Ambiguity
+from sl_nerfstudio.redecoding.correlation import View
+from sl_nerfstudio.redecoding.measure import Measured, Shown, correlation_at, measure
+from sl_nerfstudio.redecoding.prediction import Prediction
+
+_BLURS = (0.04, 0.06, 0.09, 0.13, 0.18, 0.25)  # standard deviations tried, pitches
+_TRIED = 1000  # pixels on which the blur is chosen
+_ELSEWHERE = 3000  # pixels that are looked for where the pattern is not
+_COARSEST = 1 / 3  # pitch from one pixel to the next: beyond, the image does not resolve the pattern
+_FAR = 0.5  # pitch: a decoded coordinate this far from what all frames predict contradicts the surface
+_IMPOSSIBLE = 0.01  # quantile of right correlations; below, an image contradicts a coordinate
+_TEAR = 0.35  # pitch between neighbouring pixels of one region
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """What became of the pixels of a frame; numbers of pixels."""
+
+    name: str
+    shown: int  # where the pattern falls on the object
+    decoded_before: int
+    confirmed: int  # decoded ones that the image confirms
+    added: int
+    replaced: int
+    removed: int
+    decoded_after: int
+    limits: Limits | None  # None: the frame was left as it is
+    accepted_elsewhere: float  # share of pixels that would be accepted where the pattern certainly is not
+
+
+def redecode_frame(
+    name: str,
+    image: Float32[ndarray, "h w"],
+    mask: Bool[ndarray, "h w"] | None,
+    decoded: Float32[ndarray, "h w 2"],
+    predicted: Prediction,
+    pattern: Float32[ndarray, "ph pw"],
+    ambiguity: Ambiguity,
+) -> tuple[Float32[ndarray, "h w 2"], FrameFacts]:
+    """New coordinates of a frame, and what became of the old ones.
+
+    `image` shows the pattern where `mask` says so (None: perhaps everywhere). Pixels are added where nothing was
+    decoded, replaced where the image shows another place of the pattern than the decoded one, and removed where
+    neither image nor surface supports the decoded one. All others stay as they are.
+    """
+    stretch = _stretch(predicted.coords)
+    shows = np.ones(image.shape, dtype=bool) if mask is None else mask
+    usable = predicted.known & shows & (stretch < _COARSEST * ambiguity.pitch)
+    old = np.isfinite(decoded).all(-1)
+    facts = FrameFacts(name, int(shows.sum()), int(old.sum()), 0, 0, 0, 0, int(old.sum()), None, 0.0)
+    places = np.argwhere(usable)
+    known = np.argwhere(usable & old)
+    if not len(known):
+        return decoded, facts
+    view = View(image, predicted.coords, predicted.depth, usable)
+    pitch_px = ambiguity.pitch / max(float(np.median(stretch[usable])) / np.sqrt(2), 1e-6)
+    shown = _as_shown(view, predicted.along, pattern, ambiguity, pitch_px, known)
+    found = measure(view, predicted.along, shown, places)
+    before = decoded[usable]
+    right = confirmed(found, before, ambiguity.pitch)
+    elsewhere = _elsewhere(view, predicted.along, shown, places)
+    limits = learn(found, right, len(known), elsewhere, ambiguity.pitch)
+    facts = replace(facts, confirmed=int(right.sum()))
+    if limits is None:
+        return decoded, facts
+    good = limits.accept(found)
+    changed = _changed(view, shown, found, before, good, right, limits)
+    wrong = _impossible(view, shown, found, before, good | right, right, predicted.coords[usable])
+    out = decoded.copy()
+    out[tuple(places[changed].T)] = found.coords[changed]
+    out[tuple(places[wrong].T)] = np.nan
+    out = _without_specks(out, decoded, places[changed], ambiguity.pitch, pitch_px)
+    new = np.isfinite(out).all(-1)
+    same = (out == decoded).all(-1)
+    return out, replace(
+        facts,
+        added=int((new & ~old).sum()),
+        replaced=int((new & old & ~same).sum()),
+        removed=int((old & ~new).sum()),
+        decoded_after=int(new.sum()),
+        limits=limits,
+        accepted_elsewhere=float(limits.accept(elsewhere).mean()),
+    )
+
+
+def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
+    """How far a predicted coordinate is from those of the neighbouring pixels; the larger neighbour counts."""
+    total = np.zeros(coords.shape[:2], dtype=np.float32)
+    for axis in (0, 1):
+        step = np.linalg.norm(np.diff(coords, axis=axis), axis=-1)
+        pad = [(1, 1) if k == axis else (0, 0) for k in (0, 1)]
+        padded = np.pad(step, pad, constant_values=np.nan)
+        ends = (padded[:-1], padded[1:]) if axis == 0 else (padded[:, :-1], padded[:, 1:])
+        total += np.fmax(*ends) ** 2
+    return np.sqrt(total)
+
+
+def _as_shown(
+    view: View,
+    along: Float32[ndarray, "h w 2"],
+    pattern: Float32[ndarray, "ph pw"],
+    ambiguity: Ambiguity,
+    pitch_px: float,
+    known: Int64[ndarray, "n 2"],
+) -> Shown:
+    """The pattern with the blur that agrees best with the image at decoded pixels."""
+    some = known[evenly_spaced(len(known), min(_TRIED, len(known)))]
+    tried = [Shown(gaussian_filter(pattern, b * ambiguity.pitch), ambiguity, pitch_px) for b in _BLURS]
+    return max(tried, key=lambda shown: float(np.median(measure(view, along, shown, some).correlation)))
+
+
+def _elsewhere(view: View, along: Float32[ndarray, "h w 2"], shown: Shown, places: Int64[ndarray, "n 2"]) -> Measured:
+    """What is found if the prediction is displaced by some pitches: matches at places that are certainly wrong."""
+    some = places[evenly_spaced(len(places), min(_ELSEWHERE, len(places)))]
+    decoys = shown.ambiguity.decoys
+    parts = []
+    for k, part in enumerate(np.array_split(some, 2)):
+        away = decoys[k * len(decoys) // 2]
+        parts.append(measure(replace(view, coords=view.coords + away), along, shown, part))
+    return Measured(*(np.concatenate([getattr(p, name) for p in parts]) for name in Measured.__dataclass_fields__))
+
+
+def _changed(
+    view: View,
+    shown: Shown,
+    found: Measured,
+    before: Float32[ndarray, "n 2"],
+    good: Bool[ndarray, "n"],
+    right: Bool[ndarray, "n"],
+    limits: Limits,
+) -> Bool[ndarray, "n"]:
+    """Accepted pixels that had no coordinate, or one that the image shows clearly less."""
+    old = np.isfinite(before).all(1)
+    changed = good & ~old
+    other = np.flatnonzero(
+        good & old & ~right & (np.abs(found.coords - before).max(1) > AGREES * shown.ambiguity.pitch)
+    )
+    as_it_was = correlation_at(view, shown, found.places[other], before[other])
+    changed[other] = found.correlation[other] - as_it_was > limits.margin
+    return changed
+
+
+def _impossible(
+    view: View,
+    shown: Shown,
+    found: Measured,
+    before: Float32[ndarray, "n 2"],
+    settled: Bool[ndarray, "n"],
+    right: Bool[ndarray, "n"],
+    predicted: Float32[ndarray, "n 2"],
+) -> Bool[ndarray, "n"]:
+    """Decoded pixels far from what all frames predict, at which the image shows another part of the pattern, too."""
+    far = np.abs(before - predicted).max(1) > _FAR * shown.ambiguity.pitch  # False for NaN
+    doubtful = np.flatnonzero(far & ~settled)
+    least = float(np.quantile(found.correlation[right], _IMPOSSIBLE))
+    wrong = np.zeros(len(before), dtype=bool)
+    wrong[doubtful] = correlation_at(view, shown, found.places[doubtful], before[doubtful]) < least
+    return wrong
+
+
+def _without_specks(
+    coords: Float32[ndarray, "h w 2"],
+    decoded: Float32[ndarray, "h w 2"],
+    changed: Int64[ndarray, "n 2"],
+    pitch: float,
+    pitch_px: float,
+) -> Float32[ndarray, "h w 2"]:
+    """Regions smaller than a cell are no evidence: what was changed in them is as it was."""
+    kept = np.isfinite(drop_small_regions(coords, _TEAR * pitch, round(pitch_px**2))).all(-1)
+    back = changed[~kept[tuple(changed.T)]]
+    out = coords.copy()
+    out[tuple(back.T)] = decoded[tuple(back.T)]
+    return out
