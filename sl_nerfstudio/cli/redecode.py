@@ -68,11 +68,12 @@ def redecode_trained(trained: "TrainedRun", arguments: RedecodeArguments) -> str
 
 def summary(output: Path, method: str, found: "Redecoded") -> str:
     """What became of the pixels, which frames were left as they are, and what to do next."""
+    confirmed = found.total("confirmed") / max(found.total("checked"), 1)
     lines = [
         f"{output}: {found.share_after:.1%} of the pixels that show the pattern are decoded, "
         f"{found.share_before:.1%} before",
         f"  added {found.total('added'):,}, replaced {found.total('replaced'):,}, removed {found.total('removed'):,} "
-        f"pixels; the images confirm {found.total('confirmed'):,} of {found.total('decoded_before'):,}",
+        f"pixels; the images confirm {confirmed:.1%} of what was decoded before",
     ]
     left = [frame for frame in found.frames if frame.limits is None]
     elsewhere = [frame.accepted_elsewhere for frame in found.frames if frame.limits is not None]

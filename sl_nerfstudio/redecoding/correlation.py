@@ -16,6 +16,7 @@ from sl_nerfstudio.compiled import compiled, compiled_range
 
 STEEPEST = 6.0  # pixel widths of depth from one pixel to the next on one surface: seen at 9 degrees from its plane
 _ROUNDS = 4
+_ENOUGH = 0.01  # pattern pixels: a shorter step ends the search
 _REACH = 2.0  # of a Gaussian window, standard deviations
 
 
@@ -210,7 +211,7 @@ def _fit(
                 break
             noise = max(ii - ip * ip / pp, 0.0) * s[15] / (s[0] * s[0])  # variance of a weighted mean
             sigma = np.sqrt(noise / least) / gain
-            if turn == rounds:
+            if turn == rounds or (turn > 0 and step < _ENOUGH):
                 break
             mx, my = (yy * ix - xy * iy) / (det * gain), (xx * iy - xy * ix) / (det * gain)
             step = np.sqrt(mx * mx + my * my)

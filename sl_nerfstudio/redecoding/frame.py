@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import find_objects, gaussian_filter
 
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.geometry.spacing import evenly_spaced
@@ -17,6 +17,7 @@ from sl_nerfstudio.redecoding.prediction import Prediction
 
 _BLURS = (0.04, 0.06, 0.09, 0.13, 0.18, 0.25)  # standard deviations tried, pitches
 _TRIED = 1000  # pixels on which the blur is chosen
+_MANY = 20_000  # decoded pixels of which a ninth is enough to learn from
 _ELSEWHERE = 3000  # pixels that are looked for where the pattern is not
 _COARSEST = 1 / 3  # pitch from one pixel to the next: beyond, the image does not resolve the pattern
 _FAR = 0.5  # pitch: a decoded coordinate this far from what all frames predict contradicts the surface
@@ -31,7 +32,8 @@ class FrameFacts:
     name: str
     shown: int  # where the pattern falls on the object
     decoded_before: int
-    confirmed: int  # decoded ones that the image confirms
+    checked: int  # decoded ones that were compared with the image
+    confirmed: int  # those that it confirms
     added: int
     replaced: int
     removed: int
@@ -55,44 +57,69 @@ def redecode_frame(
     decoded, replaced where the image shows another place of the pattern than the decoded one, and removed where
     neither image nor surface supports the decoded one. All others stay as they are.
     """
-    stretch = _stretch(predicted.coords)
     shows = np.ones(image.shape, dtype=bool) if mask is None else mask
+    before = int(np.isfinite(decoded).all(-1).sum())
+    facts = FrameFacts(name, int(shows.sum()), before, 0, 0, 0, 0, 0, before, None, 0.0)
+    stretch = _stretch(predicted.coords)
     usable = predicted.known & shows & (stretch < _COARSEST * ambiguity.pitch)
-    old = np.isfinite(decoded).all(-1)
-    facts = FrameFacts(name, int(shows.sum()), int(old.sum()), 0, 0, 0, 0, int(old.sum()), None, 0.0)
-    places = np.argwhere(usable)
-    known = np.argwhere(usable & old)
-    if not len(known):
+    if not (usable & np.isfinite(decoded).all(-1)).any():
         return decoded, facts
-    view = View(image, predicted.coords, predicted.depth, usable)
+    box = find_objects(usable.astype(np.uint8))[0]
+    view = View(image[box], predicted.coords[box], predicted.depth[box], usable[box])
     pitch_px = ambiguity.pitch / max(float(np.median(stretch[usable])) / np.sqrt(2), 1e-6)
-    shown = _as_shown(view, predicted.along, pattern, ambiguity, pitch_px, known)
-    found = measure(view, predicted.along, shown, places)
-    before = decoded[usable]
-    right = confirmed(found, before, ambiguity.pitch)
-    elsewhere = _elsewhere(view, predicted.along, shown, places)
-    limits = learn(found, right, len(known), elsewhere, ambiguity.pitch)
-    facts = replace(facts, confirmed=int(right.sum()))
+    out = decoded.copy()
+    out[box], facts = _redecode(view, predicted.along[box], decoded[box], pattern, ambiguity, pitch_px, facts)
+    return out, facts
+
+
+def _redecode(
+    view: View,
+    along: Float32[ndarray, "h w 2"],
+    decoded: Float32[ndarray, "h w 2"],
+    pattern: Float32[ndarray, "ph pw"],
+    ambiguity: Ambiguity,
+    pitch_px: float,
+    facts: FrameFacts,
+) -> tuple[Float32[ndarray, "h w 2"], FrameFacts]:
+    """The same for a view of which some decoded pixels are usable; `facts` has the numbers before."""
+    pitch, old = ambiguity.pitch, np.isfinite(decoded).all(-1)
+    checked = view.usable & old & _thinned(view.usable & old)
+    # A decoded pixel that is as predicted stays as it is: it is measured only to learn from it.
+    agrees = np.abs(decoded - view.coords).max(-1) < AGREES * pitch
+    measured = view.usable & (~agrees | checked)
+    places, before = np.argwhere(measured), decoded[measured]
+    shown = _as_shown(view, along, pattern, ambiguity, pitch_px, np.argwhere(checked))
+    found = measure(view, along, shown, places)
+    elsewhere = _elsewhere(view, along, shown, places)
+    right = confirmed(found, before, pitch) & checked[measured]
+    limits = learn(found, right, int(checked.sum()), elsewhere, pitch)
+    facts = replace(facts, checked=int(checked.sum()), confirmed=int(right.sum()), limits=limits)
     if limits is None:
         return decoded, facts
     good = limits.accept(found)
-    changed = _changed(view, shown, found, before, good, right, limits)
-    wrong = _impossible(view, shown, found, before, good | right, right, predicted.coords[usable])
+    changed = _changed(view, shown, found, before, good, limits)
+    wrong = _impossible(view, shown, found, before, good, right)
     out = decoded.copy()
     out[tuple(places[changed].T)] = found.coords[changed]
     out[tuple(places[wrong].T)] = np.nan
-    out = _without_specks(out, decoded, places[changed], ambiguity.pitch, pitch_px)
-    new = np.isfinite(out).all(-1)
-    same = (out == decoded).all(-1)
+    out = _without_specks(out, decoded, places[changed], pitch, pitch_px)
+    new, same = np.isfinite(out).all(-1), (out == decoded).all(-1)
     return out, replace(
         facts,
         added=int((new & ~old).sum()),
         replaced=int((new & old & ~same).sum()),
         removed=int((old & ~new).sum()),
-        decoded_after=int(new.sum()),
-        limits=limits,
+        decoded_after=facts.decoded_before + int(new.sum()) - int(old.sum()),
         accepted_elsewhere=float(limits.accept(elsewhere).mean()),
     )
+
+
+def _thinned(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+    """Every third pixel in both directions if there are many, else all."""
+    step = 3 if known.sum() > _MANY else 1
+    some = np.zeros_like(known)
+    some[::step, ::step] = True
+    return some
 
 
 def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
@@ -138,15 +165,13 @@ def _changed(
     found: Measured,
     before: Float32[ndarray, "n 2"],
     good: Bool[ndarray, "n"],
-    right: Bool[ndarray, "n"],
     limits: Limits,
 ) -> Bool[ndarray, "n"]:
     """Accepted pixels that had no coordinate, or one that the image shows clearly less."""
     old = np.isfinite(before).all(1)
     changed = good & ~old
-    other = np.flatnonzero(
-        good & old & ~right & (np.abs(found.coords - before).max(1) > AGREES * shown.ambiguity.pitch)
-    )
+    differs = np.abs(found.coords - before).max(1) > AGREES * shown.ambiguity.pitch  # False for NaN
+    other = np.flatnonzero(good & differs)
     as_it_was = correlation_at(view, shown, found.places[other], before[other])
     changed[other] = found.correlation[other] - as_it_was > limits.margin
     return changed
@@ -157,13 +182,13 @@ def _impossible(
     shown: Shown,
     found: Measured,
     before: Float32[ndarray, "n 2"],
-    settled: Bool[ndarray, "n"],
+    good: Bool[ndarray, "n"],
     right: Bool[ndarray, "n"],
-    predicted: Float32[ndarray, "n 2"],
 ) -> Bool[ndarray, "n"]:
     """Decoded pixels far from what all frames predict, at which the image shows another part of the pattern, too."""
+    predicted = view.coords[tuple(found.places.T)]
     far = np.abs(before - predicted).max(1) > _FAR * shown.ambiguity.pitch  # False for NaN
-    doubtful = np.flatnonzero(far & ~settled)
+    doubtful = np.flatnonzero(far & ~good)
     least = float(np.quantile(found.correlation[right], _IMPOSSIBLE))
     wrong = np.zeros(len(before), dtype=bool)
     wrong[doubtful] = correlation_at(view, shown, found.places[doubtful], before[doubtful]) < least

@@ -14,7 +14,7 @@ SEARCHED = 0.45  # pitches to both sides along the line on which a wrong depth m
 _STEP = 1 / 16  # pitch
 _NARROW, _WIDE = 0.45, 0.9  # standard deviations of the windows for the place, and for what it can be confused with
 _CONVERGED = 0.1  # pitch: a search with a longer last step found nothing
-_SAMPLES = 7  # pixels per pitch that a wide window looks at
+_SAMPLES = 7  # pixels per pitch that tell places apart
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ def measure(view: View, along: Float32[ndarray, "h w 2"], shown: Shown, places: 
     narrow = Window.gaussian(_NARROW * shown.pitch_px)
     shifts = np.arange(-SEARCHED, SEARCHED + _STEP / 2, _STEP, dtype=np.float32) * np.float32(pitch)
     candidates = np.dstack([drawn(shown.pattern, view.coords + s * along) for s in shifts])
-    best = correlations(view, candidates, places, narrow).argmax(1)
+    some = Window.gaussian(_NARROW * shown.pitch_px, _stride(shown))
+    best = correlations(view, candidates, places, some).argmax(1)
     direction = along[rows, columns]
     fit = fit_shifts(view, shown.pattern, places, shifts[best, None] * direction, narrow)
     mean = _spread(view, places, fit, _NARROW * shown.pitch_px, pitch)
@@ -88,9 +89,14 @@ def _margins(
     moved = view.coords + mean
     moved[places[:, 0], places[:, 1]] = view.coords[places[:, 0], places[:, 1]] + shift
     candidates = np.dstack([drawn(shown.pattern, moved + d) for d in (np.zeros(2, dtype=np.float32), *rivals)])
-    wide = Window.gaussian(_WIDE * shown.pitch_px, max(1, round(shown.pitch_px / _SAMPLES)))
+    wide = Window.gaussian(_WIDE * shown.pitch_px, _stride(shown))
     found = correlations(view, candidates, places, wide)
     return found[:, 0] - found[:, 1:].max(1)
+
+
+def _stride(shown: Shown) -> int:
+    """Every how many pixels are enough to tell places apart; for their exact position all pixels are used."""
+    return max(1, round(shown.pitch_px / _SAMPLES))
 
 
 def _spread(
