@@ -4,7 +4,7 @@ Where the decoder and the image agree, it is known what a right match looks like
 like is seen by looking for the pattern where it certainly is not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -16,6 +16,7 @@ AGREES = 1 / 6  # pitch: decoded and measured coordinates that differ less are t
 _FEWEST = 200  # decoded pixels that agree, to learn from
 _LEAST_SHARE = 0.5  # of the decoded pixels must agree
 _RIGHT, _WRONG = 0.05, 0.9  # quantiles of right matches, and of those at a wrong place, below which none is accepted
+FALSE = 0.01  # share of the accepted pixels that may be chance, if all predictions were wrong
 _ROUGH = 0.95  # quantile of the roughness of right matches
 _ACROSS = 0.98  # quantile of their displacement across the line on which a wrong depth would move them
 _SIGMA = 0.0075  # pitch: 0.15 pixels of a grid with a period of 20
@@ -53,11 +54,19 @@ def confirmed(found: Measured, decoded: Float32[ndarray, "n 2"], pitch: float) -
     return near & (found.sigma <= 2 * _SIGMA * pitch) & (found.covered >= _COVERED)
 
 
-def learn(found: Measured, right: Bool[ndarray, "n"], decoded: int, elsewhere: Measured, pitch: float) -> Limits | None:
+def learn(
+    found: Measured,
+    right: Bool[ndarray, "n"],
+    unknown: Bool[ndarray, "n"],
+    decoded: int,
+    elsewhere: Measured,
+    pitch: float,
+) -> Limits | None:
     """Limits from the `right` ones of the measured pixels, and from those measured at wrong places.
 
-    `decoded` is the number of measured pixels that had been decoded. None if too few of them are right, or if right
-    places look no better than wrong ones: then the image does not show this pattern at these places.
+    `unknown` are the measured pixels without a coordinate, `decoded` is the number of those with one that were to be
+    confirmed. None if too few of these are right, or if right places look no better than wrong ones: then the image
+    does not show this pattern at these places.
     """
     if right.sum() < max(_FEWEST, _LEAST_SHARE * decoded):
         return None
@@ -65,7 +74,7 @@ def learn(found: Measured, right: Bool[ndarray, "n"], decoded: int, elsewhere: M
     if np.median(found.correlation[right]) <= wrong:
         return None
     margin = max(float(np.quantile(found.margin[right], _RIGHT)), float(np.quantile(elsewhere.margin, _WRONG)), 0.0)
-    return Limits(
+    limits = Limits(
         correlation=max(float(np.quantile(found.correlation[right], _RIGHT)), float(wrong)),
         margin=margin,
         roughness=float(np.quantile(found.roughness[right], _ROUGH)),
@@ -73,3 +82,17 @@ def learn(found: Measured, right: Bool[ndarray, "n"], decoded: int, elsewhere: M
         sigma=_SIGMA * pitch,
         step=_STEP * pitch,
     )
+    return _strict_enough(limits, found.margin[unknown & limits.accept(found)], int(unknown.sum()), elsewhere)
+
+
+def _strict_enough(limits: Limits, accepted: Float32[ndarray, "a"], of: int, elsewhere: Measured) -> Limits:
+    """Raise the margin until at most FALSE of the accepted pixels would be accepted even if all predictions were wrong.
+
+    A target-decoy estimate: of `of` pixels those with the margins `accepted` are accepted, at wrong places a share of
+    `elsewhere`.
+    """
+    wrong = np.sort(elsewhere.margin[limits.accept(elsewhere)])
+    for k, margin in enumerate(wrong):
+        if (len(wrong) - k) / len(elsewhere.margin) * of <= FALSE * (accepted >= margin).sum():
+            return replace(limits, margin=float(margin))
+    return replace(limits, margin=max(limits.margin, float(np.nextafter(wrong[-1], np.inf)))) if len(wrong) else limits

@@ -11,17 +11,17 @@ from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.redecoding.acceptance import AGREES, Limits, confirmed, learn
 from sl_nerfstudio.redecoding.ambiguity import Ambiguity
-from sl_nerfstudio.redecoding.correlation import View
+from sl_nerfstudio.redecoding.correlation import STEEPEST, View
 from sl_nerfstudio.redecoding.measure import Measured, Shown, correlation_at, measure
 from sl_nerfstudio.redecoding.prediction import Prediction
 
 _BLURS = (0.04, 0.06, 0.09, 0.13, 0.18, 0.25)  # standard deviations tried, pitches
 _TRIED = 1000  # pixels on which the blur is chosen
 _MANY = 20_000  # decoded pixels of which a ninth is enough to learn from
-_ELSEWHERE = 3000  # pixels that are looked for where the pattern is not
+_ELSEWHERE = 6000  # pixels that are looked for where the pattern is not
 _COARSEST = 1 / 3  # pitch from one pixel to the next: beyond, the image does not resolve the pattern
 _FAR = 0.5  # pitch: a decoded coordinate this far from what all frames predict contradicts the surface
-_IMPOSSIBLE = 0.01  # quantile of right correlations; below, an image contradicts a coordinate
+_CELLS = 4.0  # size of a region that is no evidence for itself
 _TEAR = 0.35  # pitch between neighbouring pixels of one region
 
 
@@ -92,13 +92,13 @@ def _redecode(
     found = measure(view, along, shown, places)
     elsewhere = _elsewhere(view, along, shown, places)
     right = confirmed(found, before, pitch) & checked[measured]
-    limits = learn(found, right, int(checked.sum()), elsewhere, pitch)
+    limits = learn(found, right, ~old[measured], int(checked.sum()), elsewhere, pitch)
     facts = replace(facts, checked=int(checked.sum()), confirmed=int(right.sum()), limits=limits)
     if limits is None:
         return decoded, facts
-    good = limits.accept(found)
+    good = limits.accept(found) & _inside(view)[tuple(places.T)]
     changed = _changed(view, shown, found, before, good, limits)
-    wrong = _impossible(view, shown, found, before, good, right)
+    wrong = _impossible(view, shown, found, before, good, limits)
     out = decoded.copy()
     out[tuple(places[changed].T)] = found.coords[changed]
     out[tuple(places[wrong].T)] = np.nan
@@ -120,6 +120,14 @@ def _thinned(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     some = np.zeros_like(known)
     some[::step, ::step] = True
     return some
+
+
+def _inside(view: View) -> Bool[ndarray, "h w"]:
+    """Pixels whose four neighbours are on the same surface: at its border, surface and image may be a pixel apart."""
+    depth = np.pad(np.where(view.usable, view.depth, np.float32(np.nan)), 1, constant_values=np.nan)
+    here = depth[1:-1, 1:-1]
+    around = (depth[:-2, 1:-1], depth[2:, 1:-1], depth[1:-1, :-2], depth[1:-1, 2:])
+    return np.logical_and.reduce([np.abs(there - here) <= STEEPEST * here for there in around])  # False for NaN
 
 
 def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
@@ -183,15 +191,15 @@ def _impossible(
     found: Measured,
     before: Float32[ndarray, "n 2"],
     good: Bool[ndarray, "n"],
-    right: Bool[ndarray, "n"],
+    limits: Limits,
 ) -> Bool[ndarray, "n"]:
-    """Decoded pixels far from what all frames predict, at which the image shows another part of the pattern, too."""
+    """Decoded pixels far from what all frames predict, where the image shows what is predicted, though not sharply."""
     predicted = view.coords[tuple(found.places.T)]
     far = np.abs(before - predicted).max(1) > _FAR * shown.ambiguity.pitch  # False for NaN
-    doubtful = np.flatnonzero(far & ~good)
-    least = float(np.quantile(found.correlation[right], _IMPOSSIBLE))
+    doubtful = np.flatnonzero(far & ~good & (found.correlation >= limits.correlation) & (found.margin >= limits.margin))
     wrong = np.zeros(len(before), dtype=bool)
-    wrong[doubtful] = correlation_at(view, shown, found.places[doubtful], before[doubtful]) < least
+    as_it_was = correlation_at(view, shown, found.places[doubtful], before[doubtful])
+    wrong[doubtful] = found.correlation[doubtful] - as_it_was > limits.margin
     return wrong
 
 
@@ -202,8 +210,8 @@ def _without_specks(
     pitch: float,
     pitch_px: float,
 ) -> Float32[ndarray, "h w 2"]:
-    """Regions smaller than a cell are no evidence: what was changed in them is as it was."""
-    kept = np.isfinite(drop_small_regions(coords, _TEAR * pitch, round(pitch_px**2))).all(-1)
+    """Regions of a few cells are no evidence: what was changed in them is as it was."""
+    kept = np.isfinite(drop_small_regions(coords, _TEAR * pitch, round(_CELLS * pitch_px**2))).all(-1)
     back = changed[~kept[tuple(changed.T)]]
     out = coords.copy()
     out[tuple(back.T)] = decoded[tuple(back.T)]
