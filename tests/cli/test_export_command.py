@@ -95,7 +95,8 @@ def test_the_scan_of_a_run_is_decoded_again(config, scan_root, tmp_path, monkeyp
     )
     redecode()
     said = capsys.readouterr().out
-    assert "of the pixels that show the pattern are decoded" in said and f"sl-neus --data {output}" in said
+    assert "of the pixels that show the pattern are decoded" in said
+    assert f"ns-train sl-neus --data {output}" in said.replace(" \\\n     ", "")
     old, new = read_scan(scan_root), read_scan(output)
     np.testing.assert_array_equal(old.poses.stacked(), new.poses.stacked())
     for before, after in zip(old.frames, new.frames, strict=True):

@@ -50,6 +50,14 @@ def test_cells_that_were_removed_come_back(predicted, share):
     assert facts.limits is not None and facts.accepted_elsewhere < 0.01
 
 
+def test_of_many_decoded_pixels_a_part_is_enough_to_learn_from(predicted, monkeypatch):
+    monkeypatch.setattr("sl_nerfstudio.redecoding.frame._MANY", 3000)
+    decoded = with_holes(truth(), 0.6)
+    found, facts = again(decoded, predicted)
+    assert facts.checked < 0.15 * facts.decoded_before and facts.decoded_after > 0.75 * MASK.sum()
+    assert np.nanmax(error(found)) < 1
+
+
 def test_without_a_mask_the_image_itself_says_where_the_pattern_is(predicted):
     found, facts = again(with_holes(truth(), 0.6), predicted, mask=None)
     assert facts.shown == MASK.size and facts.decoded_after > 0.75 * MASK.sum() and np.nanmax(error(found)) < 1
