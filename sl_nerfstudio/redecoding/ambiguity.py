@@ -9,6 +9,7 @@ from scipy.ndimage import maximum_filter
 
 _ALIKE = 0.25  # autocorrelation of a place that can be confused
 _REACH = 2.6  # distances of the nearest such place within which others are compared
+_MOST_RIVALS, _MOST_DECOYS = 24, 8  # stripes resemble themselves everywhere along themselves
 _LOBE_PITCH = 6.0  # widths of the main lobe that count as the distance if there is no such place
 
 
@@ -36,8 +37,11 @@ class Ambiguity:
             pitch = _LOBE_PITCH * lobe
         found = np.stack([x[peak], y[peak]], 1).astype(np.float32)
         far = distance[peak]
-        rivals = found[far < _REACH * pitch]
+        near = np.flatnonzero(far < _REACH * pitch)
+        strongest = np.argsort(-alike[peak][near], kind="stable")[:_MOST_RIVALS]
+        rivals = found[near[np.sort(strongest)]]
         decoys = found[(far > 1.2 * _REACH * pitch) & (far < 2.2 * _REACH * pitch)]
+        decoys = decoys[:: max(1, -(-len(decoys) // _MOST_DECOYS))]
         if not len(decoys):
             angle = np.arange(8) * np.pi / 4
             decoys = (1.7 * _REACH * pitch * np.stack([np.cos(angle), np.sin(angle)], 1)).astype(np.float32)

@@ -17,6 +17,7 @@ from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.document import TRANSFORMS, Record, read_document
 from sl_nerfstudio.scan.file_error import read_bytes
 from sl_nerfstudio.scan.writing import encode_json
+from sl_nerfstudio.threads import one_library_thread
 
 RECORD = "redecoding.json"
 
@@ -53,6 +54,7 @@ class Redecoded:
         return self.total(name) / max(self.total("shown"), 1)
 
 
+@one_library_thread()
 def redecode_run(run: TrainedRun, settings: RedecodeSettings) -> Redecoded:
     """Write the scan of a run with coordinates that were decoded again; one frame is in memory at a time.
 

@@ -34,6 +34,12 @@ def test_random_dots_resemble_themselves_nowhere():
     assert len(found.rivals) == 0 and len(found.decoys) == 8 and found.pitch > 8
 
 
+@pytest.mark.parametrize("pattern", [np.full((60, 80), 0.3), np.arange(80.0) // 8 % 2 + np.zeros((60, 1))])
+def test_a_flat_or_a_striped_pattern_is_no_special_case(pattern):
+    found = Ambiguity.of(pattern.astype(np.float32))
+    assert 1 < found.pitch < 20 and len(found.rivals) <= 24 and 1 <= len(found.decoys) <= 8
+
+
 def test_correlation_is_that_of_numpy_whatever_the_gain():
     image = (0.2 + 0.5 * shift(DOTS, (0.5, -1.0), order=1, mode="nearest")).astype(np.float32)
     window = Window.gaussian(4.0)
