@@ -17,7 +17,7 @@ import tyro
 from benchmarks.calibration.real import leave_each_out
 from benchmarks.calibration.rendered import SETS, Row, calibrate_rendered
 from benchmarks.common.machine import write_rows
-from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
+from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.pattern.presets import make_grid
 from sl_nerfstudio.pattern.sequence import SequenceName

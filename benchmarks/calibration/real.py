@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from sl_nerfstudio.calibration.board.calibrate import BoardCalibration, calibrate
 from sl_nerfstudio.calibration.board.rig import BoardView
-from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
-from sl_nerfstudio.cli.calibrate_inputs import CalibrationInputs, read_inputs
+from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
+from sl_nerfstudio.cli.calibrating.inputs import CalibrationInputs, read_inputs
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sl_nerfstudio.cli.calibrate import calibrate_devices
-from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
+from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
 from sl_nerfstudio.synthesis.boards.captures import BOARDS, write_board_captures
 from sl_nerfstudio.synthesis.config import SynthConfig
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
+from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
 from sl_nerfstudio.cli.run import run
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ def calibrate_devices(config: CalibrateConfig) -> None:
     board = config.the_board()
     from sl_nerfstudio.calibration.board.calibrate import calibrate
     from sl_nerfstudio.calibration.board.result_file import MARK, encode_calibration
-    from sl_nerfstudio.cli.calibrate_inputs import read_inputs
-    from sl_nerfstudio.cli.calibrate_words import next_pose_words, require_determined
+    from sl_nerfstudio.cli.calibrating.inputs import read_inputs
+    from sl_nerfstudio.cli.calibrating.words import next_pose_words, require_determined
     from sl_nerfstudio.evaluation.report.calibration_report import TITLE, render_calibration_report
     from sl_nerfstudio.files.atomic import write_atomic
     from sl_nerfstudio.files.results import held_results

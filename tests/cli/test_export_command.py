@@ -16,6 +16,7 @@ import yaml
 
 from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan
 from sl_nerfstudio.cli.export import main
+from sl_nerfstudio.cli.redecode import main as redecode
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -85,6 +86,21 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, monkeypa
     assert " cm\n" in said
     measured(mesh_path, mesh.vertices[seen][[0, -1]], scan_root, refined, tmp_path)
     assert "Distances between points, in cm" in capsys.readouterr().out
+
+
+def test_the_scan_of_a_run_is_decoded_again(config, scan_root, tmp_path, monkeypatch, capsys):
+    output = tmp_path / "again"
+    monkeypatch.setattr(
+        sys, "argv", ["sl-redecode", "--load-config", str(config), "--output", str(output), "--resolution", "64"]
+    )
+    redecode()
+    said = capsys.readouterr().out
+    assert "of the pixels that show the pattern are decoded" in said
+    assert f"ns-train sl-neus --data {output}" in said.replace(" \\\n     ", "")
+    old, new = read_scan(scan_root), read_scan(output)
+    np.testing.assert_array_equal(old.poses.stacked(), new.poses.stacked())
+    for before, after in zip(old.frames, new.frames, strict=True):
+        assert np.isfinite(after.read_coords()).sum() >= 0.9 * np.isfinite(before.read_coords()).sum()
 
 
 def measured(mesh: Path, ends: np.ndarray, scan: Path, refined: Path, folder: Path) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from sl_nerfstudio.calibration.board.calibrate import FEWEST_VIEWS
 from sl_nerfstudio.calibration.board.captures import BoardCaptures, BoardPhotographs, read_board_captures
-from sl_nerfstudio.cli.calibrate_config import CalibrateConfig
+from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError

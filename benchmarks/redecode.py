@@ -1,0 +1,245 @@
+"""What sl-redecode brings: scans with missing cells and scans of realistic photographs, before and after.
+
+    python -m benchmarks.redecode [--scenes head frog ...] [--missing 0.3 0.6 0.9] [--realistic 0.6] [--output FILE]
+
+Each scan is trained on, decoded again with the result, and trained on once more: the real commands, in this process.
+Coordinates are compared with exact ones, meshes with the true surface after rigid alignment. Rows that are in the
+result file are not measured again, so an interrupted benchmark continues. A case takes about 100 s of an idle core.
+"""
+
+import io
+import json
+import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import tyro
+from jaxtyping import Float32
+from numpy import ndarray
+
+from benchmarks.common.machine import write_rows
+from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.render import visible_centres
+from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.synthesise import synthesise
+
+WRONG_PX = 2.0
+_NO_TRUTH = 1e3  # error of a coordinate where no light falls
+
+
+@dataclass(frozen=True)
+class Config:
+    """Which scans are measured."""
+
+    scenes: tuple[str, ...] = ("head", "frog", "cone-and-cylinder")
+    """objects"""
+    missing: tuple[float, ...] = (0.3, 0.6, 0.9)
+    """shares of missing cells in plain scans"""
+    realistic: tuple[float, ...] = (0.6,)
+    """shares of missing cells in scans of realistic photographs"""
+    frames: int = 12
+    """captures of a scan"""
+    resolution: int = 280
+    """width of the images, pixels"""
+    iterations: int = 400
+    """steps of each training"""
+    seed: int = 3
+    """of the scans"""
+    output: Path = Path("benchmarks/results/redecode.json")
+    """where the figures are written"""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Figures of one mesh after rigid alignment, and of the cameras; lengths in mm."""
+
+    rmse: float
+    median: float
+    completeness_mean: float
+    completeness_rmse: float
+    f_score: float  # at 0.2 % of the object's size
+    camera_mm: float
+    camera_deg: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scan before and after it was decoded again; shares between 0 and 1, errors in pattern pixels."""
+
+    scene: str
+    appearance: str
+    missing: float
+    frames: int
+    resolution: int
+    iterations: int
+    seed: int
+    decoded_before: float
+    decoded_after: float
+    wrong_before: float  # of the decoded pixels
+    wrong_after: float
+    added_median: float
+    added_p95: float
+    added_wrong: float  # of the added and replaced pixels, more than WRONG_PX off, or where no light falls
+    replaced: int
+    removed: int
+    removed_wrong: float  # share of the removed ones that were wrong
+    accepted_elsewhere: float  # share that would be accepted at places that are certainly wrong
+    before: Surface
+    after: Surface
+
+
+def measure(scene: str, appearance: str, missing: float, config: Config, folder: Path) -> Row:
+    """Make a scan, train, decode again, train."""
+    synth = SynthConfig(
+        scene=scene,
+        appearance="plain" if appearance == "plain" else "realistic",
+        frames=config.frames,
+        resolution=config.resolution,
+        missing=missing,
+        seed=config.seed,
+    )
+    first, second = folder / "scan", folder / "again"
+    synthesise(synth, first)
+    run, before = _trained(first, folder / "a", config)
+    command("sl_nerfstudio.cli.redecode", "--load-config", run, "--output", second)
+    _, after = _trained(second, folder / "b", config)
+    record = json.loads((second / "redecoding.json").read_text())
+    learnt = [f["accepted_elsewhere"] for f in record["frames"] if f["limits"]]
+    old, new = _coordinates(first), _coordinates(second)
+    error = [_errors(coords, truth) for coords in (old, new) for truth in [_truth(synth)]]
+    was, now = (np.isfinite(coords[..., 0]) for coords in (old, new))
+    changed = now & ~(was & (old == new).all(-1))
+    fresh, gone = error[1][changed], error[0][was & ~now]
+    masked = sum(frame.read_mask().sum() for frame in read_scan(first).frames)
+    return Row(
+        scene, appearance, missing, config.frames, config.resolution, config.iterations, config.seed,
+        decoded_before=float(was.sum() / masked),
+        decoded_after=float(now.sum() / masked),
+        wrong_before=_wrong(error[0][was]),
+        wrong_after=_wrong(error[1][now]),
+        added_median=float(np.median(fresh)) if len(fresh) else float("nan"),
+        added_p95=float(np.percentile(fresh, 95)) if len(fresh) else float("nan"),
+        added_wrong=_wrong(fresh),
+        replaced=int((changed & was).sum()),
+        removed=len(gone),
+        removed_wrong=_wrong(gone),
+        accepted_elsewhere=float(np.mean(learnt)) if learnt else 0.0,
+        before=before,
+        after=after,
+    )  # fmt: skip
+
+
+def _trained(scan: Path, out: Path, config: Config) -> tuple[Path, Surface]:
+    """Train, export and evaluate; returns the run's config.yml, too."""
+    _forget_writers()
+    named = ("--output-dir", out, "--experiment-name", "run", "--timestamp", "now")
+    command("nerfstudio.scripts.train", "sl-neus", "--data", scan, *named, "--max-num-iterations", config.iterations)
+    run, mesh, poses = out / "run/sl-neus/now/config.yml", out / "mesh.ply", out / "refined"
+    command("sl_nerfstudio.cli.export", "--load-config", run, "--output", mesh, "--poses", poses, "--resolution", 256)
+    given = ("--mesh", mesh, "--data", scan, "--poses", poses / "transforms.json")
+    command("sl_nerfstudio.cli.evaluate", *given, "--json", out / "e.json")
+    found = json.loads((out / "e.json").read_text())
+    accuracy, completeness = found["rigid"]["accuracy"], found["rigid"]["completeness"]
+    return run, Surface(
+        accuracy["rmse"],
+        accuracy["median"],
+        completeness["mean"],
+        completeness["rmse"],
+        list(found["rigid"]["f_score"].values())[1],
+        found["camera"]["translation_rmse"],
+        found["camera"]["rotation_rmse_deg"],
+    )
+
+
+def _forget_writers() -> None:
+    """nerfstudio keeps the writers of its logs in a module: they would write to the folder of the run before."""
+    import nerfstudio.scripts.train  # noqa: F401  (imported by itself first, nerfstudio's writer imports itself)
+    from nerfstudio.utils import writer
+
+    for one in writer.EVENT_WRITERS:
+        if hasattr(one, "tb_writer"):
+            one.tb_writer.close()
+    writer.EVENT_WRITERS.clear()
+    writer.GLOBAL_BUFFER.clear()
+
+
+def command(module: str, *arguments: object) -> None:
+    """Run a command in this process: importing nerfstudio takes ten seconds each time. Shows its output if it fails."""
+    from importlib import import_module
+
+    said, kept = io.StringIO(), sys.argv
+    loaded = import_module(module)
+    main = getattr(loaded, "entrypoint", None) or loaded.main
+    sys.argv = [module.rpartition(".")[2], *map(str, arguments)]
+    try:
+        with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            main()
+    except BaseException:
+        print(said.getvalue(), file=sys.__stderr__)
+        raise
+    finally:
+        sys.argv = kept
+
+
+def _coordinates(scan: Path) -> Float32[ndarray, "n h w 2"]:
+    return np.stack([frame.read_coords() for frame in read_scan(scan).frames])
+
+
+def _truth(config: SynthConfig) -> Float32[ndarray, "n h w 2"]:
+    """Exact coordinates of all frames, NaN where no light falls."""
+    setup = make_setup(config)
+    poses = zip(setup.truth.T_world_camera, setup.truth.T_world_projector, strict=True)
+    seen = [visible_centres(setup.caster, setup.devices, camera, projector) for camera, projector in poses]
+    size = (setup.devices.camera.h, setup.devices.camera.w)
+    maps = [np.where(s.lit[:, None], s.uv_projector, np.nan).reshape(*size, 2) for s in seen]
+    return np.stack(maps).astype(np.float32)
+
+
+def _errors(coords: Float32[ndarray, "n h w 2"], truth: Float32[ndarray, "n h w 2"]) -> Float32[ndarray, "n h w"]:
+    error = np.abs(coords - truth).max(-1)
+    return np.where(np.isfinite(truth[..., 0]), error, np.float32(_NO_TRUTH))
+
+
+def _wrong(errors: Float32[ndarray, "k"]) -> float:
+    return float((errors > WRONG_PX).mean()) if len(errors) else 0.0
+
+
+def text(row: Row) -> str:
+    """One line."""
+    a, b = row.before, row.after
+    return (
+        f"{row.scene:18} {row.appearance:9} {row.missing:.0%}"
+        f"  decoded {row.decoded_before:.1%} -> {row.decoded_after:.1%}"
+        f"  new: median {row.added_median:.2f} 95 % {row.added_p95:.2f} px, wrong {row.added_wrong:.3%}"
+        f"  wrong of all {row.wrong_before:.2%} -> {row.wrong_after:.2%}"
+        f"  RMSE {a.rmse:.3f} -> {b.rmse:.3f}  median {a.median:.3f} -> {b.median:.3f}"
+        f"  complete {a.completeness_mean:.3f} -> {b.completeness_mean:.3f}  F {a.f_score:.3f} -> {b.f_score:.3f}"
+        f"  cameras {a.camera_mm:.2f} -> {b.camera_mm:.2f} mm"
+    )
+
+
+def main() -> None:
+    """Run the benchmark."""
+    config = tyro.cli(Config, description=__doc__)
+    kept = json.loads(config.output.read_text())["rows"] if config.output.exists() else []
+    rows = [Row(**{**row, "before": Surface(**row["before"]), "after": Surface(**row["after"])}) for row in kept]
+    size = (config.frames, config.resolution, config.iterations, config.seed)
+    done = {(r.scene, r.appearance, r.missing, r.frames, r.resolution, r.iterations, r.seed) for r in rows}
+    kinds = [("plain", share) for share in config.missing] + [("realistic", share) for share in config.realistic]
+    for scene in config.scenes:
+        for appearance, missing in kinds:
+            if (scene, appearance, missing, *size) not in done:
+                with TemporaryDirectory() as folder:
+                    rows.append(measure(scene, appearance, missing, config, Path(folder)))
+                write_rows(config.output, rows)
+                print(text(rows[-1]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

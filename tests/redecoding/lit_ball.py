@@ -1,0 +1,97 @@
+"""A ball under a coded grid, by the formulas of the scan format alone: coordinates, images, and its mesh."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.pattern.grid import GridPattern
+from tests.meshing.ray_cast_scan import look_at
+
+RADIUS = 40.0  # mm, about the origin
+CAMERA = Device(w=160, h=160, fl_x=460.0, fl_y=460.0, cx=80.0, cy=80.0)
+PROJECTOR = Device(w=400, h=400, fl_x=1200.0, fl_y=1200.0, cx=200.0, cy=200.0)
+T_CAMERA, T_PROJECTOR = look_at((0, -300, 60)), look_at((90, -290, 40))
+
+
+@dataclass(frozen=True)
+class Lit:
+    """What the rays through some camera pixels see."""
+
+    coords: ndarray  # NaN where no light falls
+    p_world: ndarray
+
+
+@cache
+def grid(seed: int = 0) -> ndarray:
+    """The projected pattern."""
+    return GridPattern(w=PROJECTOR.w, h=PROJECTOR.h, seed=seed).render()
+
+
+@cache
+def ball(cells: int = 90) -> Mesh:
+    """The ball as a mesh."""
+    return extract_mesh(lambda p: p.norm(dim=-1) - RADIUS, cells, (-44.0,) * 3, (44.0,) * 3, device=torch.device("cpu"))
+
+
+def seen_at(x: ndarray, y: ndarray) -> Lit:
+    """The nearest point of the ball on the ray of a camera pixel, and where the projector sees it."""
+    d = np.stack([(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1)
+    d = d @ T_CAMERA[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    o = T_CAMERA[:3, 3]
+    b = d @ o
+    with np.errstate(invalid="ignore"):
+        p = o + (-b - np.sqrt(b**2 - o @ o + RADIUS**2))[..., None] * d
+    q = (p - T_PROJECTOR[:3, 3]) @ T_PROJECTOR[:3, :3]
+    u = PROJECTOR.fl_x * q[..., 0] / -q[..., 2] + PROJECTOR.cx
+    v = -PROJECTOR.fl_y * q[..., 1] / -q[..., 2] + PROJECTOR.cy
+    with np.errstate(invalid="ignore"):
+        lit = ((T_PROJECTOR[:3, 3] - p) * p).sum(-1) > 0
+        lit &= (u >= 0) & (v >= 0) & (u < PROJECTOR.w) & (v < PROJECTOR.h)
+    return Lit(np.where(lit[..., None], np.stack([u, v], -1), np.nan), p)
+
+
+@cache
+def truth() -> ndarray:
+    """Exact coordinates at the pixel centres, float32."""
+    y, x = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
+    return seen_at(x, y).coords.astype(np.float32)
+
+
+@cache
+def picture(seed: int = 0) -> ndarray:
+    """What the camera sees: the mean of nine rays a pixel, under slanted light of its own."""
+    y, x = np.mgrid[: CAMERA.h, : CAMERA.w].astype(float)
+    total = np.zeros((CAMERA.h, CAMERA.w))
+    for dy in (1 / 6, 3 / 6, 5 / 6):
+        for dx in (1 / 6, 3 / 6, 5 / 6):
+            total += np.nan_to_num(_light(grid(seed), seen_at(x + dx, y + dy).coords)) / 9
+    return (0.1 + (0.3 + 0.4 * x / CAMERA.w) * total).astype(np.float32)
+
+
+def _light(pattern: ndarray, coords: ndarray) -> ndarray:
+    u, v = np.nan_to_num(coords[..., 0] - 0.5), np.nan_to_num(coords[..., 1] - 0.5)
+    u, v = np.clip(u, 0, pattern.shape[1] - 1.001), np.clip(v, 0, pattern.shape[0] - 1.001)
+    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
+    a, b = u - j, v - i
+    upper = (1 - a) * pattern[i, j] + a * pattern[i, j + 1]
+    lower = (1 - a) * pattern[i + 1, j] + a * pattern[i + 1, j + 1]
+    return np.where(np.isnan(coords[..., 0]), np.nan, (1 - b) * upper + b * lower)
+
+
+def with_holes(coords: ndarray, share: float, seed: int = 0) -> ndarray:
+    """The coordinates without whole cells of the grid, chosen at random."""
+    rng = np.random.default_rng(seed)
+    missing = rng.random((21, 21)) < share
+    known = np.isfinite(coords).all(-1)
+    cell = np.zeros((*known.shape, 2), dtype=int)
+    cell[known] = (coords[known] // 20).astype(int)
+    out = coords.copy()
+    out[missing[cell[..., 1], cell[..., 0]] & known] = np.nan
+    return out

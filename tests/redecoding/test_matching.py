@@ -1,0 +1,83 @@
+"""Where a pattern resembles itself, and correlations against numpy's own."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, shift
+
+from sl_nerfstudio.redecoding.ambiguity import Ambiguity
+from sl_nerfstudio.redecoding.correlation import View, Window, correlations, fit_shifts
+from tests.redecoding.lit_ball import grid
+
+RNG = np.random.default_rng(1)
+DOTS = gaussian_filter(RNG.random((120, 140)).astype(np.float32), 2.0)
+
+
+def flat_view(image: np.ndarray, depth: np.ndarray | None = None) -> View:
+    """A camera that looks at the pattern itself."""
+    h, w = image.shape
+    coords = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).astype(np.float32)
+    depth = np.ones_like(image) if depth is None else depth
+    return View(image, coords, depth, np.ones(image.shape, dtype=bool))
+
+
+def test_a_grid_resembles_itself_at_whole_periods():
+    found = Ambiguity.of(grid())
+    assert found.pitch == pytest.approx(20, abs=1)
+    offsets = {tuple(np.rint(d / 20).astype(int)) for d in found.rivals}
+    assert {(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 2)} <= offsets
+    assert np.abs(found.rivals - 20 * np.rint(found.rivals / 20)).max() <= 1
+    assert np.linalg.norm(found.decoys, axis=1).min() > np.linalg.norm(found.rivals, axis=1).max()
+
+
+def test_random_dots_resemble_themselves_nowhere():
+    found = Ambiguity.of(DOTS)
+    assert len(found.rivals) == 0 and len(found.decoys) == 8 and found.pitch > 8
+
+
+@pytest.mark.parametrize("pattern", [np.full((60, 80), 0.3), np.arange(80.0) // 8 % 2 + np.zeros((60, 1))])
+def test_a_flat_or_a_striped_pattern_is_no_special_case(pattern):
+    found = Ambiguity.of(pattern.astype(np.float32))
+    assert 1 < found.pitch < 20 and len(found.rivals) <= 24 and 1 <= len(found.decoys) <= 8
+
+
+def test_correlation_is_that_of_numpy_whatever_the_gain():
+    image = (0.2 + 0.5 * shift(DOTS, (0.5, -1.0), order=1, mode="nearest")).astype(np.float32)
+    window = Window.gaussian(4.0)
+    candidates = np.dstack([DOTS, np.roll(DOTS, 3, 0)])
+    found = correlations(flat_view(image), candidates, np.array([[50, 60], [2, 3]]), window)
+    for n, (row, column) in enumerate([(50, 60), (2, 3)]):
+        y, x = (window.offsets + (row, column)).T
+        inside = (y >= 0) & (x >= 0)
+        for k in range(2):
+            C = np.cov(
+                image[y[inside], x[inside]], candidates[y[inside], x[inside], k], aweights=window.weights[inside]
+            )
+            assert found[n, k] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), abs=1e-3)
+
+
+def test_a_displacement_is_found_to_a_hundredth_of_a_pixel():
+    image = 0.1 + 0.3 * shift(DOTS, (-0.37, 0.81), order=3)
+    places = np.argwhere(np.pad(np.ones((60, 60), dtype=bool), 30)[:120, :140])[::37]
+    fit = fit_shifts(flat_view(image), DOTS, places, np.zeros((len(places), 2), dtype=np.float32), Window.gaussian(5.0))
+    np.testing.assert_allclose(np.median(fit.shift, 0), [-0.81, 0.37], atol=0.02)
+    assert np.abs(fit.shift - [-0.81, 0.37]).max() < 0.15 and fit.correlation.min() > 0.99
+    assert fit.covered.min() == pytest.approx(1, abs=1e-5) and fit.step.max() < 0.05
+
+
+def test_a_window_stays_on_its_surface():
+    """Beyond a step of depth the image shows something else, which must not count."""
+    depth = np.ones_like(DOTS)
+    depth[:, 70:] = 100.0
+    image = DOTS.copy()
+    image[:, 70:] = RNG.random((120, 70))
+    fit = fit_shifts(
+        flat_view(image, depth), DOTS, np.array([[60, 67]]), np.zeros((1, 2), np.float32), Window.gaussian(5.0)
+    )
+    assert fit.correlation[0] > 0.999 and np.abs(fit.shift).max() < 0.01 and 0.5 < fit.covered[0] < 0.9
+
+
+def test_a_blank_image_has_no_place():
+    blank = np.full_like(DOTS, 0.4)
+    fit = fit_shifts(flat_view(blank), DOTS, np.array([[60, 60]]), np.zeros((1, 2), np.float32), Window.gaussian(5.0))
+    assert fit.correlation[0] == 0 and fit.sigma[0] == np.inf
+    assert correlations(flat_view(blank), DOTS[..., None], np.array([[60, 60]]), Window.gaussian(5.0)).item() == 0
