@@ -87,11 +87,12 @@ def adam(problem: Problem, start: Poses, choice: AdamChoice, steps: int, rays: i
 def gauss_newton(problem: Problem, start: Poses, iterations: int, pixels: int, seed: int) -> Poses:
     """Gauss-Newton with Geman-McClure weights, each frame by itself: the surface is known, so nothing joins them.
 
-    The kernel's width follows twice the median residual of the frame. Damped by a thousandth of the diagonal.
+    The kernel's width follows twice the median residual of the frame. The damping starts at a thousandth of the
+    diagonal and halves with every iteration: kept, it would hold the weak directions where they are.
     """
     index = drawn(problem, pixels * problem.frames, torch.Generator().manual_seed(seed))
     poses = start
-    for _ in range(iterations):
+    for iteration in range(iterations):
         r = problem.residuals(poses, index)
         size = r.value.norm(dim=-1)
         width = 2 * torch.stack([_median(size[r.frame == k]) for k in range(problem.frames)])[r.frame]
@@ -101,7 +102,8 @@ def gauss_newton(problem: Problem, start: Poses, iterations: int, pixels: int, s
         scaled = weight[:, None, None] * J.mT
         H = per_frame(r.frame, scaled @ J, problem.frames)
         g = per_frame(r.frame, (scaled @ r.value[..., None])[..., 0], problem.frames)
-        H = H + torch.diag_embed(1e-3 * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
+        damping = 1e-3 * 0.5**iteration
+        H = H + torch.diag_embed(damping * H.diagonal(dim1=-2, dim2=-1) + 1e-9)
         poses = _moved(poses, camera, projector, -torch.linalg.solve(H, g))
     return poses
 
