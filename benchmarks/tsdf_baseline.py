@@ -61,7 +61,6 @@ class Row:
     seconds: float
     accuracy_rmse: float
     accuracy_median: float
-    completeness_mean: float
     completeness_rmse: float
     completeness_median: float
     accuracy_rmse_similarity: float
@@ -100,7 +99,6 @@ def _row(scan, poses, units, seconds, rigid: SurfaceScore, similarity: SurfaceSc
         seconds=seconds,
         accuracy_rmse=rigid.accuracy.rmse,
         accuracy_median=rigid.accuracy.median,
-        completeness_mean=rigid.completeness.mean,
         completeness_rmse=rigid.completeness.rmse,
         completeness_median=rigid.completeness.median,
         accuracy_rmse_similarity=similarity.accuracy.rmse,
@@ -114,13 +112,13 @@ def main() -> None:
     """Measure, print, write."""
     config = tyro.cli(Config)
     rows: list[Row] = []
-    print("scan                 poses       accuracy RMS   median completeness mean   median with scale      s")
+    print("scan                 poses       accuracy RMS   median completeness RMS   median with scale      s")
     for root in config.scans:
         for row in measure(root, config.poses, config.meshes):
             rows.append(row)
             print(
                 f"{row.scan:20} {row.poses:11} {row.accuracy_rmse:9.3f} {row.units:2} {row.accuracy_median:8.3f} "
-                f"{row.completeness_mean:17.3f} {row.completeness_median:8.3f} {row.accuracy_rmse_similarity:10.3f} "
+                f"{row.completeness_rmse:16.3f} {row.completeness_median:8.3f} {row.accuracy_rmse_similarity:10.3f} "
                 f"{row.seconds:6.1f}",
                 flush=True,
             )
