@@ -1,16 +1,20 @@
-"""Classical fusion: Open3D's TSDF with initial, ICP-registered and true poses, on scans with known truth.
+"""Classical fusion: Open3D's TSDF with initial, ICP-registered, our refined, and true poses, on scans with known truth.
 
-python -m benchmarks.tsdf_baseline SCAN [SCAN ...] [--output results.json]
+python -m benchmarks.tsdf_baseline SCAN [SCAN ...] [--poses refined] [--output results.json]
+
+Fusion with our refined poses, those with which `sl-neus` trains, tells what the field adds to the poses.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from benchmarks.baselines.icp_registration import register
+from benchmarks.baselines.refined_poses import refined_poses
 from benchmarks.baselines.tsdf import fuse
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
@@ -20,16 +24,27 @@ from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.metrics import SurfaceScore
 from sl_nerfstudio.evaluation.pose_errors import compare_poses
 from sl_nerfstudio.evaluation.reference import mesh_reference
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
-from sl_nerfstudio.scan import read_ground_truth, read_scan
+from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
+
+PoseKind = Literal["initial", "registered", "refined", "true"]
+POSES: dict[PoseKind, Callable[[Scan, DevicePoses], DevicePoses]] = {
+    "initial": lambda scan, true: scan.poses,
+    "registered": lambda scan, true: register(scan, scan.poses),
+    "refined": lambda scan, true: refined_poses(scan),
+    "true": lambda scan, true: true,
+}
 
 
 @dataclass(frozen=True)
 class Config:
-    """TSDF fusion with initial, ICP-registered and true poses."""
+    """TSDF fusion with several kinds of poses."""
 
     scans: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Scan folders with ground_truth/."""
+    poses: tuple[PoseKind, ...] = ("initial", "registered", "refined", "true")
+    """With which poses: the scan's, after ICP, after our joint adjustment, true."""
     output: Path | None = None
     """Where to write the figures as JSON, with machine, date and commit."""
     meshes: Path | None = None
@@ -54,18 +69,18 @@ class Row:
     camera_rotation_rmse_deg: float
 
 
-def measure(root: Path, meshes: Path | None) -> list[Row]:
-    """Fuse one scan with all three kinds of poses. Raises UserError for a scan without truth."""
+def measure(root: Path, kinds: tuple[PoseKind, ...], meshes: Path | None) -> list[Row]:
+    """Fuse one scan with each kind of poses. Raises UserError for a scan without truth."""
     scan = read_scan(root)
     truth = read_ground_truth(scan)
     if truth.mesh_path is None or truth.poses is None:
         raise UserError(f"{root}: has no complete ground_truth/\n    remedy: make one with sl-synth")
-    true, initial = truth.poses, scan.poses
+    true = truth.poses
     reference = mesh_reference(read_mesh(truth.mesh_path), scan, true)
     rows = []
-    for name in ("initial", "registered", "true"):
+    for name in kinds:
         start = time.perf_counter()
-        poses = {"initial": initial, "true": true}.get(name) or register(scan, initial)
+        poses = POSES[name](scan, true)
         mesh = fuse(scan, poses)
         seconds = time.perf_counter() - start
         if meshes is not None:
@@ -97,13 +112,14 @@ def main() -> None:
     """Measure, print, write."""
     config = tyro.cli(Config)
     rows: list[Row] = []
-    print("scan                 poses       accuracy RMS   median completeness RMS with scale      s")
+    print("scan                 poses       accuracy RMS   median completeness RMS   median with scale      s")
     for root in config.scans:
-        for row in measure(root, config.meshes):
+        for row in measure(root, config.poses, config.meshes):
             rows.append(row)
             print(
                 f"{row.scan:20} {row.poses:11} {row.accuracy_rmse:9.3f} {row.units:2} {row.accuracy_median:8.3f} "
-                f"{row.completeness_rmse:16.3f} {row.accuracy_rmse_similarity:10.3f} {row.seconds:6.1f}",
+                f"{row.completeness_rmse:16.3f} {row.completeness_median:8.3f} {row.accuracy_rmse_similarity:10.3f} "
+                f"{row.seconds:6.1f}",
                 flush=True,
             )
     if config.output:

@@ -69,5 +69,6 @@ sl_neus_paper = MethodSpecification(
             "projector_opt": _paper_group(1e-3),
         },
     ),
-    description="The method of Furukawa, Nishihara and Kawasaki (2025) as published, for comparison.",
+    description="The method of Furukawa, Nishihara and Kawasaki (2025), for comparison; three details differ: xyz as "
+    "input, a rounded ReLU, coordinates divided by the accumulated weight.",
 )

@@ -62,7 +62,10 @@ class RegisteredFramesSettings:
 
 @dataclass(frozen=True)
 class AdjustedFrames:
-    """Poses of all frames with 1 sigma; NaN and None where a frame was not registered."""
+    """Poses of all frames with 1 sigma; NaN and None where a frame was not registered.
+
+    Noise and residuals are NaN if the frames were registered only.
+    """
 
     poses: DevicePoses
     sigma: tuple[PoseSigma | None, ...]  # of the frame as a whole, and of projector against camera; per axis
@@ -99,18 +102,13 @@ def adjust_registered(
     Raises UserError if fewer than two frames are registered.
     """
     s = settings or RegisteredFramesSettings()
-    index: list[int] = np.flatnonzero(registration.registered).tolist()
-    if len(index) < 2:
-        lost = ", ".join(exclusion.frame for exclusion in registration.exclusions)
-        raise UserError(
-            f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed\n"
-            f"    not registered: {lost}"
-        )
-    camera = registration.T_world_camera[index]
-    projector = np.stack([_projector_pose(clouds[k], registration, k) for k in index])
+    index = _registered(clouds, registration)
     S_scene_world = _scene(clouds, registration, index)
     start = Rig.of(
-        [clouds[k].camera for k in index], clouds[0].projector, DevicePoses(camera, projector), S_scene_world
+        [clouds[k].camera for k in index],
+        clouds[0].projector,
+        _poses_of(clouds, registration, index),
+        S_scene_world,
     )
     maps = CoordinateMaps.of([torch.from_numpy(clouds[k].coords) for k in index], s.adjustment.look_up)
     prior = _prior(clouds, registration, index, S_scene_world.scale, s)
@@ -118,17 +116,66 @@ def adjust_registered(
     rig = restore(start, found.rig, baseline_scale(start, found.rig, None))
     S_world_scene = S_scene_world.inverse()
     stated = s.dependence * frame_sigmas(found.sigma.clamp_min(s.least_sigma), S_world_scene.scale)
-    sigma: list[PoseSigma | None] = [None] * len(clouds)
-    for k, values in zip(index, stated, strict=True):
-        sigma[k] = PoseSigma(*values.tolist())
     return AdjustedFrames(
         _among_all(rig.poses(S_world_scene), index, len(clouds)),
-        tuple(sigma),
+        _sigmas_among_all(stated, index, len(clouds)),
         found.noise_px,
         found.median_before_px,
         found.median_after_px,
         found.intrinsics,
     )
+
+
+def keep_registered(
+    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
+) -> AdjustedFrames:
+    """The poses of all registered frames as registration left them, with what the adjustment takes as their prior.
+
+    Raises UserError if fewer than two frames are registered.
+    """
+    s = settings or RegisteredFramesSettings()
+    index = _registered(clouds, registration)
+    scale = _scene(clouds, registration, index).scale
+    prior = _prior(clouds, registration, index, scale, s)
+    shift, turn = prior.frame_translation / scale, torch.rad2deg(prior.frame_rotation)
+    own_shift, own_turn = prior.relative_translation / scale, torch.rad2deg(prior.relative_rotation)
+    stated = torch.stack([shift, turn, own_shift, own_turn], 1).numpy()
+    return AdjustedFrames(
+        _among_all(_poses_of(clouds, registration, index), index, len(clouds)),
+        _sigmas_among_all(stated, index, len(clouds)),
+        noise_px=float("nan"),
+        median_before_px=float("nan"),
+        median_after_px=float("nan"),
+        intrinsics=None,
+    )
+
+
+def _registered(clouds: Sequence[FrameCloud], registration: Registration) -> list[int]:
+    """Numbers of the registered frames. Raises UserError if fewer than two are."""
+    index: list[int] = np.flatnonzero(registration.registered).tolist()
+    if len(index) < 2:
+        lost = ", ".join(exclusion.frame for exclusion in registration.exclusions)
+        raise UserError(
+            f"{len(index)} of {len(clouds)} frames could be registered; at least 2 are needed\n"
+            f"    not registered: {lost}"
+        )
+    return index
+
+
+def _poses_of(clouds: Sequence[FrameCloud], registration: Registration, index: Sequence[int]) -> DevicePoses:
+    """Poses of some frames after registration."""
+    projector = np.stack([_projector_pose(clouds[k], registration, k) for k in index])
+    return DevicePoses(registration.T_world_camera[list(index)], projector)
+
+
+def _sigmas_among_all(
+    stated: Float64[ndarray, "m 4"], index: Sequence[int], frames: int
+) -> tuple[PoseSigma | None, ...]:
+    """Sigma of some frames, at the indices of those frames among all; None elsewhere."""
+    sigma: list[PoseSigma | None] = [None] * frames
+    for k, values in zip(index, stated, strict=True):
+        sigma[k] = PoseSigma(*values.tolist())
+    return tuple(sigma)
 
 
 def _among_all(poses: DevicePoses, index: Sequence[int], frames: int) -> DevicePoses:

@@ -53,6 +53,9 @@ class ProcessConfig:
     """transforms.json with rough camera poses to start from (within 20 degrees); the scan gets their axes and unit"""
     rig: Rig = "free"
     """how the devices moved: each by itself, both fixed to each other, or only the camera"""
+    no_adjust: bool = False
+    """leave the poses as registration (ICP) finds them, without adjusting all frames together: for methods that refine
+    poses themselves, and to see what the adjustment is worth"""
     estimate_projector: bool = False
     """nobody has calibrated the projector: find its intrinsics from all frames; those in a file are only a start"""
     masks: Path | None = None
@@ -79,6 +82,12 @@ class ProcessConfig:
         for holds, flag, value, why in rules:
             if not holds:
                 raise UserError(f"{flag} {value}: {why}")
+        if self.no_adjust and (self.finds_projector or self.rig != "free"):
+            other = "--estimate-projector" if self.estimate_projector else f"--rig {self.rig}"
+            raise UserError(
+                f"--no-adjust and {other}: only the joint adjustment can do what {other} asks for\n"
+                "    remedy: leave one of them out"
+            )
         work, output = (os.path.realpath(path) for path in (self.work_folder, self.output))
         if os.path.commonpath([work, output]) == output:
             raise UserError(

@@ -14,8 +14,8 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     AdjustedFrames,
     RegisteredFramesSettings,
     adjust_registered,
+    keep_registered,
 )
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration
@@ -63,6 +63,17 @@ def adjust_consistent(
     if doubtful:
         with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]), settings)
     return _without_contradictions(clouds, with_more, log, settings)
+
+
+def registered_only(
+    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
+) -> ConsistentFrames:
+    """All registered frames where registration put them; they are compared within the uncertainty of that.
+
+    Raises UserError if fewer than two frames are registered.
+    """
+    kept = keep_registered(clouds, registration, settings)
+    return ConsistentFrames(registration, kept, _compared(clouds, registration, kept, exact=False))
 
 
 def _agrees_well(found: ConsistentFrames, k: int) -> bool:
@@ -148,9 +159,16 @@ def compare_registered(
     clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames
 ) -> CrossFrameAgreement:
     """Coordinates of all registered frames against each other; the poses count as exact, so that errors show."""
+    return _compared(clouds, registration, adjusted, exact=True)
+
+
+def _compared(
+    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames, exact: bool
+) -> CrossFrameAgreement:
+    """`exact`: the poses count as exact; else they may err by what they state."""
     index = np.flatnonzero(registration.registered)
     chosen = [clouds[k] for k in index]
-    poses = DevicePoses(adjusted.poses.T_world_camera[index], adjusted.poses.T_world_projector[index])
+    sigma = [None if exact else adjusted.sigma[k] for k in index]
     return compare_frames(
-        [c.camera for c in chosen], clouds[0].projector, poses, [c.coords for c in chosen], [None] * len(chosen)
+        [c.camera for c in chosen], clouds[0].projector, adjusted.poses[index], [c.coords for c in chosen], sigma
     )

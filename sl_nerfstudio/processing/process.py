@@ -14,7 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.processing.capture_files.cameras import refine_camera
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.consistency import adjust_consistent
+from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
@@ -98,11 +98,14 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     _require_registered(config, inputs, results, registration, wrong, make_report)
 
     settings = adjustment_settings(config.rig, found)
-    consistent = store.kept(
-        "adjustment",
-        (clouds, registration, settings),
-        lambda: adjust_consistent(clouds, registration, log, settings),
-    )
+    if config.no_adjust:
+        consistent = registered_only(clouds, registration, settings)
+    else:
+        consistent = store.kept(
+            "adjustment",
+            (clouds, registration, settings),
+            lambda: adjust_consistent(clouds, registration, log, settings),
+        )
     if found is not None and config.rig != "static-projector":  # whose placement has adjusted everything
         refined = refine_projector(clouds, consistent, found, job.stated.camera, settings, log)
         clouds, consistent, found = refined.clouds, refined.consistent, refined.found

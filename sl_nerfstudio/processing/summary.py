@@ -81,7 +81,11 @@ def summarise(
         cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
         verdict=judge_scan(
             ScanFacts(
-                tuple(map(_facts, frames)), tuple(PairFacts(e.frames, e.used) for e in records), cross, bool(wrong)
+                tuple(map(_facts, frames)),
+                tuple(PairFacts(e.frames, e.used) for e in records),
+                cross,
+                bool(wrong),
+                adjusted=not config.no_adjust,
             )
         ),
         projector=found,

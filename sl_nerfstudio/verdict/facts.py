@@ -35,6 +35,7 @@ class ScanFacts:
     pairs: tuple[PairFacts, ...] | None = None  # of registration
     cross: CrossFrameAgreement | None = None  # of the frames in the scan, in their order
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
+    adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
     def in_scan(self) -> tuple[FrameFacts, ...]:

@@ -30,6 +30,11 @@ def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     degenerate = [f.name for f in facts.in_scan if f.degenerate]
     if len(degenerate) > settings.most_frames * len(facts.in_scan):
         yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
+    if not facts.adjusted:
+        yield Reason(
+            "acceptable", "the poses are those of the registration alone (--no-adjust); frames were compared within "
+            "its uncertainty only",
+        )  # fmt: skip
     if facts.wrong_intrinsics:
         yield Reason("acceptable", "the captures contradict the stated intrinsics")
 

@@ -94,6 +94,36 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     assert angles.max() < 0.3
 
 
+def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigma_covers_them(
+    monkeypatch, whole, ramp_scan, tmp_path
+):
+    monkeypatch.setattr(stages, "adjust_consistent", lambda *_: pytest.fail("adjusted"))
+    registered = []
+    real = stages.registered_only
+    monkeypatch.setattr(stages, "registered_only", lambda *args: registered.append(args[1]) or real(*args))
+    result, log = _run(ramp_scan.config(tmp_path / "s", no_adjust=True))
+    assert log[-1] == "registered 4 of 4 frames" and result.joint_px is None
+    assert result.verdict.band == "acceptable"
+    assert any("registration alone (--no-adjust)" in reason for reason in result.verdict.reasons)
+    scan, adjusted = read_scan(tmp_path / "s"), read_scan(whole[2] / "s")
+    np.testing.assert_allclose(scan.poses.T_world_camera, registered[0].T_world_camera, atol=1e-9)
+    np.testing.assert_allclose(scan.poses.baseline, registered[0].baseline, rtol=1e-9)
+    true = ramp_scan.T_world_camera
+    S = fit_similarity(scan.poses.T_world_camera[:, :3, 3], true[:, :3, 3])
+    errors = np.linalg.norm(S.points(scan.poses.T_world_camera[:, :3, 3]) - true[:, :3, 3], axis=1) / S.scale
+    for error, rough, fine in zip(errors, scan.frames, adjusted.frames, strict=True):
+        assert rough.pose_sigma is not None and fine.pose_sigma is not None
+        assert rough.pose_sigma.camera_rotation_deg >= 1.0 > fine.pose_sigma.camera_rotation_deg
+        distance = np.linalg.norm(rough.T_world_camera[:3, 3])
+        assert error < 3 * (rough.pose_sigma.camera_translation + np.radians(1.0) * distance)
+
+
+@pytest.mark.parametrize("more", [{"rig": "rigid"}, {"rig": "static-projector"}, {"estimate_projector": True}])
+def test_what_only_the_adjustment_can_do_cannot_be_asked_for_without_it(ramp_scan, tmp_path, more):
+    with pytest.raises(UserError, match=r"--no-adjust and --(rig|estimate-projector)"):
+        _run(ramp_scan.config(tmp_path / "s", no_adjust=True, **more))
+
+
 def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, tmp_path):
     lose(NAMES[3])
     result, log = _run(ramp_scan.config(tmp_path / "s"))
