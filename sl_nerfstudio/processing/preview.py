@@ -31,8 +31,9 @@ def make_preview(
     part: UInt8[ndarray, "_h _w"] | None = None,
     frames: int = 1,
 ) -> Preview:
-    """Reduced pictures of one of `frames` frames. `part` is what each pixel shows (`Part`), if surroundings were looked for.
+    """Reduced pictures of one of `frames` frames.
 
+    `part` is what each pixel shows (`Part`), if surroundings were looked for.
     `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded.
     """
     picture = colours = None

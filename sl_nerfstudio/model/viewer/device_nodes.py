@@ -1,4 +1,4 @@
-"""Cameras and projectors in the viewer's scene: pyramids at their starting and current poses, names, and the way between."""
+"""Cameras and projectors in the viewer's scene: pyramids at starting and current poses, the way between, and names."""
 
 import math
 from collections.abc import Sequence
@@ -95,7 +95,7 @@ class DeviceNodes:
             self.path.visible = shown
 
     def show(self, *, refined: bool, starting: bool, named: Sequence[int]) -> None:
-        """Choose what is visible; `named` are the frames with a name. Lines are visible where both of their ends are."""
+        """Choose what is visible; `named` are the frames with a name. Lines are where both of their ends are."""
         for handles, visible in ((self.refined, refined), (self.starting, starting)):
             for handle in handles:
                 handle.visible = visible

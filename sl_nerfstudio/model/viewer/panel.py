@@ -16,7 +16,9 @@ from sl_nerfstudio.model.viewer.surface import MODES, RENDERED, Coloured
 class Panel:
     """The values that the user chose; every change calls `changed` with the name of what changed."""
 
-    def __init__(self, server: viser.ViserServer, names: Sequence[str], changed: Callable[[str], None]) -> None:
+    def __init__(
+        self, server: viser.ViserServer, names: Sequence[str], training: bool, changed: Callable[[str], None]
+    ) -> None:
         gui = server.gui
         with gui.add_folder("Scan", order=-1.0):
             self.surface = gui.add_dropdown("Surface", MODES, RENDERED, hint="The surface as a mesh, in these colours")
@@ -31,7 +33,7 @@ class Panel:
             self.projectors = gui.add_checkbox("Projectors", True)
             self.starting = gui.add_checkbox("Starting poses", True, hint="Grey, with a line to the current pose")
             self.names = gui.add_checkbox("All names", False, hint="Otherwise those of the chosen frame")
-        self._frames = names
+        self._frames, self._training = names, training
         for name in ("surface", "frame", "rays", "projectors", "starting", "names"):
             getattr(self, name).on_update(_Call(changed, name))
         self.update.on_click(_Call(changed, "update"))
@@ -48,7 +50,8 @@ class Panel:
 
     def show_legend(self, coloured: Coloured | None) -> None:
         """Say what the colours mean; None if the surface is not drawn as a mesh."""
-        self.update.visible = self._legend.visible = coloured is not None
+        self._legend.visible = coloured is not None
+        self.update.visible = self._training and coloured is not None
         if coloured is not None:
             self.say(legend(coloured))
 

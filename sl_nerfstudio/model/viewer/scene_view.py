@@ -28,7 +28,7 @@ _FRUSTUM_SIZE = 0.4  # of the devices' distance from the object, times nerfstudi
 _RAY = 0.012  # radius of a ray, as a share of a pyramid's size
 _OBJECT_RADIUS = 0.8  # scene units
 _USUAL_FOV, _USUAL_ASPECT = math.radians(75), 1.5  # of a client that has not said its own
-_MARGIN = 1.2  # pyramids reach a little beyond their centres, and names beyond them
+_MARGIN = 1.1  # pyramids reach a little beyond their centres, and names beyond them
 
 ScenePoses = tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]
 
@@ -67,7 +67,7 @@ class SceneView(ViewerControl):
             DeviceNodes(scene, PROJECTOR, names, devices[1], projectors, current[1], self._scale, pattern),
         )
         self._mark_unplaced()
-        self.panel = Panel(self.viser_server, names, self._changed)
+        self.panel = Panel(self.viser_server, names, viewer.trainer is not None, self._changed)
         self.show_devices()
         self.viser_server.on_client_connect(self._look_at_object)
 

@@ -57,7 +57,7 @@ class BareViewer(Viewer):
     """What of nerfstudio's viewer a SceneView uses."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self.viser_server, self.train_lock, self.rerendered = server, None, 0
+        self.viser_server, self.train_lock, self.trainer, self.rerendered = server, None, None, 0
         self.config = SimpleNamespace(websocket_host="127.0.0.1", camera_frustum_scale=0.1)  # type: ignore[assignment]
         self.control_panel = SimpleNamespace(_layer_depth=SimpleNamespace(value=True))  # type: ignore[assignment]
         self.camera_handles = {}
