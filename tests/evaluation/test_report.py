@@ -1,10 +1,6 @@
-import base64
-import json
 import re
 from datetime import datetime
-from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +22,7 @@ from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
 from .faceted_scan import CAMERA, FacetedScan
+from .report.pages import Page, figure_of, unpacked
 from .shapes import blob, sphere
 
 TRAINING = {
@@ -45,41 +42,6 @@ TRAINING = {
         },
     },
 }
-
-
-class Page(HTMLParser):
-    """Collects what a browser would load, ids, and pictures without a text for those who do not see them."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.loaded: list[str] = []
-        self.ids: list[str] = []
-        self.anchors: list[str] = []
-        self.undescribed: list[str] = []
-        self.text: list[str] = []
-        self._skip = False
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value or "" for key, value in attrs}
-        self._skip = tag in ("script", "style")
-        self.loaded += [given[key] for key in ("src", "srcset", "data", "poster", "action") if key in given]
-        link = given.get("href", given.get("xlink:href", ""))
-        if link.startswith("#"):
-            self.anchors.append(link[1:])
-        elif link:
-            self.loaded.append(link)
-        if "id" in given:
-            self.ids.append(given["id"])
-        if (tag == "img" and not given.get("alt")) or (tag == "svg" and not given.get("aria-label")):
-            self.undescribed.append(str(attrs)[:80])
-
-    def handle_endtag(self, tag: str) -> None:
-        self._skip = False
-
-    def handle_data(self, data: str) -> None:
-        if not self._skip:
-            self.text.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -215,19 +177,6 @@ def test_the_view_of_all_devices_shows_all_of_them(full_report: str) -> None:
             shown[button["label"], number] = (edge.max() / np.tan(np.pi / 8)) * (1 if (p @ back < 0).all() else np.inf)
     assert shown["object", 0] < 1 and max(shown["all devices", k] for k in range(3)) < 1
     assert max(shown["all devices", k] for k in range(3)) > 0.85 and shown["object", 0] > 0.85  # and not far away
-
-
-def figure_of(page: str) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="figure">(.*?)</script>', page, flags=re.S)
-    assert found
-    return json.loads(found.group(1))
-
-
-def unpacked(values: Any) -> np.ndarray:
-    """Numbers of a figure, which Plotly packs as base64."""
-    if isinstance(values, dict):
-        return np.frombuffer(base64.b64decode(values["bdata"]), values["dtype"]).astype(np.float64)
-    return np.array(values, dtype=np.float64)
 
 
 def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:
