@@ -15,7 +15,7 @@ PACKAGE = ROOT / "sl_nerfstudio"
 LAYERS = (
     "errors", "console", "progress", "threads", "compiled", "files", "geometry", "scan", "pattern", "synthesis",
     "decoding", "capture", "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict",
-    "object_separation", "processing", "field", "rendering", "dataparser", "model", "meshing", "runs", "redecoding",
+    "object_separation", "processing", "field", "rendering", "meshing", "dataparser", "model", "runs", "redecoding",
     "evaluation", "cli", "methods", "__main__",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds

@@ -512,50 +512,42 @@ def viewer(pipeline: SLPipeline, tmp_path_factory: pytest.TempPathFactory) -> It
 
 
 def test_viewer_shows_cameras_and_projectors_before_and_after(viewer: Viewer, pipeline: SLPipeline) -> None:
+    """In nerfstudio's own viewer; tests/model/viewer has the rest."""
     port = viewer.viser_server.get_port()
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as page:
         assert page.status == 200
-    view = pipeline.scene_view
+    devices = pipeline.scene_view._devices
     loaded = pipeline.datamanager.dataparser.loaded
-    starting = [
-        loaded.S_scene_world.poses(T) for T in (loaded.scan.poses.T_world_camera, loaded.scan.poses.T_world_projector)
-    ]
+    start = loaded.S_scene_world.poses(loaded.scan.poses.stacked()).reshape(2, -1, 4, 4)
     refined = [T.numpy() for T in pipeline._sl_model.poses_scene()]
-    for handles, poses in zip((*view._starting, *view._refined), (*starting, *refined), strict=True):
-        positions = [h.position for h in handles]
-        np.testing.assert_allclose(positions, poses[:, :3, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-4)
-    names = {p[0].split("/")[-1] for p in viewer.viewer_elements}
-    assert {"show_projectors", "show_starting", "projector_of_frame"} <= names
+    for nodes, before, after in zip(devices, start, refined, strict=True):
+        for handles, T in ((nodes.starting, before), (nodes.refined, after)):
+            positions = [h.position for h in handles]
+            np.testing.assert_allclose(positions, T[:, :3, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-4)
+    assert not viewer.control_panel.layer_depth
 
 
-def test_viewer_frusta_follow_the_poses(viewer: Viewer, pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewer_moves_the_captured_images_with_the_poses(
+    viewer: Viewer, pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
     camera, projector = pipeline._sl_model.poses_scene()
-    camera, projector = camera.clone(), projector.clone()
-    camera[:, 0, 3] += 1
-    projector[:, 1, 3] -= 1
-    view = pipeline.scene_view
-    monkeypatch.setattr(view, "_current_poses", lambda: (camera, projector))
-    before = [h.position for h in view._starting[0]]
-    view.update(force=True)
-    for handles, poses in ((view._refined[0], camera), (view._refined[1], projector)):
-        np.testing.assert_allclose([h.position for h in handles], poses[:, :3, 3].numpy() * 10, atol=1e-4)
-    np.testing.assert_allclose(
-        [viewer.camera_handles[i].position for i in range(3)], camera[:, :3, 3].numpy() * 10, atol=1e-4
+    moved = camera.clone()
+    moved[:, 0, 3] += 1
+    monkeypatch.setattr(
+        pipeline.scene_view, "_numpy_poses", lambda: (moved.double().numpy(), projector.double().numpy())
     )
-    np.testing.assert_array_equal([h.position for h in view._starting[0]], before)
+    pipeline.scene_view.update(force=True)
+    positions = [viewer.camera_handles[i].position for i in range(3)]
+    np.testing.assert_allclose(positions, moved[:, :3, 3].numpy() * 10, atol=1e-4)
 
 
-def test_viewer_checkboxes_hide_frusta(viewer: Viewer, pipeline: SLPipeline) -> None:
+def test_viewer_makes_the_surface_of_a_trained_field(viewer: Viewer, pipeline: SLPipeline) -> None:
     view = pipeline.scene_view
-    shown = lambda handles: [h.visible for h in handles]  # noqa: E731
-    assert view.show_projectors.gui_handle is not None and view.show_starting.gui_handle is not None
-    view.show_projectors.gui_handle.value = False
-    view._set_visibility()
-    assert not any(shown(view._refined[1]) + shown(view._starting[1])) and all(shown(view._starting[0]))
-    view.show_projectors.gui_handle.value = True
-    view.show_starting.gui_handle.value = False
-    view._set_visibility()
-    assert all(shown(view._refined[1])) and not any(shown(view._starting[0]) + shown(view._starting[1]))
+    view.panel.surface._impl.value = "views"
+    view._changed("surface")
+    assert view._surface is not None and view._surface.quality.views.max() == 3
+    view.panel.surface._impl.value = "as rendered"
+    view._changed("surface")
 
 
 def test_every_output_can_be_shown(pipeline: SLPipeline) -> None:

@@ -8,7 +8,6 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models.base_model import Model
-from nerfstudio.viewer.viewer_elements import ViewerSlider
 from numpy import ndarray
 from torch import Tensor, nn
 
@@ -85,7 +84,7 @@ class SLModel(Model):
         change = torch.tensor(self.scan.intrinsics_change.values, dtype=torch.float64)
         self.register_buffer("intrinsics_change", change)
         self.history_table = History(("loss", "coordinate_px", "pattern_cosine", "eikonal", "surface"))
-        self.projector_of_frame = ViewerSlider("Projector of frame", 0, 0, max(len(self.scan.frames) - 1, 1), 1)
+        self.viewed_frame = 0
 
     # ---- for other parts of the package
 
@@ -261,7 +260,7 @@ class SLModel(Model):
         """
         metadata = bundle.metadata or {}
         if "sl_view" not in metadata:
-            view = torch.full_like(bundle.origins[:, 0], int(self.projector_of_frame.value), dtype=torch.long)
+            view = torch.full_like(bundle.origins[:, 0], self.viewed_frame, dtype=torch.long)
             return bundle.origins, bundle.directions, view
         views = metadata["sl_view"][:, 0].long()
         if "sl_refined" in metadata:

@@ -27,7 +27,7 @@ from sl_nerfstudio.model.training.checkpoints import SCAN_KEY, SETTINGS_KEY
 from sl_nerfstudio.model.training.fingerprints import as_tensor, as_text
 from sl_nerfstudio.model.training.interruption import INTERRUPTION
 from sl_nerfstudio.model.training.loop import SLTrainer
-from sl_nerfstudio.model.viewer import SceneView
+from sl_nerfstudio.model.viewer.scene_view import SceneView
 from sl_nerfstudio.progress import track
 
 _HELD_OUT_PIXELS = 4096  # of one frame, at most: enough for a median to two digits
@@ -59,7 +59,7 @@ class SLPipeline(VanillaPipeline):
       uninterrupted one would.
     - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
-    - The viewer shows projectors, and at the end of training the next commands are printed.
+    - The viewer shows the scan (viewer/), and at the end of training the next commands are printed.
     """
 
     config: SLPipelineConfig
@@ -70,10 +70,7 @@ class SLPipeline(VanillaPipeline):
         self._seed = torch.initial_seed()
         self.register_buffer(SCAN_KEY, as_tensor(config.scan_fingerprint))
         self.register_buffer(SETTINGS_KEY, as_tensor(config.settings_fingerprint))
-        loaded = self.datamanager.dataparser.loaded
-        self.scene_view = SceneView(loaded.scan, loaded.S_scene_world, lambda: self._sl_model.poses_scene())
-        self.show_projectors = self.scene_view.show_projectors
-        self.show_starting = self.scene_view.show_starting
+        self.scene_view = SceneView(self._sl_model)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

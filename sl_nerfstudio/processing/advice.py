@@ -12,8 +12,28 @@ _POOR_FITNESS = 0.65  # share of a frame's points that agree with other frames
 
 def what_to_recapture(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: bool) -> tuple[str, ...]:
     """One sentence for each problem, the most important first; empty if nothing is needed."""
-    lost = [f"{f.name}: capture it again; it was left out ({first_line(f.reason)})" for f in frames if not f.in_scan]
-    return (*lost, *_gaps(frames, edges, ordered), *(s for f in frames if f.in_scan for s in _weak(f)))
+    return (*_lost(frames), *_gaps(frames, edges, ordered), *(s for f in frames if f.in_scan for s in _weak(f)))
+
+
+def _lost(frames: Sequence[FrameRecord]) -> list[str]:
+    """One sentence for each frame that was left out; those that are connected with each other share one."""
+    lost = [f for f in frames if not f.in_scan]
+    groups: dict[int, list[str]] = {}
+    for frame in lost:
+        if frame.component > 0:
+            groups.setdefault(frame.component, []).append(frame.name)
+    sentences = []
+    for frame in lost:
+        group = groups.get(frame.component, [])
+        why = f"left out ({first_line(frame.reason)})"
+        if len(group) < 2:
+            sentences.append(f"{frame.name}: capture it again; it was {why}")
+        elif frame.name == group[0]:
+            sentences.append(
+                f"{', '.join(group)}: capture views that connect this group {frame.component} with the scan; "
+                f"{frame.name} was {why}"
+            )
+    return sentences
 
 
 def first_line(reason: str) -> str:
@@ -23,16 +43,26 @@ def first_line(reason: str) -> str:
 
 def _gaps(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: bool) -> list[str]:
     """Places where frames are connected to the others badly or not at all."""
-    used = {frozenset(edge.frames) for edge in edges if edge.used}
-    present = [f.name for f in frames if f.in_scan]
     if ordered:
         return [
             f"between {a} and {b}: add a frame; the two share too little of the surface to be registered directly"
-            for a, b in pairwise(present)
-            if frozenset((a, b)) not in used
+            for a, b in unconnected_neighbours(frames, edges)
         ]
+    used = _used(edges)
+    present = [f.name for f in frames if f.in_scan]
     single = [name for name in present if sum(name in pair for pair in used) == 1 and len(present) > 2]
     return [f"near {name}: add a frame; only one other frame overlaps it" for name in single]
+
+
+def unconnected_neighbours(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]) -> list[tuple[str, str]]:
+    """Frames of the scan that follow each other, but were not registered with each other."""
+    used = _used(edges)
+    present = [f.name for f in frames if f.in_scan]
+    return [(a, b) for a, b in pairwise(present) if frozenset((a, b)) not in used]
+
+
+def _used(edges: Sequence[EdgeRecord]) -> set[frozenset[str]]:
+    return {frozenset(edge.frames) for edge in edges if edge.used}
 
 
 def _weak(frame: FrameRecord) -> list[str]:

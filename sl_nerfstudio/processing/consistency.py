@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 )
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
-from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration
+from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration, SeparatePoses
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
 from sl_nerfstudio.verdict.scan_agreement import compare_frames
@@ -126,10 +126,12 @@ def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) 
         registration.fitness.copy(),
     )
     exclusions = list(registration.exclusions)
-    number = int(component.max()) + 1
+    number, separate = int(component.max()) + 1, list(registration.separate)
     for group in groups:
         frames = list(group)
         names = tuple(registration.names[k] for k in frames)
+        if len(frames) > 1:
+            separate.append(SeparatePoses(names, T[frames], baseline[frames]))
         exclusions += [CoordinatesDisagree(name, names) for name in names]
         registered[frames] = False
         T[frames], baseline[frames], fitness[frames] = np.nan, np.nan, np.nan
@@ -145,6 +147,7 @@ def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) 
         fitness=fitness,
         exclusions=tuple(exclusions),
         uncertainties=tuple(u for u in registration.uncertainties if u.frame not in names),
+        separate=tuple(separate),
     )
 
 

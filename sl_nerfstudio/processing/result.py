@@ -1,10 +1,11 @@
 """The result of `sl-process`, for the report and for programs."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sl_nerfstudio.processing.capture_files.captured import CaptureNotes
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.placed import PlacedGroup
 from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.selection.object_only import ObjectOnly
 from sl_nerfstudio.processing.selection.object_words import object_document
@@ -69,6 +70,7 @@ class ProcessResult:
     contradiction: str = ""  # which intrinsics the captures contradict; it is among the remarks, too
     object_only: ObjectOnly | None = None  # None: surroundings were not looked for
     captured: CaptureNotes | None = None  # on the captures
+    placed: tuple[PlacedGroup, ...] = field(default=(), compare=False)  # for the 3D view of the report
 
     @property
     def registered(self) -> int:
@@ -110,4 +112,5 @@ def with_object_only(result: ProcessResult, found: ObjectOnly) -> ProcessResult:
         replace(f, in_scan=False, stage="separating", reason=reason) if f.in_scan and f.name in empty else f
         for f in result.frames
     )
-    return replace(result, frames=frames, object_only=found)
+    placed = tuple(group.only_object(found.parts) for group in result.placed)
+    return replace(result, frames=frames, object_only=found, placed=placed)

@@ -12,6 +12,7 @@ from sl_nerfstudio.processing.advice import what_to_recapture
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.intrinsics_words import contradiction
+from sl_nerfstudio.processing.placed import place_frames
 from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
@@ -90,6 +91,7 @@ def summarise(
         ),
         projector=found,
         contradiction=wrong,
+        placed=place_frames(results, registration, poses),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 

@@ -52,7 +52,7 @@ def write_scan(
             image = _image(frame, shown)
             cloud = frame.cloud
             part = None if result.object_only is None else result.object_only.parts.get(frame.name)
-            previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part))
+            previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part, len(results)))
             if not record.in_scan or cloud is None or image is None:
                 continue
             decoded, k = worker.load(frame), row[frame.name]

@@ -20,6 +20,7 @@ from sl_nerfstudio.registration.result import (
     PoorPair,
     Registration,
     SeparateComponent,
+    SeparatePoses,
     SurfaceDisagrees,
     UncertainRotation,
     Uncertainty,
@@ -60,8 +61,16 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
             for k in np.flatnonzero(~registered).tolist()
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
+        tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
         ordered,
     )  # fmt: skip
+
+
+def _separate_poses(names: Sequence[str], component: Component, graph: ViewGraph) -> SeparatePoses:
+    """The poses of a component that is not the largest, among themselves."""
+    inside = np.isin(np.arange(len(names)), list(component))
+    poses, baseline = _in_first_camera(graph.solve(component).S_world_camera, inside)
+    return SeparatePoses(tuple(np.array(names)[inside].tolist()), poses[inside], baseline[inside])
 
 
 def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:

@@ -89,6 +89,15 @@ Uncertainty = UndecidedProjector | UncertainRotation
 
 
 @dataclass(frozen=True)
+class SeparatePoses:
+    """Frames that are connected to each other but not to the largest component, in axes and a unit of their own."""
+
+    frames: tuple[str, ...]
+    T_world_camera: Float64[ndarray, "m 4 4"]  # in the axes of the first of these cameras
+    baseline: Float64[ndarray, "m"]  # camera to projector
+
+
+@dataclass(frozen=True)
 class Registration:
     """Camera poses in the axes of the first registered frame's camera (looking along -z), and baselines."""
 
@@ -101,6 +110,7 @@ class Registration:
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
     uncertainties: tuple[Uncertainty, ...]
+    separate: tuple[SeparatePoses, ...] = ()  # of the other components
     ordered: bool = True  # frames follow each other in the order of capture; False: stated, or found not to be so
 
 

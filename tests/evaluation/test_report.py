@@ -1,7 +1,5 @@
-import json
 import re
 from datetime import datetime
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,8 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
-from .faceted_scan import FacetedScan
+from .faceted_scan import CAMERA, FacetedScan
+from .report.pages import Page, figure_of, unpacked
 from .shapes import blob, sphere
 
 TRAINING = {
@@ -43,41 +42,6 @@ TRAINING = {
         },
     },
 }
-
-
-class Page(HTMLParser):
-    """Collects what a browser would load, ids, and pictures without a text for those who do not see them."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.loaded: list[str] = []
-        self.ids: list[str] = []
-        self.anchors: list[str] = []
-        self.undescribed: list[str] = []
-        self.text: list[str] = []
-        self._skip = False
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {key: value or "" for key, value in attrs}
-        self._skip = tag in ("script", "style")
-        self.loaded += [given[key] for key in ("src", "srcset", "data", "poster", "action") if key in given]
-        link = given.get("href", given.get("xlink:href", ""))
-        if link.startswith("#"):
-            self.anchors.append(link[1:])
-        elif link:
-            self.loaded.append(link)
-        if "id" in given:
-            self.ids.append(given["id"])
-        if (tag == "img" and not given.get("alt")) or (tag == "svg" and not given.get("aria-label")):
-            self.undescribed.append(str(attrs)[:80])
-
-    def handle_endtag(self, tag: str) -> None:
-        self._skip = False
-
-    def handle_data(self, data: str) -> None:
-        if not self._skip:
-            self.text.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -158,11 +122,10 @@ def test_report_tells_everything(full_report: str) -> None:
 
 
 def test_interactive_surface_is_complete(full_report: str) -> None:
-    found = re.search(r'<script type="application/json" id="figure">(.*?)</script>', full_report, flags=re.S)
-    assert found
-    figure = json.loads(found.group(1))
-    assert [trace["type"] for trace in figure["data"]] == ["mesh3d", "scatter3d", "scatter3d"]
-    (menu,) = figure["layout"]["updatemenus"]
+    figure = figure_of(full_report)
+    assert [trace["name"] for trace in figure["data"]] == ["surface", "cameras", "projectors", "measured"]
+    menu, views = figure["layout"]["updatemenus"]
+    assert [button["label"] for button in views["buttons"]] == ["object", "all devices"]
     names = ["error", "uncertainty (1 sigma)", "views", "residual", "ray angle"]
     assert [button["label"] for button in menu["buttons"]] == names
     changes = [button["args"][0] for button in menu["buttons"]]
@@ -174,6 +137,46 @@ def test_interactive_surface_is_complete(full_report: str) -> None:
     assert np.array_equal(views, np.arange(count) % 3)
     assert np.allclose(sigma[views > 0], 0.05) and (sigma[views == 0] > changes[1]["cmax"]).all()  # marked
     assert [change["colorbar.title.text"] for change in changes] == ["mm", "mm", "frames", "px", "degrees"]
+    stated = unpacked(figure["data"][0]["customdata"])  # of the ends of a measured line
+    np.testing.assert_allclose(stated, np.where(np.arange(count) % 3 > 0, 0.05, np.nan), rtol=1e-6)
+
+
+def test_pyramids_stand_where_the_devices_do_and_open_towards_what_they_see(full_report: str) -> None:
+    figure, made = figure_of(full_report), FacetedScan()
+    true = made.true_poses()
+    true.T_world_camera[1, :3, 3] += 0.5  # as in the report
+    for trace, T, device in ((1, true.T_world_camera, CAMERA), (2, true.T_world_projector, made.projector)):
+        drawn = np.stack([unpacked(figure["data"][trace][axis]) for axis in "xyz"], 1).reshape(3, -1, 3)
+        assert np.isnan(drawn[:, -1]).all()  # the gap to the next one
+        np.testing.assert_allclose(drawn[:, 0], T[:, :3, 3], rtol=1e-5)
+        ray = np.array([-device.cx / device.fl_x, device.cy / device.fl_y, -1.0])  # of the upper left corner
+        side = drawn[:, 1] - drawn[:, 0]
+        expected = np.einsum("nij,j->ni", T[:, :3, :3], ray / np.linalg.norm(ray))
+        np.testing.assert_allclose(side / np.linalg.norm(side, axis=1, keepdims=True), expected, atol=1e-4)
+        assert figure["data"][trace]["text"][0].endswith("of frame 0: frame_00000")
+
+
+def test_the_view_of_all_devices_shows_all_of_them(full_report: str) -> None:
+    """By the way of Plotly: axes onto the aspect ratio, then a pinhole of 45 degrees, looking at the centre."""
+    figure = figure_of(full_report)
+    scene = figure["layout"]["scene"]
+    low, high = (np.array([scene[f"{axis}axis"]["range"][k] for axis in "xyz"]) for k in (0, 1))
+    ratio = np.array([scene["aspectratio"][axis] for axis in "xyz"])
+    np.testing.assert_allclose(ratio / (high - low), (ratio / (high - low))[0])  # of equal scale
+    shown = {}
+    for button in figure["layout"]["updatemenus"][1]["buttons"]:
+        camera = {k: np.array([v[axis] for axis in "xyz"]) for k, v in button["args"][0]["scene.camera"].items()}
+        back = camera["eye"] - camera["center"]
+        back /= np.linalg.norm(back)
+        right = np.cross(camera["up"], back)
+        right /= np.linalg.norm(right)
+        for number, trace in enumerate(figure["data"][:3]):
+            p = np.stack([unpacked(trace[axis]) for axis in "xyz"], 1)
+            p = (p[np.isfinite(p).all(1)] - low) / (high - low) * ratio - ratio / 2 - camera["eye"]
+            edge = np.abs(np.stack([p @ right / (1030 / 560), p @ np.cross(back, right)], 1) / -(p @ back)[:, None])
+            shown[button["label"], number] = (edge.max() / np.tan(np.pi / 8)) * (1 if (p @ back < 0).all() else np.inf)
+    assert shown["object", 0] < 1 and max(shown["all devices", k] for k in range(3)) < 1
+    assert max(shown["all devices", k] for k in range(3)) > 0.85 and shown["object", 0] > 0.85  # and not far away
 
 
 def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:

@@ -1,6 +1,6 @@
 """What to capture again, with the reason."""
 
-from sl_nerfstudio.processing.advice import what_to_recapture
+from sl_nerfstudio.processing.advice import unconnected_neighbours, what_to_recapture
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
 
 
@@ -38,3 +38,15 @@ def test_unordered_frames_with_a_single_connection():
     edges = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a"), _edge("c", "d")]
     said = what_to_recapture(frames, edges, ordered=False)
     assert said == ("near d: add a frame; only one other frame overlaps it",)
+
+
+def test_frames_of_one_group_share_a_sentence():
+    apart = {"in_scan": False, "stage": "registering", "reason": "it may slip\n    cause:  round"}
+    frames = [_frame("a", component=0), _frame("b", **apart, component=2), _frame("c", **apart, component=-1),
+              _frame("d", **apart, component=2), _frame("e", component=0)]  # fmt: skip
+    assert what_to_recapture(frames, [_edge("a", "e")], ordered=True) == (
+        "b, d: capture views that connect this group 2 with the scan; b was left out (it may slip)",
+        "c: capture it again; it was left out (it may slip)",
+    )
+    assert unconnected_neighbours(frames, [_edge("a", "e")]) == []
+    assert unconnected_neighbours(frames, [_edge("a", "b")]) == [("a", "e")]

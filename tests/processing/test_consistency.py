@@ -126,6 +126,10 @@ def test_groups_become_components_of_their_own_and_what_was_said_of_them_goes():
         CoordinatesDisagree(NAMES[2], group),
         CoordinatesDisagree(NAMES[4], (NAMES[4],)),
     )
+    (separate,) = found.separate  # a single frame has no poses to tell
+    assert separate.frames == group
+    np.testing.assert_array_equal(separate.T_world_camera, RIG.T_world_camera[1:3])
+    np.testing.assert_array_equal(separate.baseline, start.baseline[1:3])
     for k in (1, 2, 4):
         assert np.isnan(found.T_world_camera[k]).all() and np.isnan(found.baseline[k]) and np.isnan(found.fitness[k])
     assert start.registered.all() and np.isfinite(start.T_world_camera).all()

@@ -14,7 +14,7 @@ from sl_nerfstudio.processing.scan_poses import find_scan_poses
 from sl_nerfstudio.processing.summary import left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import NoCommonSurface, UncertainRotation, UndecidedProjector
+from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation, UndecidedProjector
 from tests.processing.ramp_scan import NAMES
 
 
@@ -100,6 +100,55 @@ def test_frames_of_another_component_say_so(config, results, registration, poses
     result = summarise(config, "ramps", results, apart, poses)
     assert [frame.component for frame in result.frames] == [0, 0, 0, 1]
     assert result.verdict.band == "acceptable" and f"{NAMES[3]}: stands alone" in result.verdict.reasons[0]
+
+
+def test_placed_points_are_where_both_devices_see_them(config, results, registration, poses):
+    """Projected by hand: into the camera they are the pixels' centres, into the projector the decoded coordinates."""
+    (group,) = summarise(config, "ramps", results, registration, poses).placed
+    assert group.component == 0 and [frame.name for frame in group.frames] == list(NAMES)
+    clouds = clouds_of(results)
+    for k, frame in enumerate(group.frames):
+        assert 100 < len(frame.points) <= 2000
+        np.testing.assert_array_equal(frame.T_world_camera, poses.adjusted.poses.T_world_camera[k])
+        np.testing.assert_allclose(_seen(frame.camera, frame.T_world_camera, frame.points), frame.uv_camera, atol=0.1)
+        column, row = np.floor(frame.uv_camera).astype(int).T
+        seen = _seen(frame.projector, frame.T_world_projector, frame.points)
+        off = np.linalg.norm(seen - clouds[k].coords[row, column], axis=1)
+        assert np.median(off) < 0.1 and off.max() < 1
+
+
+def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, results, registration, poses):
+    T = np.stack([np.eye(4), np.eye(4)])
+    T[1, :3, 3] = [1.0, 2.0, 3.0]
+    apart = replace(
+        registration,
+        registered=np.array([True, True, False, False]),
+        component=np.array([0, 0, 1, 1]),
+        exclusions=tuple(NoCommonSurface(name) for name in NAMES[2:]),
+        separate=(SeparatePoses(tuple(NAMES[2:]), T, np.array([0.5, 2.0])),),
+    )
+    scan, other = summarise(config, "ramps", results, apart, poses).placed
+    assert (scan.component, other.component) == (0, 1)
+    assert [[f.name for f in g.frames] for g in (scan, other)] == [list(NAMES[:2]), list(NAMES[2:])]
+    for k, frame in enumerate(other.frames):
+        np.testing.assert_array_equal(frame.T_world_camera, T[k])
+        baseline = np.linalg.norm(frame.T_world_projector[:3, 3] - T[k, :3, 3])
+        assert baseline == pytest.approx((0.5, 2.0)[k])
+        np.testing.assert_allclose(_seen(frame.camera, T[k], frame.points), frame.uv_camera, atol=0.1)
+    alone = summarise(config, "ramps", results, replace(apart, separate=()), poses).placed
+    assert [(g.component, len(g.frames)) for g in alone] == [(0, 2), (-1, 1), (-1, 1)]
+    assert [g.frames[0].name for g in alone[1:]] == list(NAMES[2:])
+    nowhere = summarise(config, "ramps", results, None, None).placed  # registration was not reached
+    assert [g.component for g in nowhere] == [-1] * 4
+    part = np.zeros(clouds_of(results)[0].coords.shape[:2], np.uint8)
+    assert not len(scan.only_object({NAMES[0]: part}).frames[0].points)  # nothing of it is the object
+    assert scan.only_object({}).frames == scan.frames
+
+
+def _seen(device, T_world_device, p_world):
+    """Pixels of points through a pinhole that looks along -z."""
+    x, y, z = ((p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]).T
+    return np.stack([device.cx - device.fl_x * x / z, device.cy + device.fl_y * y / z], 1)
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,18 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(clouds):
         assert why.partner in (None, *found.names[:3])
     assert np.isnan(found.fitness[3:]).all()
     assert (found.fitness[:3] > 0.9).all()
+    (separate,) = found.separate  # in axes of their own
+    assert separate.frames == group
+    np.testing.assert_allclose(separate.T_world_camera[0], np.eye(4), atol=1e-9)
+    true = rendered("head", (4, 5))
+    T, baseline = true.T_world_camera, true.baseline
+    unit = np.sqrt(baseline.prod())  # the geometric mean of the baselines is one
+    relative = np.linalg.inv(T[0]) @ T[1]
+    turn = relative[:3, :3].T @ separate.T_world_camera[1, :3, :3]
+    assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 1
+    np.testing.assert_allclose(separate.baseline, baseline / unit, rtol=0.02)
+    off = np.linalg.norm(separate.T_world_camera[1, :3, 3] - relative[:3, 3] / unit)
+    assert off < 0.03 * np.linalg.norm(T[0, :3, 3]) / unit
 
 
 def test_a_frame_without_surface_shares_none(clouds):

@@ -4,6 +4,7 @@ import base64
 import gzip
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,51 @@ from scipy.spatial import KDTree
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.colour_layers import ColourLayer
 from sl_nerfstudio.evaluation.report.pictures import CLAY
+from sl_nerfstudio.evaluation.report.view3d import (
+    CAMERA_COLOUR,
+    PROJECTOR_COLOUR,
+    DrawnDevices,
+    PlotBox,
+    as_json,
+    frustum_length,
+    menu,
+    view_buttons,
+    viewpoint,
+)
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 from sl_nerfstudio.meshing.mesh import Mesh
 
 MOST_TRIANGLES = 40_000  # about 1 MB in the page
+
+MEASURED_LINE = {
+    "type": "scatter3d", "mode": "lines+markers", "name": "measured", "x": [], "y": [], "z": [], "hoverinfo": "skip",
+    "showlegend": False, "line": {"color": "#111111", "width": 6}, "marker": {"color": "#111111", "size": 4},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SceneDevices:
+    """Names and intrinsics of what took the frames."""
+
+    names: Sequence[str]
+    cameras: Sequence[Device]
+    projector: Device
+
+    def drawn(self, poses: DevicePoses) -> tuple[DrawnDevices, DrawnDevices]:
+        """Cameras and projectors at some poses."""
+        of = [f"of frame {k}: {name}" for k, name in enumerate(self.names)]
+        return (
+            DrawnDevices("cameras", [f"camera {o}" for o in of], self.cameras, poses.T_world_camera, CAMERA_COLOUR),
+            DrawnDevices(
+                "projectors",
+                [f"projector {o}" for o in of],
+                [self.projector] * len(of),
+                poses.T_world_projector,
+                PROJECTOR_COLOUR,
+            ),
+        )
 
 
 def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
@@ -41,50 +82,48 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
     return Mesh(vertices, np.asarray(small.triangles).astype(np.int64)), nearest
 
 
-def mesh_figure(mesh: Mesh, layers: Sequence[ColourLayer], poses: DevicePoses) -> str:
-    """Plotly figure (JSON): the surface with cameras and projectors as dots, and a menu of what colours it.
+def mesh_figure(
+    mesh: Mesh,
+    layers: Sequence[ColourLayer],
+    poses: DevicePoses,
+    devices: SceneDevices,
+    sigma: Float[ndarray, "v"] | None = None,
+) -> str:
+    """Plotly figure (JSON): the surface with cameras and projectors, a menu of what colours it, and two viewpoints.
 
-    The first of the layers colours it at the start; without layers it is clay, and there is no menu.
+    The first of the layers colours it at the start; without layers it is clay, and there is no such menu. `sigma` is
+    what the page says of the ends of a measured line; the line is the last trace.
     """
-    import plotly.graph_objects as go
-
     small, nearest = decimated(mesh)
     x, y, z = small.vertices.astype(np.float32).T
     i, j, k = small.faces.astype(np.int32).T
-    look: dict[str, Any] = {"color": f"rgb{tuple(int(255 * c) for c in CLAY)}", "hoverinfo": "skip"}
+    look: dict[str, Any] = {"color": f"rgb{tuple(int(255 * c) for c in CLAY)}", "hoverinfo": "none"}
     if layers:
         look = _look(layers[0], nearest)
-    figure = go.Figure(
-        go.Mesh3d(
-            x=x, y=y, z=z, i=i, j=j, k=k, name="surface", showlegend=False, flatshading=False,
-            lighting={"ambient": 0.55, "diffuse": 0.6, "specular": 0.05, "roughness": 0.9}, **look,
-        )
-    )  # fmt: skip
-    for name, T, colour, symbol in (
-        ("cameras", poses.T_world_camera, "#2563a8", "circle"),
-        ("projectors", poses.T_world_projector, "#c2571a", "diamond"),
-    ):
-        cx, cy, cz = T[:, :3, 3].T
-        labels = [f"{name[:-1]} of frame {index}" for index in range(len(T))]
-        figure.add_scatter3d(
-            x=cx, y=cy, z=cz, mode="markers", name=name, visible="legendonly", text=labels, hoverinfo="text",
-            marker={"size": 3, "color": colour, "symbol": symbol},
-        )  # fmt: skip
-    up = poses.T_world_camera[:, :3, 1].mean(0)
-    eye = poses.T_world_camera[0, :3, 3] - small.vertices.mean(0)
-    axis = {"visible": False}
-    figure.update_layout(
-        template="none", height=560, margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        scene={
-            "xaxis": axis, "yaxis": axis, "zaxis": axis, "aspectmode": "data",
-            "camera": {"up": _xyz(up), "eye": _xyz(eye)},
-        },
-        legend={"orientation": "h", "x": 0, "y": 0},
-        font={"family": "inherit", "size": 12},
-    )  # fmt: skip
+    if sigma is not None:
+        look["customdata"] = sigma[nearest].astype(np.float32)
+    surface = {
+        "type": "mesh3d", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "name": "surface", "showlegend": False,
+        "flatshading": False,
+        "lighting": {"ambient": 0.55, "diffuse": 0.6, "specular": 0.05, "roughness": 0.9}, **look,
+    }  # fmt: skip
+    centre = (small.vertices.min(0) + small.vertices.max(0)) / 2
+    drawn = devices.drawn(poses)
+    length = frustum_length(poses.stacked(), centre)
+    everything = np.concatenate([small.vertices, *(d.points(length).reshape(-1, 3) for d in drawn)])
+    box = PlotBox.around(everything)
+    views = [viewpoint(points, centre, poses.T_world_camera) for points in (small.vertices, everything)]
+    buttons = [
+        {"label": name, "method": "relayout", "args": [{"scene.camera": box.camera(view)}]}
+        for name, view in zip(("object", "all devices"), views, strict=True)
+    ]
+    menus = [view_buttons(buttons)]
     if len(layers) > 1:
-        figure.update_layout(updatemenus=[_menu(layers, nearest)])
-    return str(figure.to_json()).replace("<", "\\u003c")  # it goes into a <script> element
+        menus.insert(0, _menu(layers, nearest))
+    return as_json(
+        [surface, *(d.trace(length) for d in drawn), MEASURED_LINE],
+        {"scene": {**box.axes(), "camera": box.camera(views[0])}, "updatemenus": menus},
+    )
 
 
 def _look(layer: ColourLayer, nearest: Int[ndarray, "n"]) -> dict[str, Any]:
@@ -113,12 +152,7 @@ def _menu(layers: Sequence[ColourLayer], nearest: Int[ndarray, "n"]) -> dict[str
         plain = {key: look[key] for key in ("cmin", "cmax", "hovertemplate")}
         change = {**nested, **plain, "colorbar.title.text": layer.units}
         buttons.append({"label": layer.name, "method": "restyle", "args": [change, [0]]})
-    return {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "top", "bgcolor": "white"}
-
-
-def _xyz(v: Float[ndarray, "3"]) -> dict[str, float]:
-    length = float(np.linalg.norm(v)) or 1.0
-    return {axis: 1.5 * float(value) / length for axis, value in zip("xyz", v, strict=True)}
+    return menu(buttons)
 
 
 def compressed_script() -> str:

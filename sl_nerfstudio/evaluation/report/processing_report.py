@@ -1,14 +1,19 @@
 """The report of `sl-process`: what happened to every capture, as one HTML file that needs no network."""
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from markupsafe import Markup, escape
 
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
 from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import data_uri
-from sl_nerfstudio.processing.advice import first_line
+from sl_nerfstudio.evaluation.report.placed_figure import placed_figure
+from sl_nerfstudio.evaluation.report.plot3d import compressed_script
+from sl_nerfstudio.processing.advice import first_line, unconnected_neighbours
 from sl_nerfstudio.processing.preview import Preview
 from sl_nerfstudio.processing.projector.found import describe
 from sl_nerfstudio.processing.result import FrameRecord, ProcessResult
@@ -48,8 +53,37 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
         "settings": _settings(result),
+        "figure": _figure(result),
+        "groups": [len(group.frames) for group in result.placed],
+        "plotly": compressed_script() if result.placed else "",
     }
-    return page(_TEMPLATE, values, first_line=first_line)
+    return page(_TEMPLATE, values, first_line=first_line, linked=_linker([f.name for f in result.frames]))
+
+
+def _figure(result: ProcessResult) -> str:
+    """The 3D view; "" if no frame was calibrated."""
+    if not result.placed:
+        return ""
+    undecided = [f.name for f in result.frames if f.undecided]
+    missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
+    return placed_figure(result.placed, undecided, missing, {f.name: k for k, f in enumerate(result.frames)})
+
+
+def _linker(names: Sequence[str]) -> Callable[[str], Markup]:
+    """Makes links of the frame names before the first colon of a text: what it is about."""
+    number = {name: k for k, name in enumerate(names)}
+    among = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    pattern = re.compile(rf"(?<![\w-])(?:{among})(?![\w-])") if names else re.compile(r"(?!)")
+
+    def linked(text: str) -> Markup:
+        parts, end = [], 0
+        for found in pattern.finditer(text, 0, max(text.find(": "), 0)):
+            link = Markup('<a href="#frame-{}">{}</a>').format(number[found[0]], found[0])
+            parts += [escape(text[end : found.start()]), link]
+            end = found.end()
+        return Markup("").join([*parts, escape(text[end:])])
+
+    return linked
 
 
 def _settings(result: ProcessResult) -> list[tuple[str, str]]:

@@ -22,7 +22,7 @@ from sl_nerfstudio.evaluation.report.colour_layers import colour_layers
 from sl_nerfstudio.evaluation.report.comparisons import Comparison, compare_frames
 from sl_nerfstudio.evaluation.report.pages import page
 from sl_nerfstudio.evaluation.report.pictures import ColourScale, camera_views, data_uri, render
-from sl_nerfstudio.evaluation.report.plot3d import compressed_script, mesh_figure
+from sl_nerfstudio.evaluation.report.plot3d import SceneDevices, compressed_script, mesh_figure
 from sl_nerfstudio.evaluation.report.thumbnails import COORDINATE, EPIPOLAR, PATTERN, FrameThumbnails
 from sl_nerfstudio.scan import PoseSigma
 
@@ -96,7 +96,10 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictu
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
     layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
-    figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses)
+    scan, quality = report.inputs.scan, report.inputs.quality
+    devices = SceneDevices([f.name for f in scan.frames], [f.camera for f in scan.frames], scan.projector)
+    sigma = None if quality is None else quality.sigma
+    figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses, devices, sigma)
     histogram = ""
     if scale is not None:
         errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])

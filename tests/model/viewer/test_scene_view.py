@@ -1,0 +1,199 @@
+"""What nerfstudio's viewer shows of a scan, by the nodes of its scene."""
+
+import math
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+import viser.transforms as vtf
+
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.model.viewer.device_nodes import vertical_fov
+from sl_nerfstudio.model.viewer.scene_view import SceneView, first_view
+from sl_nerfstudio.model.viewer.surface import MODES
+from tests.dataparser.tiny_scan import RADIUS
+from tests.model.viewer.conftest import SCALE
+
+
+def model_of(view: SceneView) -> Any:
+    return view._model
+
+
+def messages(view: SceneView, kind: str) -> dict[str, Any]:
+    """The last message of a kind about each node. What is sent at once arrives through a thread of viser's."""
+    waiting = view.viser_server._websock_server._queued_messages
+    for _ in range(500):
+        if waiting.empty() and view.viser_server._websock_server._atomic_lock.acquire(timeout=1):
+            view.viser_server._websock_server._atomic_lock.release()
+            break
+        time.sleep(0.01)
+    queued = view.viser_server._websock_server._broadcast_buffer.message_from_id.values()
+    return {m.name: m for m in queued if type(m).__name__ == kind}
+
+
+def choose(view: SceneView, **values: Any) -> None:
+    """As a user does; the callbacks run here."""
+    for name, value in values.items():
+        getattr(view.panel, name)._impl.value = value
+        view._changed(name)
+
+
+def test_every_device_is_named_coloured_and_where_it_stood(view: SceneView) -> None:
+    scan = model_of(view).scan
+    names = [frame.name for frame in scan.frames]
+    frusta, labels = messages(view, "CameraFrustumMessage"), messages(view, "LabelMessage")
+    colours = {"camera": (90, 160, 255), "projector": (255, 140, 40)}
+    for devices, kind, T in zip(
+        view._devices, colours, (scan.poses.T_world_camera, scan.poses.T_world_projector), strict=True
+    ):
+        for k, name in enumerate(names):
+            r, g, b = colours[kind]
+            assert frusta[f"/refined/{kind}/{name}"].color == r << 16 | g << 8 | b
+            assert frusta[f"/starting/{kind}/{name}"].color == 130 << 16 | 130 << 8 | 130
+            assert labels[f"/names/{kind}/{name}"].text == f"{kind} {k}"
+            for handle in (devices.refined[k], devices.starting[k], devices.labels[k]):
+                np.testing.assert_allclose(handle.position, 10 * SCALE * T[k, :3, 3], rtol=1e-6)
+            looks = vtf.SO3(devices.refined[k].wxyz).as_matrix()[:, 2]  # viser's pyramids look along +z
+            np.testing.assert_allclose(looks, -T[k, :3, 2], atol=1e-6)
+
+
+def test_the_picture_does_not_hide_devices(view: SceneView) -> None:
+    assert view.viewer.control_panel._layer_depth.value is False
+
+
+@pytest.mark.parametrize(("fov", "aspect"), [(math.radians(75), 1.8), (0.6, 0.5)])
+def test_the_first_view_is_framed_on_the_object_with_all_devices_in_sight(view: SceneView, fov: float, aspect: float):
+    T = np.concatenate(view._numpy_poses())
+    found = first_view(T, fov, aspect)
+    np.testing.assert_array_equal(found.centre, 0)
+    back = found.eye / np.linalg.norm(found.eye)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    seen = (T[:, :3, 3] - found.eye) @ np.stack([right, np.cross(back, right), -back], 1)
+    edge = np.abs(seen[:, :2] / seen[:, 2:]) / (math.tan(fov / 2) * np.array([aspect, 1.0]))
+    assert (seen[:, 2] > 0).all() and edge.max() < 1
+
+
+def test_a_client_begins_there(view: SceneView) -> None:
+    camera = SimpleNamespace(fov=0.0, aspect=0.0)  # before it has said its own
+    client = object.__new__(viser.ClientHandle)
+    client.camera = camera  # type: ignore[assignment]
+    view._look_at_object(client)
+    expected = first_view(np.concatenate(view._numpy_poses()), math.radians(75), 1.5)
+    np.testing.assert_allclose(camera.position, 10 * expected.eye)
+    np.testing.assert_allclose(camera.look_at, [0, 0, 0])
+
+
+def test_devices_follow_their_poses_with_a_line_from_the_start(view: SceneView) -> None:
+    model = model_of(view)
+    start = model.scan.poses
+    T = start.T_world_camera.copy()
+    T[1, :3, 3] += [5.0, -3.0, 2.0]
+    model.current = DevicePoses(T, start.T_world_projector)
+    view.update(force=True)
+    cameras, projectors = view._devices
+    np.testing.assert_allclose(cameras.refined[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
+    np.testing.assert_allclose(cameras.labels[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
+    np.testing.assert_allclose(cameras.starting[1].position, 10 * SCALE * start.T_world_camera[1, :3, 3], rtol=1e-6)
+    drawn = messages(view, "MeshMessage")
+    rod = drawn["/moved/camera"].vertices.reshape(2, 3, 3).mean(1)  # one prism: its two ends
+    np.testing.assert_allclose(rod, 10 * SCALE * np.stack([start.T_world_camera[1, :3, 3], T[1, :3, 3]]), rtol=1e-5)
+    assert not drawn["/moved/projector"].vertices.any()  # nothing moved
+    np.testing.assert_allclose(
+        projectors.refined[1].position, 10 * SCALE * start.T_world_projector[1, :3, 3], rtol=1e-6
+    )
+
+
+def test_frames_that_cannot_be_placed_are_red(view: SceneView) -> None:
+    model_of(view).lost = [False, True, False]
+    view.update(force=True)
+    for kind in ("camera", "projector"):
+        assert messages(view, "CameraFrustumMessage")[f"/refined/{kind}/frame_00001"].color == 230 << 16 | 60 << 8 | 50
+        assert messages(view, "LabelMessage")[f"/names/{kind}/frame_00001"].text == f"{kind} 1: not placed"
+    T = model_of(view).scan.poses.T_world_camera
+    np.testing.assert_allclose(view._devices[0].refined[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
+
+
+def test_the_panel_hides_and_shows(view: SceneView) -> None:
+    cameras, projectors = view._devices
+
+    def shown() -> list[bool]:
+        nodes = (cameras.refined, cameras.starting, projectors.refined, projectors.starting)
+        assert all(len({handle.visible for handle in handles}) == 1 for handles in nodes)
+        return [*(handles[0].visible for handles in nodes), cameras.path.visible, projectors.path.visible]
+
+    def named() -> list[list[int]]:
+        return [[k for k, label in enumerate(d.labels) if label.visible] for d in (cameras, projectors)]
+
+    assert shown() == [True] * 6 and named() == [[0], [0]]
+    choose(view, frame=2)
+    assert named() == [[2], [2]]
+    choose(view, projectors=False)
+    assert shown() == [True, True, False, False, True, False] and named() == [[2], []]
+    choose(view, starting=False)
+    assert shown() == [True, False, False, False, False, False]
+    choose(view, projectors=True, names=True)
+    assert shown() == [True, False, True, False, False, False] and named() == [[0, 1, 2], [0, 1, 2]]
+    choose(view, starting=True, names=False)
+    assert shown() == [True] * 6 and named() == [[2], [2]]
+
+
+def test_rays_of_the_chosen_frame_meet_on_the_surface(view: SceneView) -> None:
+    scan = model_of(view).scan
+    choose(view, rays=True, frame=1)
+    assert model_of(view).viewed_frame == 1 and view.viewer.rerendered == 1  # its projector lights the picture, too
+    drawn = messages(view, "MeshMessage")
+    for kind, T in (("camera", scan.poses.T_world_camera), ("projector", scan.poses.T_world_projector)):
+        ends = drawn[f"/rays/{kind}"].vertices.reshape(-1, 2, 3, 3).mean(2) / (10 * SCALE)  # mm
+        assert 20 < len(ends) <= 60
+        np.testing.assert_allclose(ends[:, 0], np.broadcast_to(T[1, :3, 3], ends[:, 0].shape), rtol=1e-4)
+        np.testing.assert_allclose(np.linalg.norm(ends[:, 1], axis=1), RADIUS, atol=0.05)
+    choose(view, frame=2)  # of which nothing was decoded
+    drawn = messages(view, "MeshMessage")
+    assert not drawn["/rays/camera"].vertices.any() and not drawn["/rays/projector"].vertices.any()
+    choose(view, rays=False)
+    assert not [name for name in view._nodes if name.startswith("/rays")]
+
+
+def test_the_surface_in_all_colours(view: SceneView) -> None:
+    for mode in MODES[1:]:
+        choose(view, surface=mode)
+        assert "/surface" in messages(view, "GlbMessage") and view.panel._legend.content
+    found = view._surface
+    choose(view, surface="views")
+    assert view._surface is found  # of one step, there is one mesh
+    model_of(view).step_now += 1
+    choose(view, surface="sigma")
+    assert view._surface is not found and "Step 8" in view.panel._legend.content
+    choose(view, surface=MODES[0])
+    assert "/surface" not in view._nodes and not view.panel.update.visible
+
+
+def test_a_field_without_a_surface_is_said_not_raised(view: SceneView) -> None:
+    model_of(view).offset = 5.0
+    choose(view, surface="normals")
+    assert "no zero level" in view.panel._legend.content and "/surface" not in view._nodes
+    model_of(view).offset = 0.0
+    view._changed("update")
+    assert "/surface" in view._nodes
+
+
+def test_nothing_happens_without_a_viewer(sphere_scan: Any) -> None:
+    from tests.model.viewer.conftest import SphereModel
+
+    view = SceneView(SphereModel(sphere_scan))
+    view.update(force=True)
+    view.show_devices()
+
+
+def test_vertical_field_of_view() -> None:
+    pinhole = Device(w=640, h=480, fl_x=500.0, fl_y=400.0, cx=320.0, cy=240.0)
+    assert vertical_fov(pinhole) == pytest.approx(2 * math.atan(240 / 400))
+    doe = Device(w=600, h=600, fl_x=600.0, fl_y=600.0, cx=300.0, cy=300.0, model="DOE")
+    assert vertical_fov(doe) == pytest.approx(2 * math.asin(300 / 600))
+    shifted = Device(w=640, h=480, fl_x=500.0, fl_y=400.0, cx=320.0, cy=0.0)
+    assert vertical_fov(shifted) == pytest.approx(math.atan(480 / 400))
