@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sl_nerfstudio.cli.exporting.config import ExportConfig
-from sl_nerfstudio.console import command, next_steps, short_path
+from sl_nerfstudio.console import command, next_steps, short_path, unit_word
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -19,7 +19,7 @@ _SUSPICIOUS_PX = 3.0
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
     """The whole text."""
-    unit = "units" if scan.units == "arbitrary" else scan.units
+    unit = unit_word(scan.units)
     mesh, surface = exported.mesh, exported.surface
     extent = " x ".join(f"{side:.4g}" for side in mesh.vertices.max(0) - mesh.vertices.min(0))
     lines = [
