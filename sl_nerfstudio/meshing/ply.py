@@ -11,7 +11,7 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 
-_TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}
+_TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}  # not all programs read ushort
 
 
 def encode_ply(mesh: Mesh, properties: VertexProperties | None = None, unit: str = "") -> bytes:
@@ -46,7 +46,7 @@ def _columns(
     return columns | {
         "sigma": ("float", quality.sigma),
         "sigma_independent": ("float", quality.sigma_independent),
-        "views": ("ushort", quality.views),
+        "views": ("int", quality.views),
         "residual": ("float", quality.residual),
         "ray_angle": ("float", quality.ray_angle),
         "invented": ("uchar", properties.invented),

@@ -114,7 +114,7 @@ class ScanWriter:
         T_world_projector: Float[ndarray, "4 4"],
         pattern: UInt8[ndarray, "_ _"] | UInt16[ndarray, "_ _"] | None = None,
         mask: Bool[ndarray, "_ _"] | None = None,
-        color: UInt8[ndarray, "_ _ *c"] | UInt16[ndarray, "_ _ *c"] | None = None,
+        color: UInt8[ndarray, "_ _ *channels"] | UInt16[ndarray, "_ _ *channels"] | None = None,
         camera: Device | None = None,
         pose_sigma: PoseSigma | None = None,
         true_poses: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]] | None = None,

@@ -40,7 +40,9 @@ def frames(camera: Device = CAMERA, projector: Device = DOE, placed=(True, True,
     names = [f"frame_{k:05d}" for k in range(len(POSES))]
     return PosedFrames(
         tuple(PosedDevice(n, camera, T, Path(f"/scan/images/{n}.png")) for n, T in zip(names, POSES, strict=True)),
-        tuple(PosedDevice(n, projector, T @ SHIFT, Path("/scan/pattern.png")) for n, T in zip(names, POSES, strict=True)),
+        tuple(
+            PosedDevice(n, projector, T @ SHIFT, Path("/scan/pattern.png")) for n, T in zip(names, POSES, strict=True)
+        ),
         tuple(placed),
     )
 

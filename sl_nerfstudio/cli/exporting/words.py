@@ -189,11 +189,12 @@ def _other_files(config: ExportConfig, scan: "Scan", exported: "Exported", unit:
     notes = {
         "colmap": f"COLMAP model in {unit}; the projector is its last camera",
         "blender": f"script for Blender, in {metres}, z up",
-        "tum": f"device to world, +y down, +z ahead, in {metres}; unplaced frames are left out",
-        "kitti": f"device to world, +y down, +z ahead, in {metres}",
+        "tum": f"trajectories, device to world, +y down, in {metres}; without unplaced frames",
+        "kitti": f"trajectories, device to world, +y down, in {metres}",
     }
-    files = config.settings(scan.units).device_files
-    return lines + [f"{', '.join(map(str, paths))}: {notes[kind]}" for kind, paths in files.items()]
+    for kind, paths in config.settings(scan.units).device_files.items():
+        lines += [f"{paths[0].parent}: {', '.join(path.name for path in paths)}", f"  {notes[kind]}"]
+    return lines
 
 
 def _las_unit(path: Path, units: str) -> list[str]:
