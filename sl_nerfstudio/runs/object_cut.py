@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.finishing.closed_field import Planes
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.object_separation.frame_points import DecodedFrame
 from sl_nerfstudio.object_separation.plane_judgement import PlaneFinding
@@ -52,9 +53,9 @@ def object_cut(mesh: Mesh, found: Separation, kept: Bool[ndarray, "f"]) -> Objec
     return ObjectCut(kept, float(areas.sum()), float(areas[~kept].sum()), found.findings, removed)
 
 
-def planes_below(found: Separation, S_scene_world: Similarity) -> list[tuple[Float[ndarray, "3"], float]]:
+def planes_below(found: Separation, S_scene_world: Similarity) -> Planes:
     """Normals and offsets, in the scene, of the planes above which the object is: what belongs to a plane is below."""
-    planes = []
+    planes: Planes = []
     for one in found.surroundings:
         plane = one.finding.plane
         normal = S_scene_world.R @ plane.normal

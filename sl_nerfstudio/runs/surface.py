@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from sl_nerfstudio.meshing.extract import extract_mesh
-from sl_nerfstudio.meshing.finishing.closed_field import ClosedField
+from sl_nerfstudio.meshing.finishing.closed_field import ClosedField, hull_planes
 from sl_nerfstudio.meshing.finishing.fill_holes import FilledHoles, fill_holes
 from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -16,6 +17,8 @@ from sl_nerfstudio.meshing.trim import Trimmed, trim_to_observed
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.object_cut import ObjectCut, cut_object, object_cut, planes_below, separate_scan
 from sl_nerfstudio.runs.trained_run import TrainedModel
+
+_SAME = 0.01  # of an edge: vertices of two extractions that are so near are the same one
 
 
 @dataclass(frozen=True)
@@ -60,21 +63,38 @@ def _open_surface(model: TrainedModel, settings: ExportSettings) -> Surface:
 
 
 def _solid(model: TrainedModel, settings: ExportSettings) -> Surface:
-    """Closed pieces of the zero level, each of which some frame observed; flat where it meets the box or a plane."""
+    """Closed pieces of the zero level, in each of which frames observed something.
+
+    What nobody observed is cut off flat where it leaves the convex hull of what was observed, the planes around the
+    object, or the box of the field: there the field knows nothing, and bulges.
+    """
     scan, poses, world = model.scan, model.poses(), model.S_scene_world.inverse()
-    found = separate_scan(scan, poses) if settings.object_only else None
-    planes = [] if found is None else planes_below(found, model.S_scene_world)
+    start = time.perf_counter()
+    whole = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(world)
+    first = time.perf_counter() - start
+    trimmed = trim_to_observed(whole, scan, poses)
+    real = trimmed.observed & whole.corners_of(trimmed.kept)
+    planes, found = [], separate_scan(scan, poses) if settings.object_only else None
+    if found is not None:
+        real &= found.keeps(whole.vertices)
+        planes = planes_below(found, model.S_scene_world)
+    planes += hull_planes(model.S_scene_world.points(whole.vertices[real]), 2 / settings.resolution)
     start = time.perf_counter()
     field = ClosedField(model.sdf, planes, model.device)
-    whole = extract_mesh(field, settings.resolution, device=model.device).mapped(world)
-    seconds = time.perf_counter() - start
-    trimmed = trim_to_observed(whole, scan, poses)
-    if found is None:
-        kept, cut = _pieces_with(whole, trimmed.kept), None
-    else:
-        kept = _pieces_with(whole, trimmed.kept & found.keeps(whole.vertices)[whole.faces].all(1))
-        cut = object_cut(whole, found, kept)
-    return Surface(MarkedMesh(whole, ~trimmed.observed).with_faces(kept), trimmed, None, cut, 0, seconds)
+    solid = extract_mesh(field, settings.resolution, device=model.device).mapped(world)
+    second = time.perf_counter() - start
+    observed = _same_vertices(solid, whole, real)
+    kept = _pieces_with(solid, observed[solid.faces].all(1))
+    cut = None if found is None else object_cut(solid, found, kept)
+    return Surface(MarkedMesh(solid, ~observed).with_faces(kept), trimmed, None, cut, 0, first + second)
+
+
+def _same_vertices(mesh: Mesh, other: Mesh, chosen: Bool[ndarray, "w"]) -> Bool[ndarray, "v"]:
+    """Vertices of a mesh that are also chosen vertices of another one, extracted on the same grid."""
+    if not chosen.any():
+        return np.zeros(len(mesh.vertices), dtype=bool)
+    distance, _ = KDTree(other.vertices[chosen]).query(mesh.vertices)
+    return np.asarray(distance < _SAME * other.edge_length())
 
 
 def _pieces_with(mesh: Mesh, chosen: Bool[ndarray, "f"]) -> Bool[ndarray, "f"]:

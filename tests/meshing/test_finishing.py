@@ -81,7 +81,7 @@ def test_pieces_that_touch_in_one_vertex_are_two_holes():
     around = np.flatnonzero((MESH.faces == 0).any(1))
     removed = np.zeros(len(MESH.faces), dtype=bool)
     first = around[0]
-    opposite = [f for f in around if len(set(MESH.faces[f]) & set(MESH.faces[first])) == 1][0]
+    opposite = next(f for f in around if len(set(MESH.faces[f]) & set(MESH.faces[first])) == 1)
     removed[[first, opposite]] = True
     assert fill_holes(MESH, trimmed_by(removed), 2.0).closed == 2
 

@@ -1,4 +1,4 @@
-"""Cameras and trajectories of other programs: a known corner of a box lands on the right pixel, by their own formulas."""
+"""Cameras and trajectories for other programs: by their own formulas, a known corner lands on the right pixel."""
 
 import json
 import math

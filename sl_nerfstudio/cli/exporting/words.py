@@ -56,7 +56,10 @@ def _file_unit(path: Path, units: str) -> list[str]:
 
 
 def _solid(exported: "Exported") -> list[str]:
-    return ["  a closed solid: every edge joins two triangles", *_agreement(exported.surface)]
+    return [
+        "  a closed solid; what nobody saw ends flat at the convex hull of what was seen",
+        *_agreement(exported.surface),
+    ]
 
 
 def _removed(surface: "Surface") -> list[str]:
@@ -136,6 +139,8 @@ def _invented(config: ExportConfig, exported: "Exported") -> list[str]:
 
 
 def _percent(share: float) -> str:
+    if 0 < share < 5e-4:
+        return "less than 0.1%"
     return f"{share:.1%}" if share < 0.1 else f"{share:.0%}"
 
 

@@ -1,15 +1,22 @@
-"""A field whose zero level is closed: it ends at the box, and at planes on which the object stands."""
+"""A field whose zero level is closed: it ends at the walls of its box, and at planes."""
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from numpy import ndarray
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from sl_nerfstudio.meshing.sparse_grid import Field
 
 _MARGIN = 2e-3  # of the box's half side: what is nearer to its walls is outside
+
+_FACETS = 64  # of a convex hull, the largest ones: the many small ones are where the surface was observed
+
+Planes = list[tuple[Float64[ndarray, "3"], float]]
+"""Unit normals n and offsets d: points with n . p > d are above."""
 
 
 class ClosedField:
@@ -32,3 +39,18 @@ class ClosedField:
         for normal, offset in self._normals:
             found = torch.maximum(found, offset - p @ normal)
         return found
+
+
+def hull_planes(points: Float[ndarray, "n 3"], margin: float) -> Planes:
+    """The largest faces of the convex hull of points, moved out by `margin`, with the points above them.
+
+    None if the points have no volume.
+    """
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return []
+    a, b, c = (points[hull.simplices[:, k]] for k in range(3))
+    facet, of_facet = np.unique(hull.equations.round(6), axis=0, return_inverse=True)
+    area = np.bincount(of_facet.reshape(-1), np.linalg.norm(np.cross(b - a, c - a), axis=1), len(facet))
+    return [(-row[:3], float(row[3]) - margin) for row in facet[np.argsort(-area)[:_FACETS]]]

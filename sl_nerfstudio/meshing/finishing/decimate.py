@@ -8,7 +8,6 @@ from numpy import ndarray
 
 from sl_nerfstudio.meshing.mesh import Mesh
 
-
 _BORDERS = 100.0  # weight of errors across borders beside those across the surface: 1 lets jagged borders recede
 
 
