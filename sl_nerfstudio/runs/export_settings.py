@@ -6,7 +6,8 @@ from typing import Literal
 
 CameraKind = Literal["colmap", "blender"]
 TrajectoryKind = Literal["tum", "kitti"]
-COLMAP_FOLDER, COLMAP_FILES = "colmap", ("cameras.txt", "images.txt", "points3D.txt")
+COLMAP_FOLDER = "colmap"
+COLMAP_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
 BLENDER_FILE = "cameras_blender.py"
 
 

@@ -1,4 +1,4 @@
-"""Cameras and trajectories for other programs: by their own formulas, a known corner lands on the right pixel."""
+"""Cameras and trajectories for other programs: a known corner lands on the right pixel, by their own formulas."""
 
 import json
 import math
@@ -95,6 +95,21 @@ def test_colmap_projects_the_corner_to_the_right_pixels_of_cameras_and_projector
             assert images[name].points2D[0].point3D_id == 1
     assert np.array_equal(model.points3D[2].color, [40, 50, 60]) and model.points3D[1].track.length() == 6
     assert model.points3D[1].error == pytest.approx(0.25)  # half a pixel in projectors, none in cameras
+
+
+def test_devices_that_are_fixed_to_each_other_are_one_rig_of_colmap(tmp_path):
+    fixed = read_colmap(tmp_path, frames(PINHOLE))  # all of these have one relative pose
+    assert len(fixed.rigs) == 1 and len(fixed.frames) == 3
+    turned = frames(PINHOLE)
+    other = PosedDevice(
+        "frame_00001", DOE, POSES[1] @ pose([0, 9.001, 0], [70.0, 4.0, -3.0]), Path("/scan/pattern.png")
+    )
+    free = PosedFrames(turned.cameras, (turned.projectors[0], other, turned.projectors[2]), turned.placed)
+    (tmp_path / "free").mkdir()
+    model = read_colmap(tmp_path / "free", free)
+    assert len(model.rigs) == 2 and len(model.frames) == 6
+    image = next(image for image in model.images.values() if image.name == "projector/frame_00001.png")
+    np.testing.assert_allclose(image.project_point(CORNER), pixel(DOE, other.T_world_device, CORNER), atol=2e-5)
 
 
 def test_frames_that_are_not_placed_are_no_images_of_colmap(tmp_path):

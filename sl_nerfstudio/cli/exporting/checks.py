@@ -34,7 +34,7 @@ def _values(config: ExportConfig) -> Iterator[str]:
     if config.points is not None and config.points.suffix.lower() not in POINT_SUFFIXES:
         yield (
             f"--points {config.points}: unknown kind of point cloud {config.points.suffix!r}\n"
-            f"    remedy: end the name in one of {', '.join(POINT_SUFFIXES)}"
+            f"    remedy: end the name in {' or '.join(POINT_SUFFIXES)}"
         )
     if config.resolution < 2:
         yield f"--resolution {config.resolution}: at least 2 cells are needed; 256 or 512 is usual"

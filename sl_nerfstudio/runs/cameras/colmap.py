@@ -1,4 +1,4 @@
-"""A COLMAP model as text: cameras.txt, images.txt, points3D.txt, with the projector as a second camera.
+"""A COLMAP model as text, with the projector as a second camera: cameras, rigs, frames, images and points3D.
 
 COLMAP's pixels are this package's: the centre of the first is (0.5, 0.5). Lengths and world axes are the scan's. Each
 frame has two images: the capture and, under the name `projector/FRAME.png`, the pattern as its projector "sees" it.
@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.errors import UserError
@@ -19,9 +21,11 @@ _SINE = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)
 """sin t = t (1 + .. t^2 + .. t^4 + .. t^6 + .. t^8): with these, OPENCV_FISHEYE has the direction cosines of a DOE, to
 1e-7 of the focal length up to 65 degrees."""
 
+_RIGID = 1e-6  # largest change of a rotation's entries, and of the translation in baselines, within one rig
+
 
 def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dict[str, bytes]:
-    """The three files by name; images are named by their paths below `root`, frames that are not placed are left out.
+    """The files by name; images are named by their paths below `root`, frames that are not placed are left out.
 
     Raises UserError for devices that COLMAP has no model of, and for names that its text format cannot hold.
     """
@@ -42,7 +46,10 @@ def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dic
             _image(2 * k + 2, projector, len(devices), name),
             _points(tracks.uv_projector[mine].tolist(), points),
         ]
+    rigs, shots = _rigs(frames, placed, kinds)
     return {
+        "rigs.txt": _text("# RIG_ID NUM_SENSORS REF_TYPE REF_ID, then (TYPE ID HAS_POSE QW QX QY QZ TX TY TZ)[]", rigs),
+        "frames.txt": _text("# FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA, then (TYPE SENSOR_ID IMAGE_ID)[]", shots),
         "cameras.txt": _text("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; the last one is the projector", cameras),
         "images.txt": _text(
             "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then (X Y POINT3D_ID)[]; world to device, +y down",
@@ -52,6 +59,37 @@ def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dic
             "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", _tracks(tracks, placed)
         ),
     }
+
+
+def _rigs(frames: PosedFrames, placed: Sequence[int], kinds: Sequence[Device]) -> tuple[list[str], list[str]]:
+    """Lines of rigs.txt and frames.txt: one rig if all frames have the same relative pose, else each device alone."""
+    relative = [np.linalg.inv(frames.projectors[k].T_world_cv) @ frames.cameras[k].T_world_cv for k in placed]
+    baseline = float(np.linalg.norm(relative[0][:3, 3]))
+    scaled = np.array(relative) / np.array([1.0, 1.0, 1.0, baseline])
+    projector = len(kinds) + 1
+    if len(kinds) > 1 or np.ptp(scaled, axis=0).max() > _RIGID:
+        rigs = [f"{k + 1} 1 CAMERA {k + 1}" for k in range(projector)]
+        shots = []
+        for k in placed:
+            for number, device in (
+                (kinds.index(frames.cameras[k].device) + 1, frames.cameras[k]),
+                (projector, frames.projectors[k]),
+            ):
+                image = 2 * k + (2 if number == projector else 1)
+                pose = _pose(np.linalg.inv(device.T_world_cv))
+                shots.append(f"{image} {number} {pose} 1 CAMERA {number} {image}")
+        return rigs, shots
+    shots = [
+        f"{k + 1} 1 {_pose(np.linalg.inv(frames.cameras[k].T_world_cv))} 2 CAMERA 1 {2 * k + 1} CAMERA 2 {2 * k + 2}"
+        for k in placed
+    ]
+    return [f"1 2 CAMERA 1 CAMERA 2 1 {_pose(relative[0])}"], shots
+
+
+def _pose(T: Float64[ndarray, "4 4"]) -> str:
+    """A rigid motion as COLMAP writes it: QW QX QY QZ TX TY TZ."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    return " ".join(f"{v:.15g}" for v in (w, x, y, z, *T[:3, 3].tolist()))
 
 
 def _text(comment: str, lines: Sequence[str]) -> bytes:
@@ -79,9 +117,7 @@ def _image(number: int, device: PosedDevice, camera: int, name: str) -> str:
             "    cause:  COLMAP's text files end a name there\n"
             "    remedy: rename the image and its entry in transforms.json, and train again; or leave --cameras out"
         )
-    T = np.linalg.inv(device.T_world_cv)
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-    return f"{number} {' '.join(f'{v:.15g}' for v in (w, x, y, z, *T[:3, 3].tolist()))} {camera} {name}"
+    return f"{number} {_pose(np.linalg.inv(device.T_world_cv))} {camera} {name}"
 
 
 def _points(uv: list[list[float]], points: list[int]) -> str:
