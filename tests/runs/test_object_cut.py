@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -18,10 +19,13 @@ from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.object_separation.separate import Separation
 from sl_nerfstudio.runs.export import Exported
+from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.object_cut import cut_object, planes_below, separate_scan
-from sl_nerfstudio.runs.surface import Surface
+from sl_nerfstudio.runs.surface import Surface, build_surface
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
+
+from .ball_run import BallModel
 
 RADIUS = 25.0
 NO_QUALITY = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
@@ -79,6 +83,29 @@ def test_the_planes_below_the_object_are_the_same_in_the_scene(found):
     above = S.points(points) @ normal - offset
     np.testing.assert_allclose(above, S.scale * (one.finding.plane.heights(points) - one.tolerance), atol=1e-9)
     assert abs(one.finding.plane.normal[2]) > 0.9999 and 0 < one.tolerance < 2
+
+
+class BallOnTable(BallModel):
+    """The field of a ball on a table that reaches beyond the scene's box."""
+
+    def sdf(self, p_scene):
+        p_world = torch.from_numpy(self.S_scene_world.inverse().points(p_scene.double().numpy()))
+        ball = p_world.norm(dim=-1) - RADIUS
+        return (torch.minimum(ball, p_world[:, 2] + RADIUS) * self.S_scene_world.scale).float()
+
+
+def test_a_closed_solid_of_the_object_alone_stands_flat_where_the_table_was(scan, found, monkeypatch):
+    monkeypatch.setattr("sl_nerfstudio.runs.surface.separate_scan", lambda *_: found)
+    model = BallOnTable(scan, S_scene_world=Similarity.scaling(1 / 60))
+    surface = build_surface(model, ExportSettings(Path("m.stl"), resolution=64, watertight=True, object_only=True))
+    mesh, observed = surface.marked.mesh, ~surface.marked.invented
+    assert mesh.is_closed() and surface.cut is not None and len(surface.cut.removed) == 1
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[observed], axis=1), RADIUS, atol=0.05)
+    assert np.abs(mesh.vertices).max() < RADIUS + 0.1
+    bottom = mesh.vertices[:, 2].min()
+    assert bottom > -RADIUS and (mesh.vertices[:, 2] < bottom + 0.05).sum() > 20  # flat
+    open_one = build_surface(model, ExportSettings(Path("m.ply"), resolution=64, object_only=True))
+    assert not open_one.marked.mesh.is_closed() and len(open_one.marked.mesh.faces) < len(mesh.faces)
 
 
 def test_the_summary_says_what_was_removed_and_why(scan, found):
