@@ -66,7 +66,8 @@ def read_inputs(
 
     `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
     """
-    result, scan = read_mesh(mesh), read_scan(data)
+    scan = read_scan(data)
+    result = read_mesh(mesh, scan.units)
     truth = read_ground_truth(scan)
     path = poses / TRANSFORMS if poses and poses.is_dir() else poses
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
@@ -122,7 +123,7 @@ def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: i
             points, f"{len(points):,} reference points ({path.name}); accuracy cannot fall below their spacing, and "
             "completeness counts all of them",
         )  # fmt: skip
-    return mesh_reference(read_mesh(path), scan, poses, samples, seed)
+    return mesh_reference(read_mesh(path, scan.units), scan, poses, samples, seed)
 
 
 def read_points(path: Path) -> Float64[ndarray, "n 3"]:

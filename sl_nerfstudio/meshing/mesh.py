@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.geometry.similarity import Similarity
 
 
@@ -26,10 +27,30 @@ class Mesh:
 
     def with_faces(self, keep: Bool[ndarray, "f"]) -> "Mesh":
         """The chosen triangles, with the vertices that they use."""
-        faces = self.faces[keep]
+        used = self.corners_of(keep)
+        return Mesh(self.vertices[used], (np.cumsum(used) - 1)[self.faces[keep]])
+
+    def corners_of(self, chosen: Bool[ndarray, "f"]) -> Bool[ndarray, "v"]:
+        """The vertices that some of the chosen triangles use."""
         used = np.zeros(len(self.vertices), dtype=bool)
-        used[faces] = True
-        return Mesh(self.vertices[used], (np.cumsum(used) - 1)[faces])
+        used[self.faces[chosen]] = True
+        return used
+
+    def edges(self) -> Int64[ndarray, "e 2"]:
+        """The three sides of every triangle, in its direction: inner edges occur twice."""
+        return np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+
+    def is_closed(self) -> bool:
+        """Whether every edge joins exactly two triangles, which run along it in opposite directions."""
+        a, b = self.edges().T
+        there, count = np.unique(a * len(self.vertices) + b, return_counts=True)
+        back = np.unique(b * len(self.vertices) + a)
+        return bool((count == 1).all() and np.array_equal(there, back))
+
+    def component_of_faces(self) -> Int64[ndarray, "f"]:
+        """Number of the connected piece, from 0, that each triangle lies in; pieces share no vertex."""
+        label = component_labels(self.faces[:, :2].ravel(), self.faces[:, 1:].ravel(), len(self.vertices))
+        return np.unique(label[self.faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.int64)
 
     def vertex_normals(self) -> Float64[ndarray, "v 3"]:
         """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""

@@ -9,9 +9,11 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.files.atomic import write_atomic
+from sl_nerfstudio.meshing.formats.encode import encode_glb, encode_mtl, encode_obj, encode_stl
+from sl_nerfstudio.meshing.formats.file_frame import file_from_world
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.ply import encode_ply
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.scan.file_error import FileError, check_file
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb")
@@ -30,13 +32,19 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def write_mesh(path: Path, mesh: Mesh, quality: VertexQuality | None = None) -> None:
-    """Write a mesh; `path` appears complete or not at all.
+def files_of(path: Path) -> tuple[Path, ...]:
+    """All files that `write_mesh` writes for a path: OBJ has a second one for its material."""
+    return (path, path.with_suffix(".mtl")) if path.suffix.lower() == ".obj" else (path,)
 
-    PLY keeps float64, and holds normals and the `quality` of each vertex, which the others leave out; OBJ has
-    8 decimals; STL and GLB hold float32, STL without shared vertices. Axes are not changed, although GLB viewers may
-    expect y up. Raises UserError for an unknown suffix, a mesh without triangles, a vertex that is not a number, or a
-    place where writing is impossible.
+
+def write_mesh(path: Path, mesh: Mesh, properties: VertexProperties | None = None, units: str = "arbitrary") -> None:
+    """Write a mesh of a scan's world, whose lengths are in `units`; each file appears complete or not at all.
+
+    PLY keeps float64 and the scan's unit and axes, and holds normals and all `properties`. The others hold the colours
+    of `properties` alone (STL: nothing), and are rounded: OBJ, with a .mtl beside it, to 8 decimals, STL and GLB to
+    float32. STL, without shared vertices, is in millimetres, GLB in metres with y up: see `file_from_world`. Raises
+    UserError for an unknown suffix, a mesh without triangles, a vertex that is not a number, or a place where writing
+    is impossible.
     """
     suffix = check_suffix(path)
     if len(mesh.faces) == 0:
@@ -51,19 +59,25 @@ def write_mesh(path: Path, mesh: Mesh, quality: VertexQuality | None = None) -> 
             "    cause:  the training diverged, or the scan's poses are wrong\n"
             "    remedy: check the scan with sl-check and train again"
         )
-    write_atomic(path, encode_ply(mesh, quality) if suffix == ".ply" else _by_trimesh(mesh, suffix))
+    placed = mesh.mapped(file_from_world(suffix, units))
+    colour = None if properties is None else properties.colour
+    if suffix == ".ply":
+        write_atomic(path, encode_ply(placed, properties, units))
+    elif suffix == ".obj":
+        _, material = files_of(path)
+        write_atomic(material, encode_mtl(colour is not None))
+        write_atomic(path, encode_obj(placed, colour, material.name))
+    elif suffix == ".stl":
+        write_atomic(path, encode_stl(placed, "arbitrary units" if units == "arbitrary" else "mm"))
+    else:
+        write_atomic(path, encode_glb(placed, colour))
 
 
-def _by_trimesh(mesh: Mesh, suffix: str) -> bytes:
-    import trimesh
-
-    content: Any = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=suffix[1:])
-    return content.encode("utf-8") if isinstance(content, str) else content
-
-
-def read_mesh(path: Path) -> Mesh:
+def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
     """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
 
+    GLB, which is in metres with y up, and STL, in millimetres, are taken into a world with z up whose lengths are in
+    `units`; one of their units is one arbitrary unit. PLY and OBJ stay as they are.
     Vertices at the same place are merged only in STL, which cannot share them. Raises UserError if the file is missing,
     empty, damaged, too large, without triangles, refers to vertices that do not exist, or holds values that are not
     numbers.
@@ -82,7 +96,7 @@ def read_mesh(path: Path) -> Mesh:
         raise FileError(path, problem, cause, "export or copy it again") from error
     if suffix == ".ply":
         _check_ply_counts(path, len(vertices), len(faces))
-    return _checked(path, vertices, faces)
+    return _checked(path, vertices, faces).mapped(file_from_world(suffix, units).inverse())
 
 
 def _check_ply_counts(path: Path, vertices: int, faces: int) -> None:

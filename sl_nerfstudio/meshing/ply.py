@@ -8,39 +8,66 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 
-_TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}
+_TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}  # not all programs read ushort
 
 
-def encode_ply(mesh: Mesh, quality: VertexQuality | None = None) -> bytes:
-    """A binary PLY: positions in float64, normals, and the quality of each vertex, if it is given."""
-    normal = mesh.vertex_normals()
-    columns: dict[str, tuple[str, ndarray]] = {axis: ("double", mesh.vertices[:, k]) for k, axis in enumerate("xyz")}
-    columns |= {f"n{axis}": ("float", normal[:, k]) for k, axis in enumerate("xyz")}
-    if quality is not None:
-        columns |= {
-            "sigma": ("float", quality.sigma),
-            "sigma_independent": ("float", quality.sigma_independent),
-            "views": ("ushort", quality.views),
-            "residual": ("float", quality.residual),
-            "ray_angle": ("float", quality.ray_angle),
-        }
-    rows = np.empty(len(mesh.vertices), dtype=[(name, _TYPES[kind]) for name, (kind, _) in columns.items()])
+def encode_ply(mesh: Mesh, properties: VertexProperties | None = None, unit: str = "") -> bytes:
+    """A binary PLY: positions in float64, normals, and the properties of each vertex, if they are given.
+
+    `unit` is said in a comment of the header.
+    """
+    columns = _columns(mesh.vertices, mesh.vertex_normals(), properties)
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    element = [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    return _encode(columns, unit, element) + faces.tobytes()
+
+
+def encode_points(
+    points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], properties: VertexProperties, unit: str
+) -> bytes:
+    """A binary PLY of points without triangles, with the same properties."""
+    return _encode(_columns(points, normals, properties), unit, [])
+
+
+def _columns(
+    points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], properties: VertexProperties | None
+) -> dict[str, tuple[str, ndarray]]:
+    columns: dict[str, tuple[str, ndarray]] = {axis: ("double", points[:, k]) for k, axis in enumerate("xyz")}
+    columns |= {f"n{axis}": ("float", normals[:, k]) for k, axis in enumerate("xyz")}
+    if properties is None:
+        return columns
+    if properties.colour is not None:
+        columns |= {name: ("uchar", properties.colour[:, k]) for k, name in enumerate(("red", "green", "blue"))}
+    quality = properties.quality
+    return columns | {
+        "sigma": ("float", quality.sigma),
+        "sigma_independent": ("float", quality.sigma_independent),
+        "views": ("int", quality.views),
+        "residual": ("float", quality.residual),
+        "ray_angle": ("float", quality.ray_angle),
+        "invented": ("uchar", properties.invented),
+    }
+
+
+def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[str]) -> bytes:
+    """Header and vertices; `element` are the header's lines of what follows them."""
+    rows = np.empty(len(columns["x"][1]), dtype=[(name, _TYPES[kind]) for name, (kind, _) in columns.items()])
     for name, (_, values) in columns.items():
         rows[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
+        *([f"comment lengths in {unit}"] if unit else []),
         f"element vertex {len(rows)}",
         *(f"property {kind} {name}" for name, (kind, _) in columns.items()),
-        f"element face {len(mesh.faces)}",
-        "property list uchar int vertex_indices",
+        *element,
         "end_header\n",
     ]
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    return "\n".join(header).encode("ascii") + rows.tobytes() + faces.tobytes()
+    return "\n".join(header).encode("ascii") + rows.tobytes()
 
 
 def read_quality(path: Path) -> VertexQuality | None:

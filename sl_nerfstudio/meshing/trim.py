@@ -22,6 +22,7 @@ contradictions are fewer than the second share of the inconclusive counts: surfa
 between two surfaces is contradicted by the frames that see through it."""
 TINY = 3  # vertices: such a small gap is always closed, because wrong decodings can coincide by chance
 BADLY_DECODED = 0.25  # share of inconclusive counts above which the mask alone counts as evidence
+_SEVERAL = 2  # frames that contradict a vertex: one alone may have decoded wrongly
 _LEAST_SHARE = 0.1  # of the seen vertices must be observed: with fewer, the agreement is chance
 _SECOND_PASS_SHARE = 1e-3  # of all vertices: if more are contradicted, they are removed and all frames counted again
 
@@ -31,6 +32,9 @@ class Trimmed:
     """The observed part of a mesh, and why the rest was removed; counts of vertices."""
 
     mesh: Mesh
+    kept: Bool[ndarray, "f"]  # triangles of the whole mesh
+    observed: Bool[ndarray, "v"]  # vertices of the whole mesh; those of closed gaps are not
+    denied: Bool[ndarray, "v"]  # vertices of the whole mesh that several frames contradict
     total: int
     unseen: int  # no frame saw them
     contradicted: int  # frames saw something else there, or nothing
@@ -64,8 +68,12 @@ def trim_to_observed(mesh: Mesh, scan: Scan, poses: DevicePoses | None = None) -
     keep = observed | _small_gaps(mesh, observed, counts)
     kept = keep[mesh.faces].all(1)
     loose, pieces = _loose_pieces(mesh, kept, counts)
+    kept &= ~loose
     return Trimmed(
-        mesh=mesh.with_faces(kept & ~loose),
+        mesh=mesh.with_faces(kept),
+        kept=kept,
+        observed=observed,
+        denied=~observed & (counts.contradicted >= _SEVERAL),
         total=len(mesh.vertices),
         unseen=int((~seen).sum()),
         contradicted=int(_contradicted(counts).sum()),
@@ -94,14 +102,10 @@ def _contradicted(counts: FrameCounts) -> Bool[ndarray, "v"]:
 
 def _without(mesh: Mesh, contradicted: Bool[ndarray, "v"], observed: Bool[ndarray, "v"]) -> Mesh:
     """The mesh without contradicted vertices, and without the pieces of invented surface that this leaves behind."""
-    edges = _edges(mesh)
+    edges = mesh.edges()
     count, label = _components(len(contradicted), edges[~contradicted[edges].any(1)])
     real = np.bincount(label, observed, count) > 0
     return mesh.with_vertices(~contradicted & real[label])
-
-
-def _edges(mesh: Mesh) -> Int64[ndarray, "e 2"]:
-    return np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
 
 
 def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarray, "n"]]:
@@ -111,7 +115,7 @@ def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarra
 
 def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], counts: FrameCounts) -> Bool[ndarray, "v"]:
     """Vertices of small unobserved patches inside the observed surface: tiny, or not contradicted by several frames."""
-    edges = _edges(mesh)
+    edges = mesh.edges()
     gap = ~observed
     count, label = _components(len(gap), edges[gap[edges].all(1)])
     face_gap = gap[mesh.faces]
@@ -123,7 +127,7 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], counts: FrameCounts) -
     mixed = edges[observed[edges[:, 0]] != observed[edges[:, 1]]]
     bordering[label[mixed[gap[mixed]]]] = True
     members = np.bincount(label[gap], minlength=count)
-    several = np.bincount(label[gap], (counts.contradicted[gap] > 1).astype(float), count)
+    several = np.bincount(label[gap], (counts.contradicted[gap] >= _SEVERAL).astype(float), count)
     in_mask = np.bincount(label[gap], (counts.inconclusive[gap] > 0).astype(float), count)
     silent, denied = (
         np.bincount(label[gap], v[gap].astype(float), count) for v in (counts.inconclusive, counts.contradicted)

@@ -58,18 +58,23 @@ def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
     )
 
 
-def collect_views(mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None = None) -> VertexViews:
+def collect_views(
+    mesh: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    chosen: Int64[ndarray, "c"] | None = None,
+    task: str = "uncertainty of the surface",
+) -> VertexViews:
     """All frames that see, light and confirm each vertex (or each of the `chosen` ones).
 
     A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
-    predicts. One frame's images are in memory at a time.
+    predicts; `task` names the progress. One frame's images are in memory at a time.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
     points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
     occluder = Occluder(mesh)
     found = [
-        _views_of(points, normals, occluder, frame, scan, poses, k)
-        for k, frame in enumerate(track(scan.frames, "uncertainty of the surface"))
+        _views_of(points, normals, occluder, frame, scan, poses, k) for k, frame in enumerate(track(scan.frames, task))
     ]
     vertex = np.concatenate([f.vertex for f in found])
     order = np.argsort(vertex, kind="stable")

@@ -8,16 +8,21 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files.atomic import write_atomic
-from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.finishing.decimate import Decimated, decimate
+from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
+from sl_nerfstudio.meshing.formats.point_files import observed_points, write_points
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
-from sl_nerfstudio.meshing.trim import Trimmed, trim_to_observed
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_colour import VertexColours, vertex_colours
+from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
 from sl_nerfstudio.runs.covariance_file import write_covariance
-from sl_nerfstudio.runs.object_cut import ObjectCut, cut_object
+from sl_nerfstudio.runs.device_files import write_device_files
+from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.run_record import training_record
+from sl_nerfstudio.runs.surface import Surface, build_surface
 from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import PoseSigma, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
@@ -26,50 +31,64 @@ from sl_nerfstudio.threads import one_library_thread
 
 
 @dataclass(frozen=True)
-class ExportSettings:
-    """What is exported, and to which files."""
-
-    mesh: Path
-    pose_folder: Path | None = None  # for transforms.json and training.json; None: the poses are not written
-    resolution: int = 512  # cells along each side of the scene's box
-    keep_unobserved: bool = False
-    object_only: bool = False  # without planes around the object and what is not connected to it
-
-
-@dataclass(frozen=True)
 class Exported:
     """What was written; lengths in the scan's unit."""
 
     mesh: Mesh
-    quality: VertexQuality  # of the mesh's vertices
-    trimmed: Trimmed | None  # None: nothing was removed for not being observed
-    cut: ObjectCut | None  # None: surroundings were not looked for
+    properties: VertexProperties  # of the mesh's vertices
+    surface: Surface  # before it was decimated
+    decimated: Decimated | None
+    colours: VertexColours | None  # of the surface before it was decimated; None: no picture without the pattern
+    points: int  # in the point cloud
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
-    extraction_seconds: float
-    writing_seconds: float  # trimming, uncertainty and writing
+    writing_seconds: float  # everything but the extraction
+
+    @property
+    def invented_share(self) -> float:
+        """Share of the mesh's area that no frame observed."""
+        return MarkedMesh(self.mesh, self.properties.invented).invented_share()
 
 
 @one_library_thread()
 def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
-    """Extract the surface, trim it to what was observed, cut out the object, as the settings say, and write the files.
+    """Extract the surface, keep of it what the settings say, and write the files.
 
     Raises UserError if there is no surface, if no part of it was observed, or if a file cannot be written.
     """
     model, start = run.model, time.perf_counter()
-    closed = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(model.S_scene_world.inverse())
-    extracted = time.perf_counter()
-    trimmed = None if settings.keep_unobserved else trim_to_observed(closed, model.scan, model.poses())
-    mesh = closed if trimmed is None else trimmed.mesh
-    cut = cut_object(mesh, model.scan, model.poses()) if settings.object_only else None
-    mesh = mesh if cut is None else cut.mesh
+    surface = build_surface(model, settings)
+    mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()
     joint = model.joint_covariance()
-    quality = vertex_uncertainty(mesh, model.scan, model.poses(), joint, model.cell)
-    write_mesh(settings.mesh, mesh, quality)
+    quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
+    colours = vertex_colours(mesh, scan, poses)
+    invented = quality.views == 0 if settings.keep_unobserved else surface.marked.invented
+    properties = VertexProperties(quality, invented, None if colours is None else colours.rgb)
+    points = 0
+    if settings.points is not None:
+        points = write_points(settings.points, *observed_points(mesh, properties), scan.units)
+    if settings.cameras or settings.trajectories:
+        write_device_files(settings, model, mesh, properties.colour)
+    decimated = None
+    if settings.target_faces is not None:
+        decimated = decimate(mesh, settings.target_faces)
+        mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
+        if settings.watertight:
+            _require_closed(mesh, settings.target_faces)
+    write_mesh(settings.mesh, mesh, properties, scan.units)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
-        write_covariance(settings.pose_folder, model.scan, joint)
+        write_covariance(settings.pose_folder, scan, joint)
         write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
-    return Exported(mesh, quality, trimmed, cut, model.pose_sigma(), extracted - start, time.perf_counter() - extracted)
+    seconds = time.perf_counter() - start - surface.extraction_seconds
+    return Exported(mesh, properties, surface, decimated, colours, points, model.pose_sigma(), seconds)
+
+
+def _require_closed(mesh: Mesh, triangles: int) -> None:
+    if not mesh.is_closed():
+        raise UserError(
+            f"--target-faces {triangles}: the surface is no longer closed with so few triangles\n"
+            "    cause:  thin parts of it collapse\n    remedy: keep more triangles, or leave --watertight out"
+        )
 
 
 def _write_poses(path: Path, model: TrainedModel) -> None:

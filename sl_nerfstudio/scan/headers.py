@@ -9,6 +9,8 @@ from sl_nerfstudio.scan.images import read_header
 from sl_nerfstudio.scan.partial_scan import PartialFrame, PartialScan
 from sl_nerfstudio.scan.problem import Faults, Problem
 
+_MAY_BE_COLOUR = ("file_path", "sl_color_path")
+
 
 def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
     """Check the headers of all files; return the files that can be decoded."""
@@ -28,9 +30,11 @@ def relative(path: Path, root: Path) -> str:
 
 def _check_frame(frame: PartialFrame, root: Path, good: set[Path], faults: Faults) -> None:
     size = _size(frame.camera)
-    for key in ("file_path", "sl_pattern_path", "mask_path"):
+    for key in ("file_path", "sl_pattern_path", "mask_path", "sl_color_path"):
         if key in frame.paths:
-            _check_image(frame.paths[key], root, frame.name, size, key != "file_path", "the camera", good, faults)
+            _check_image(
+                frame.paths[key], root, frame.name, size, key not in _MAY_BE_COLOUR, "the camera", good, faults
+            )
     path = frame.paths.get("sl_coords_path")
     if path is None:
         return

@@ -18,7 +18,7 @@ from sl_nerfstudio.scan.types import Frame, PoseSigma
 
 POSES = ("transform_matrix", "projector_transform_matrix")
 SIGMA_KEYS = tuple(PoseSigma.__dataclass_fields__)
-_PATHS = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path")
+_PATHS = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path", "sl_color_path")
 _FRAME_KEYS = (*_PATHS, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
 
 
@@ -47,6 +47,7 @@ class PartialFrame:
             T_world_camera=self.T_world_camera,
             T_world_projector=self.T_world_projector,
             pose_sigma=self.pose_sigma,
+            color_path=self.paths.get("sl_color_path"),
         )
 
 

@@ -84,10 +84,15 @@ class Frame:
     T_world_camera: Float64[ndarray, "4 4"]
     T_world_projector: Float64[ndarray, "4 4"]
     pose_sigma: PoseSigma | None = None
+    color_path: Path | None = None  # the same view without the pattern
 
     def read_image(self) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
         """The captured image, (h, w) grey or (h, w, 3) RGB, as stored. Raises UserError if unreadable."""
         return read_image(self.image_path)
+
+    def read_color(self) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
+        """The same view without the pattern, (h, w) grey or (h, w, 3) sRGB; None if it was not captured."""
+        return None if self.color_path is None else read_image(self.color_path)
 
     def read_pattern(self) -> Float32[ndarray, "h w"]:
         """The normalised pattern image in [0, 1]; the captured image as grey where the scan has none."""

@@ -114,6 +114,7 @@ class ScanWriter:
         T_world_projector: Float[ndarray, "4 4"],
         pattern: UInt8[ndarray, "_ _"] | UInt16[ndarray, "_ _"] | None = None,
         mask: Bool[ndarray, "_ _"] | None = None,
+        color: UInt8[ndarray, "_ _ *channels"] | UInt16[ndarray, "_ _ *channels"] | None = None,
         camera: Device | None = None,
         pose_sigma: PoseSigma | None = None,
         true_poses: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]] | None = None,
@@ -122,8 +123,9 @@ class ScanWriter:
         """Write one frame. `name` becomes the stem of its files; `true_poses` (camera, projector) go to ground_truth/.
 
         `coords` is None only for captures that have not been decoded yet: such a folder does not pass the check.
-        `camera` replaces the common intrinsics; `extra` holds further keys of the frame. Raises ValueError for a name
-        given twice, shapes that differ from the camera's, or a pose that is not a rigid motion.
+        `color` is the same view without the pattern. `camera` replaces the common intrinsics; `extra` holds further
+        keys of the frame. Raises ValueError for a name given twice, shapes that differ from the camera's, or a pose
+        that is not a rigid motion.
         """
         device = camera or self._camera
         if device is None:
@@ -134,7 +136,8 @@ class ScanWriter:
             or Path(name).name != name
         ):
             raise ValueError(f"frame name {name!r} was given before or is not a file name")
-        for what, array in (("image", image), ("coords", coords), ("pattern", pattern), ("mask", mask)):
+        arrays = {"image": image, "coords": coords, "pattern": pattern, "mask": mask, "color": color}
+        for what, array in arrays.items():
             if array is not None and array.shape[:2] != (device.h, device.w):
                 raise ValueError(f"{what} of {name} is {array.shape[:2]}, the camera {(device.h, device.w)}")
         frame: dict[str, Any] = {"file_path": self._write(f"images/{name}.png", encode_png(image))}
@@ -144,6 +147,8 @@ class ScanWriter:
             frame["sl_coords_path"] = self._write(f"coords/{name}.npz", encode_coords(coords))
         if mask is not None:
             frame["mask_path"] = self._write(f"masks/{name}.png", encode_png(mask.astype(np.uint8) * np.uint8(255)))
+        if color is not None:
+            frame["sl_color_path"] = self._write(f"color/{name}.png", encode_png(color))
         if camera is not None:
             frame.update(device_fields(camera, "camera_model"))
         frame.update(pose_fields(T_world_camera, T_world_projector))

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
+from sl_nerfstudio.cli.export import export_trained
+from sl_nerfstudio.cli.exporting.checks import check_outputs
+from sl_nerfstudio.cli.exporting.config import ExportConfig
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.model.training.fingerprints import plain
@@ -28,7 +30,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 def test_the_mesh_is_in_world_units_and_axes_and_cut(scan, tmp_path, suffix):
     config = ExportConfig(Path("config.yml"), tmp_path / f"mesh{suffix}", resolution=96)
     text = export_trained(run_of(scan), config)
-    mesh = read_mesh(config.output)
+    mesh = read_mesh(config.output, "mm")
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTRE, axis=1), RADIUS, atol=5e-3)
     assert mesh.vertices[:, 2].min() > CENTRE[2] - 36  # the lower side is seen by nobody
     assert f"{len(mesh.vertices):,} vertices" in text and " mm" in text and "vertices that no frame saw" in text

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.runs.export import ExportSettings, export_run
+from sl_nerfstudio.runs.export import export_run
+from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.scan import PoseSigma, Scan, read_pose_sigmas, read_poses, read_unplaced
 
@@ -25,9 +26,10 @@ def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
     found = export_run(run, settings)
     written = read_mesh(settings.mesh)
     assert np.array_equal(written.vertices, found.mesh.vertices) and np.array_equal(written.faces, found.mesh.faces)
-    assert found.trimmed is not None and found.trimmed.mesh is found.mesh
-    assert found.trimmed.total > len(found.mesh.vertices) and found.trimmed.residual_px < 0.2
-    assert found.pose_sigma is sigma and min(found.extraction_seconds, found.writing_seconds) >= 0
+    trimmed = found.surface.trimmed
+    assert trimmed is not None and np.array_equal(trimmed.mesh.vertices, found.mesh.vertices)
+    assert trimmed.total > len(found.mesh.vertices) and trimmed.residual_px < 0.2
+    assert found.pose_sigma is sigma and min(found.surface.extraction_seconds, found.writing_seconds) >= 0
     path = tmp_path / "refined/transforms.json"
     np.testing.assert_allclose(read_poses(path, scan).stacked(), scan.poses.stacked(), atol=1e-12)
     assert read_pose_sigmas(path, scan) == [PoseSigma(*row) for row in sigma.tolist()]
@@ -42,7 +44,7 @@ def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
 
 def test_without_trimming_the_ball_is_closed_and_no_poses_are_written_unless_wanted(scan: Scan, tmp_path):
     found = export_run(run_of(scan), ExportSettings(tmp_path / "mesh.ply", resolution=64, keep_unobserved=True))
-    assert found.trimmed is None and found.pose_sigma is None
+    assert found.surface.trimmed is None and found.pose_sigma is None
     np.testing.assert_allclose(np.linalg.norm(found.mesh.vertices - CENTRE, axis=1), RADIUS, atol=0.02)
     edges = np.sort(np.concatenate([found.mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()

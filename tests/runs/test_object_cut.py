@@ -5,16 +5,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.cli.export import ExportConfig, summary
+from sl_nerfstudio.cli.exporting.config import ExportConfig
+from sl_nerfstudio.cli.exporting.words import summary
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.object_separation.separate import Separation
 from sl_nerfstudio.runs.export import Exported
-from sl_nerfstudio.runs.object_cut import cut_object
+from sl_nerfstudio.runs.export_settings import ExportSettings
+from sl_nerfstudio.runs.object_cut import cut_object, planes_below, separate_scan
+from sl_nerfstudio.runs.surface import Surface, build_surface
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
+
+from .ball_run import BallModel
 
 RADIUS = 25.0
 NO_QUALITY = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
@@ -47,29 +58,71 @@ def scan(tmp_path_factory) -> Scan:
     return scan_of(_mesh(BALL, TABLE), pairs_around(8, 45), tmp_path_factory.mktemp("cut") / "scan")
 
 
-def test_the_table_goes_and_the_ball_stays(scan):
+@pytest.fixture(scope="module")
+def found(scan) -> Separation:
+    return separate_scan(scan, scan.poses)
+
+
+def test_the_table_goes_and_the_ball_stays(found):
     mesh = _mesh(BALL, TABLE)
-    cut = cut_object(mesh, scan, scan.poses)
-    np.testing.assert_allclose(np.linalg.norm(cut.mesh.vertices, axis=1), RADIUS, rtol=0.03)
+    cut = cut_object(mesh, found)
+    kept = mesh.with_faces(cut.kept)
+    np.testing.assert_allclose(np.linalg.norm(kept.vertices, axis=1), RADIUS, rtol=0.03)
     assert len(cut.removed) == 1 and abs(cut.removed[0].plane.normal[2]) > 0.9999
     assert cut.area_before == pytest.approx(mesh.face_areas().sum())
-    assert cut.area_before - cut.area_removed == pytest.approx(cut.mesh.face_areas().sum())
+    assert cut.area_before - cut.area_removed == pytest.approx(kept.face_areas().sum())
     seen = BALL.vertices[:, 2] > -0.5 * RADIUS
-    assert cut.mesh.vertices[:, 2].max() > 0.99 * RADIUS and len(cut.mesh.vertices) > 0.95 * seen.sum()
+    assert kept.vertices[:, 2].max() > 0.99 * RADIUS and len(kept.vertices) > 0.95 * seen.sum()
 
 
-def test_the_summary_says_what_was_removed_and_why(scan):
-    cut = cut_object(_mesh(BALL, TABLE), scan, scan.poses)
-    exported = Exported(cut.mesh, NO_QUALITY, None, cut, None, 1.0, 1.0)
+def test_the_planes_below_the_object_are_the_same_in_the_scene(found):
+    S = Similarity(0.02, Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), np.array([0.1, 0.2, -0.3]))
+    ((normal, offset),) = planes_below(found, S)
+    one = found.surroundings[0]
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 100
+    above = S.points(points) @ normal - offset
+    np.testing.assert_allclose(above, S.scale * (one.finding.plane.heights(points) - one.tolerance), atol=1e-9)
+    assert abs(one.finding.plane.normal[2]) > 0.9999 and 0 < one.tolerance < 2
+
+
+class BallOnTable(BallModel):
+    """The field of a ball on a table that reaches beyond the scene's box."""
+
+    def sdf(self, p_scene):
+        p_world = torch.from_numpy(self.S_scene_world.inverse().points(p_scene.double().numpy()))
+        ball = p_world.norm(dim=-1) - RADIUS
+        return (torch.minimum(ball, p_world[:, 2] + RADIUS) * self.S_scene_world.scale).float()
+
+
+def test_a_closed_solid_of_the_object_alone_stands_flat_where_the_table_was(scan, found, monkeypatch):
+    monkeypatch.setattr("sl_nerfstudio.runs.surface.separate_scan", lambda *_: found)
+    model = BallOnTable(scan, S_scene_world=Similarity.scaling(1 / 60))
+    surface = build_surface(model, ExportSettings(Path("m.stl"), resolution=64, watertight=True, object_only=True))
+    mesh, observed = surface.marked.mesh, ~surface.marked.invented
+    assert mesh.is_closed() and surface.cut is not None and len(surface.cut.removed) == 1
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices[observed], axis=1), RADIUS, atol=0.05)
+    assert np.abs(mesh.vertices).max() < RADIUS + 0.1
+    bottom = mesh.vertices[:, 2].min()
+    assert bottom > -RADIUS and (mesh.vertices[:, 2] < bottom + 0.05).sum() > 20  # flat
+    open_one = build_surface(model, ExportSettings(Path("m.ply"), resolution=64, object_only=True))
+    assert not open_one.marked.mesh.is_closed() and len(open_one.marked.mesh.faces) < len(mesh.faces)
+
+
+def test_the_summary_says_what_was_removed_and_why(scan, found):
+    mesh = _mesh(BALL, TABLE)
+    cut = cut_object(mesh, found)
+    marked = MarkedMesh(mesh, np.zeros(len(mesh.vertices), dtype=bool)).with_faces(cut.kept)
+    surface = Surface(marked, None, None, cut, 0, 1.0)
+    exported = Exported(marked.mesh, VertexProperties(NO_QUALITY, marked.invented), surface, None, None, 0, None, 1.0)
     text = summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported)
     assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
     assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
 
 
-def test_a_surface_elsewhere_leaves_nothing(scan):
+def test_a_surface_elsewhere_leaves_nothing(found):
     far = Mesh(BALL.vertices + 500.0, np.asarray(BALL.faces, np.int64))
     with pytest.raises(UserError, match=r"leaves nothing of the surface\n.*far from the scan's decoded points"):
-        cut_object(far, scan, scan.poses)
+        cut_object(far, found)
 
 
 def test_a_scan_without_coordinates_is_refused(tmp_path):
@@ -78,4 +131,4 @@ def test_a_scan_without_coordinates_is_refused(tmp_path):
 
     empty = scan_of(_mesh(BALL, TABLE), pairs_around(2, 45), tmp_path / "scan", nothing)
     with pytest.raises(UserError, match="no frame has decoded coordinates, so --object-only cannot find the object"):
-        cut_object(_mesh(BALL, TABLE), empty, empty.poses)
+        separate_scan(empty, empty.poses)

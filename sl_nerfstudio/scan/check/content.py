@@ -12,7 +12,7 @@ from numpy import ndarray
 from sl_nerfstudio.scan.check.coordinate_problems import coordinate_problems
 from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
 from sl_nerfstudio.scan.check.image_match import ImageMatch, has_detail, match_image
-from sl_nerfstudio.scan.check.image_problems import Shown
+from sl_nerfstudio.scan.check.image_problems import CLEAR, Shown
 from sl_nerfstudio.scan.check.pattern_shift import pattern_shift
 from sl_nerfstudio.scan.coordinates import read_coords
 from sl_nerfstudio.scan.file_error import FileError
@@ -97,6 +97,7 @@ def check_content(
             match = match_image(coords, both, pattern.grey, grey, where)
             if image is not None and shown is not image and image.shape[:2] == both.shape:
                 image_match = match_image(coords, both, pattern.grey, as_grey(image), where)
+    _check_color(frame, partial, match, where, good, faults)
     return FrameContent(
         frame.name,
         digest,
@@ -181,6 +182,42 @@ def _check_mask(path: Path, frame: PartialFrame, partial: PartialScan, faults: F
         return mask == full
     faults.add(problem, relative(path, partial.root), frame.name)
     return None
+
+
+def _check_color(
+    frame: PartialFrame,
+    partial: PartialScan,
+    match: ImageMatch | None,
+    where: Bool[ndarray, "_ _"] | None,
+    good: set[Path],
+    faults: Faults,
+) -> None:
+    """The picture without the pattern: can it be decoded, and does it really not show the pattern?"""
+    path = frame.paths.get("sl_color_path")
+    color = _read_image(path, partial, frame.name, faults) if path is not None and path in good else None
+    if path is None or color is None:
+        return
+    if color.min() == color.max():
+        faults.add(_EMPTY_PICTURE, relative(path, partial.root), frame.name)
+    elif match is not None and where is not None:
+        correlation = match.prediction.correlation(as_grey(color), where)
+        if correlation >= CLEAR:
+            faults.add(_shows_pattern(correlation), relative(path, partial.root), frame.name)
+
+
+_EMPTY_PICTURE = Problem(
+    "has the same value everywhere",
+    "a covered lens, or a dark room while the projector was off",
+    "take the picture in even light, or leave sl_color_path out",
+)
+
+
+def _shows_pattern(correlation: float) -> Problem:
+    return Problem(
+        f"shows the pattern (correlation {correlation:.2f})",
+        "it was taken with the pattern, or is another file",
+        "give the picture that was taken without the pattern, or leave sl_color_path out",
+    )
 
 
 def _together_problems(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "h w"]) -> Iterator[Problem]:

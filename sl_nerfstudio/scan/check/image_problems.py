@@ -12,7 +12,7 @@ from sl_nerfstudio.scan.check.image_match import ImageMatch
 from sl_nerfstudio.scan.problem import Problem
 
 # Correlations. Right frames have 0.5 to 0.95, or little in all frames (coarse images, stripes in another light).
-_CLEAR = 0.4  # from here on, the pattern is recognised
+CLEAR = 0.4  # from here on, the pattern is recognised
 _GAIN = 0.05  # of a move from there on: right frames gain nothing, and one pixel costs at least this
 _FAINT, _LARGE_GAIN = 0.25, 0.15  # the same for images too coarse to show the pattern well
 _RESTORED = 0.6  # share of the better frames' correlation that the right move gives back; a wrong one gives less
@@ -40,23 +40,23 @@ def image_problems(
     """(frame, problem) of coordinates that do not belong to the image; `read_shown` gives the image of a frame."""
     known = [(frame.name, frame.match) for frame in frames if frame.match is not None]
     usual = float(np.quantile([match.correlation for _, match in known], _BETTER)) if known else 0.0
-    strange = {name: match for name, match in known if match.correlation < max(_NOTHING * usual, _CLEAR / 2)}
+    strange = {name: match for name, match in known if match.correlation < max(_NOTHING * usual, CLEAR / 2)}
     others = _fitting_others(strange, [frame.name for frame in frames], read_shown)
     for name, match in known:
         other = others.get(name, ("", 0.0))
         if _is_shifted(match, usual) and match.moved > other[1]:
             yield name, _shifted(match)
-        elif match.interpreted >= _CLEAR and match.interpreted - match.correlation >= _AXES_GAIN:
+        elif match.interpreted >= CLEAR and match.interpreted - match.correlation >= _AXES_GAIN:
             yield name, _other_axes(match)
         elif other[0]:
             yield name, _of_another_frame(match, *other)
-        elif usual >= _CLEAR and match.correlation < _NOTHING * usual:
+        elif usual >= CLEAR and match.correlation < _NOTHING * usual:
             yield name, _of_no_image(match, usual)
 
 
 def _is_shifted(match: ImageMatch, usual: float) -> bool:
     gain = match.moved - match.correlation
-    enough = (match.moved >= _CLEAR and gain >= _GAIN) or (match.moved >= _FAINT and gain >= _LARGE_GAIN)
+    enough = (match.moved >= CLEAR and gain >= _GAIN) or (match.moved >= _FAINT and gain >= _LARGE_GAIN)
     return (match.x, match.y) != (0, 0) and enough and match.moved >= _RESTORED * usual
 
 
@@ -71,7 +71,7 @@ def _fitting_others(
             continue
         for name, match in strange.items():
             correlation = 0.0 if name == other else match.prediction.correlation(*shown)
-            enough = max(_CLEAR, match.correlation + _OTHERS_GAIN)
+            enough = max(CLEAR, match.correlation + _OTHERS_GAIN)
             if correlation >= max(enough, found.get(name, ("", 0.0))[1]):
                 found[name] = (other, correlation)
     return found

@@ -1,0 +1,59 @@
+"""Points of the surface with the pixels of all cameras and projectors that measured them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64, UInt8
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.vertex_properties import GREY
+from sl_nerfstudio.meshing.vertex_views import collect_views
+from sl_nerfstudio.scan.types import Scan
+
+_POINTS = 20_000  # at most
+
+
+@dataclass(frozen=True)
+class SurfaceTracks:
+    """Points, and the frames that confirm each of them."""
+
+    p_world: Float64[ndarray, "n 3"]
+    rgb: UInt8[ndarray, "n 3"]
+    point: Int64[ndarray, "m"]  # of each observation, by its place in `p_world`
+    frame: Int64[ndarray, "m"]
+    uv_camera: Float64[ndarray, "m 2"]  # where the camera sees the point
+    uv_projector: Float64[ndarray, "m 2"]  # what was decoded there
+    residual_px: Float64[ndarray, "m"]  # distance from where the projector would see the point
+
+
+def surface_tracks(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, scan: Scan, poses: DevicePoses) -> SurfaceTracks:
+    """Vertices of a mesh, evenly chosen."""
+    chosen = evenly_spaced(len(mesh.vertices), min(_POINTS, len(mesh.vertices)))
+    views = collect_views(mesh, scan, poses, chosen, "points for COLMAP")
+    p_world = mesh.vertices[views.vertex]
+    uv_camera, uv_projector = np.zeros((len(p_world), 2)), np.zeros((len(p_world), 2))
+    for k, frame in enumerate(scan.frames):
+        mine = views.frame == k
+        uv_camera[mine] = _pixels(frame.camera, poses.T_world_camera[k], p_world[mine])
+        uv_projector[mine] = _pixels(scan.projector, poses.T_world_projector[k], p_world[mine])
+    rgb = np.full((len(mesh.vertices), 3), GREY, dtype=np.uint8) if colour is None else colour
+    return SurfaceTracks(
+        mesh.vertices[chosen],
+        rgb[chosen],
+        np.searchsorted(chosen, views.vertex).astype(np.int64),
+        views.frame,
+        uv_camera,
+        uv_projector - views.residual,
+        np.linalg.norm(views.residual, axis=1).astype(np.float64),
+    )
+
+
+def _pixels(device: Device, T_world_device: Float64[ndarray, "4 4"], p_world: Float64[ndarray, "n 3"]) -> ndarray:
+    T = inverse(torch.from_numpy(T_world_device))
+    return project(Intrinsics.of(device, torch.float64), transform(T, torch.from_numpy(p_world)))[0].numpy()

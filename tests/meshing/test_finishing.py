@@ -1,0 +1,155 @@
+"""Holes, closed solids and fewer triangles, on surfaces whose truth is known by formula."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.finishing.closed_field import ClosedField
+from sl_nerfstudio.meshing.finishing.decimate import decimate
+from sl_nerfstudio.meshing.finishing.fill_holes import fill_holes
+from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.trim import Trimmed
+from sl_nerfstudio.meshing.vertex_properties import VertexProperties
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+
+BALL = trimesh.creation.icosphere(4, 10.0)
+MESH = Mesh(np.asarray(BALL.vertices, dtype=np.float64), np.asarray(BALL.faces, dtype=np.int64))
+CENTRE = MESH.vertices[MESH.faces].mean(1)
+NORTH, EAST, SOUTH = np.array([0.0, 0, 10]), np.array([10.0, 0, 0]), np.array([0.0, 0, -10])
+
+
+def trimmed_by(removed: np.ndarray, denied: np.ndarray | None = None) -> Trimmed:
+    """A ball from which triangles were trimmed."""
+    observed = MESH.corners_of(~removed)
+    denied = np.zeros(len(observed), dtype=bool) if denied is None else denied
+    return Trimmed(MESH.with_faces(~removed), ~removed, observed, denied, len(observed), 0, 0, 0, 0, 0.1)
+
+
+def cap(pole: np.ndarray, radius: float) -> np.ndarray:
+    return np.linalg.norm(CENTRE - pole, axis=1) < radius
+
+
+def test_holes_up_to_the_size_are_closed_by_the_surface_itself_and_larger_ones_stay():
+    removed = cap(NORTH, 1.5) | cap(EAST, 3.0)
+    trimmed = trimmed_by(removed)
+    found = fill_holes(MESH, trimmed, 4.0)
+    assert (found.closed, found.too_large, found.denied) == (1, 1, 0)
+    assert np.array_equal(found.kept, ~cap(EAST, 3.0))
+    assert found.area == pytest.approx(MESH.face_areas()[cap(NORTH, 1.5)].sum())
+    both = fill_holes(MESH, trimmed, 7.5)
+    assert both.closed == 2 and both.kept.all() and MESH.with_faces(both.kept).is_closed()
+    inside = MESH.corners_of(removed) & ~MESH.corners_of(~removed)
+    marked = MarkedMesh(MESH, ~trimmed.observed).with_faces(both.kept)
+    assert np.array_equal(marked.invented, inside)
+    touched = MESH.face_areas()[inside[MESH.faces].any(1)].sum()
+    assert marked.invented_share() == pytest.approx(touched / MESH.face_areas().sum())
+
+
+@pytest.mark.parametrize(("largest", "closed"), [(3.9, 0), (4.9, 1)])
+def test_the_size_of_a_hole_is_its_largest_extent(largest, closed):
+    removed = cap(NORTH, 2.0)
+    extent = MESH.vertices[MESH.corners_of(removed)]
+    assert 3.9 < np.linalg.norm(extent[:, None] - extent, axis=2).max() < 4.9
+    assert fill_holes(MESH, trimmed_by(removed), largest).closed == closed
+
+
+def test_a_hole_that_frames_look_through_stays_open():
+    removed = cap(NORTH, 2.0) | cap(SOUTH, 2.0)
+    through = MESH.corners_of(cap(NORTH, 2.0))
+    found = fill_holes(MESH, trimmed_by(removed, through), 6.0)
+    assert (found.closed, found.denied) == (1, 1) and np.array_equal(found.kept, ~cap(NORTH, 2.0))
+
+
+def test_what_has_an_end_of_its_own_is_no_hole():
+    """The zero level leaves the box there: it closes nothing."""
+    cut = MESH.with_faces(CENTRE[:, 2] < 8)
+    centre = cut.vertices[cut.faces].mean(1)
+    kept = centre[:, 2] < 5
+    observed = cut.corners_of(kept)
+    nothing = np.zeros(len(observed), dtype=bool)
+    trimmed = Trimmed(cut.with_faces(kept), kept, observed, nothing, len(observed), 0, 0, 0, 0, 0.1)
+    found = fill_holes(cut, trimmed, 100.0)
+    assert (found.closed, found.too_large) == (0, 0) and np.array_equal(found.kept, kept)
+
+
+def test_pieces_that_touch_in_one_vertex_are_two_holes():
+    around = np.flatnonzero((MESH.faces == 0).any(1))
+    removed = np.zeros(len(MESH.faces), dtype=bool)
+    first = around[0]
+    opposite = next(f for f in around if len(set(MESH.faces[f]) & set(MESH.faces[first])) == 1)
+    removed[[first, opposite]] = True
+    assert fill_holes(MESH, trimmed_by(removed), 2.0).closed == 2
+
+
+def torus(p: torch.Tensor) -> torch.Tensor:
+    return torch.stack([p[:, :2].norm(dim=1) - 0.6, p[:, 2]], 1).norm(dim=1) - 0.2
+
+
+def test_decimation_keeps_the_surface_closed_and_states_how_far_it_moved():
+    before = extract_mesh(torus, 64)
+    found = decimate(before, 1500)
+    after = found.mesh
+    assert before.is_closed() and after.is_closed() and len(after.faces) <= 1500
+    assert found.triangles_before == len(before.faces)
+    vertices = trimesh.Trimesh(after.vertices, after.faces, process=False)
+    _, back, _ = trimesh.proximity.closest_point(vertices, before.vertices[::10])
+    assert np.sqrt((back**2).mean()) == pytest.approx(found.rms_error, rel=0.1)
+    assert back.max() <= found.largest_error < 0.02
+    _, away, _ = trimesh.proximity.closest_point(trimesh.Trimesh(before.vertices, before.faces), after.vertices[::10])
+    np.testing.assert_allclose(found.distance[::10], away, atol=1e-5)
+    near = np.linalg.norm(before.vertices[found.nearest] - after.vertices, axis=1)
+    assert near.max() < 2 * before.edge_length()
+
+
+def test_a_mesh_with_fewer_triangles_stays_as_it_is():
+    found = decimate(MESH, 10**6)
+    assert found.mesh is MESH and np.array_equal(found.nearest, np.arange(len(MESH.vertices)))
+    assert found.largest_error < 1e-5
+
+
+def test_properties_go_to_the_nearest_vertex_and_a_move_adds_to_the_uncertainty():
+    n = np.arange(4)
+    sigma = np.array([3.0, np.nan, 1.0, 2.0])
+    quality = VertexQuality(sigma, sigma / 2, n * 2, n * 0.1, n * 10.0)
+    colour = np.stack([n, n, n], 1).astype(np.uint8)
+    found = VertexProperties(quality, n == 1, colour).chosen(np.array([0, 1, 3])).moved(np.array([4.0, 1.0, 0.0]))
+    np.testing.assert_allclose(found.quality.sigma, [5.0, np.nan, 2.0])
+    np.testing.assert_allclose(found.quality.sigma_independent, [np.hypot(1.5, 4.0), np.nan, 1.0])
+    assert found.quality.views.tolist() == [0, 2, 6] and found.invented.tolist() == [False, True, False]
+    assert found.colour is not None and found.colour[:, 0].tolist() == [0, 1, 3]
+
+
+def test_a_field_that_leaves_the_box_becomes_a_closed_solid_cut_flat_at_walls_and_planes():
+    """A cylinder along z through the whole box, cut at z > -0.25 as well."""
+
+    def cylinder(p: torch.Tensor) -> torch.Tensor:
+        return p[:, :2].norm(dim=1) - 0.5
+
+    assert not extract_mesh(cylinder, 48).is_closed()
+    field = ClosedField(cylinder, [(np.array([0.0, 0, 1]), -0.25)], torch.device("cpu"))
+    solid = extract_mesh(field, 48)
+    assert solid.is_closed() and solid.vertices[:, 2].min() == pytest.approx(-0.25, abs=1e-3)
+    assert solid.vertices[:, 2].max() == pytest.approx(0.998, abs=2e-3)
+    volume = trimesh.Trimesh(solid.vertices, solid.faces).volume
+    assert volume == pytest.approx(np.pi * 0.25 * 1.248, rel=0.01)
+
+
+def test_the_largest_component_is_the_one_with_the_largest_area():
+    fine, coarse = trimesh.creation.icosphere(3, 1.0), trimesh.creation.icosphere(1, 5.0)
+    vertices = np.concatenate([fine.vertices + [20, 0, 0], coarse.vertices]).astype(np.float64)
+    faces = np.concatenate([fine.faces, coarse.faces + len(fine.vertices)]).astype(np.int64)
+    marked = MarkedMesh(Mesh(vertices, faces), np.arange(len(vertices)) >= len(fine.vertices))
+    found = marked.largest_component()
+    assert len(found.mesh.faces) == len(coarse.faces) and found.invented.all()
+    np.testing.assert_allclose(np.linalg.norm(found.mesh.vertices, axis=1), 5.0)
+
+
+def test_closed_means_two_triangles_at_every_edge_in_opposite_directions():
+    assert MESH.is_closed() and not MESH.with_faces(np.arange(len(MESH.faces)) > 0).is_closed()
+    turned = replace(MESH, faces=np.concatenate([MESH.faces[:1, ::-1], MESH.faces[1:]]))
+    assert not turned.is_closed()

@@ -1,0 +1,114 @@
+"""Colours of vertices: a ball whose colour is a function of the place, in pictures made by formula."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.vertex_colour import vertex_colours
+from sl_nerfstudio.meshing.vertex_properties import GREY
+from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.images import encode_png
+
+from .ray_cast_scan import pairs_around, scan_of
+
+RADIUS = 40.0
+SOLID = trimesh.creation.icosphere(4, RADIUS)
+BALL = Mesh(np.asarray(SOLID.vertices, dtype=np.float64), np.asarray(SOLID.faces, dtype=np.int64))
+PINHOLE = Device(w=128, h=112, fl_x=300.0, fl_y=310.0, cx=60.0, cy=58.0)
+
+
+def colour_at(p: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1]: three different gradients, of which none is symmetric in the image."""
+    return 0.5 + p / (2.5 * RADIUS)
+
+
+def picture(T_world_camera: np.ndarray) -> np.ndarray:
+    """What a pinhole camera sees of the ball, by the formulas of the format; black beside it."""
+    x, y = np.meshgrid(np.arange(PINHOLE.w) + 0.5, np.arange(PINHOLE.h) + 0.5)
+    d = np.stack([(x - PINHOLE.cx) / PINHOLE.fl_x, -(y - PINHOLE.cy) / PINHOLE.fl_y, -np.ones_like(x)], -1)
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T_world_camera[:3, :3].T
+    o = T_world_camera[:3, 3]
+    b, c = d @ o, o @ o - RADIUS**2
+    hit = b * b > c
+    p = o + (-b - np.sqrt(np.where(hit, b * b - c, 0)))[..., None] * d
+    return np.round(np.where(hit[..., None], colour_at(p), 0.0) * 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Four captures from above, of which the first three were also taken without the pattern."""
+    root: Path = tmp_path_factory.mktemp("colour") / "scan"
+    scan = scan_of(BALL, pairs_around(4, 40), root, camera=PINHOLE)
+    (root / "color").mkdir()
+    frames = list(scan.frames)
+    for k, frame in enumerate(frames[:3]):
+        path = root / f"color/{frame.name}.png"
+        path.write_bytes(encode_png(picture(frame.T_world_camera)))
+        frames[k] = replace(frame, color_path=path)
+    return replace(scan, frames=tuple(frames))
+
+
+def angle_cosines(scan: Scan, frames: range) -> np.ndarray:
+    """Cosine between the ball's normal and the line of sight, of each frame and vertex."""
+    eyes = np.stack([scan.frames[k].T_world_camera[:3, 3] for k in frames])
+    way = eyes[:, None] - BALL.vertices
+    return (way * BALL.vertices).sum(2) / np.linalg.norm(way, axis=2) / RADIUS
+
+
+def test_vertices_have_the_colour_of_their_place_and_unseen_ones_are_grey(scan):
+    found = vertex_colours(BALL, scan, scan.poses)
+    assert found is not None and found.pictures == 3
+    cosine = angle_cosines(scan, range(3))
+    clearly = (cosine > 0.3).any(0)
+    assert found.seen[clearly].all() and not found.seen[(cosine < 0.1).all(0)].any()
+    expected = colour_at(BALL.vertices) * 255
+    assert np.abs(found.rgb[clearly] - expected[clearly]).max() < 5
+    assert (found.rgb[~found.seen] == GREY).all() and 0.2 < found.seen.mean() < 0.8
+
+
+def test_flat_views_weigh_less(scan):
+    """One picture is all white: its share in a vertex is its squared cosine."""
+    white = np.full((PINHOLE.h, PINHOLE.w), 255, dtype=np.uint8)
+    path = scan.root / "color/white.png"
+    path.write_bytes(encode_png(white))
+    first = replace(scan.frames[0], color_path=path)
+    found = vertex_colours(BALL, replace(scan, frames=(first, *scan.frames[1:2])), scan.poses[:2])
+    assert found is not None
+    squares = angle_cosines(scan, range(2)) ** 2
+    both = (angle_cosines(scan, range(2)) > 0.3).all(0)
+    share = squares[0] / squares.sum(0)
+    expected = 255 * (share[:, None] + (1 - share[:, None]) * colour_at(BALL.vertices))
+    assert both.sum() > 100 and np.abs(found.rgb[both] - expected[both]).max() < 5
+
+
+def test_what_is_hidden_takes_no_colour_from_what_hides_it(scan):
+    eye = scan.frames[0].T_world_camera[:3, 3]
+    plate = trimesh.creation.box((12.0, 12.0, 0.5))
+    plate.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], eye / np.linalg.norm(eye)))
+    plate.apply_translation(0.5 * eye)
+    vertices = np.concatenate([BALL.vertices, plate.vertices]).astype(np.float64)
+    faces = np.concatenate([BALL.faces, plate.faces + len(BALL.vertices)]).astype(np.int64)
+    alone = replace(scan, frames=scan.frames[:1])
+    open_view = vertex_colours(BALL, alone, scan.poses[:1])
+    found = vertex_colours(Mesh(vertices, faces), alone, scan.poses[:1])
+    assert open_view is not None and found is not None
+    behind = open_view.seen & ~found.seen[: len(BALL.vertices)]
+    ray = BALL.vertices - eye
+    off = np.linalg.norm(np.cross(ray, -eye / np.linalg.norm(eye)), axis=1) / np.linalg.norm(ray, axis=1)
+    assert behind.any() and (off[behind] < 0.06).all() and not (open_view.seen & (off < 0.036) & ~behind).any()
+    assert (found.rgb[: len(BALL.vertices)][behind] == GREY).all()
+
+
+def test_pictures_with_16_bits_and_a_scan_without_pictures(scan):
+    assert vertex_colours(BALL, replace(scan, frames=scan.frames[3:]), scan.poses[3:]) is None
+    path = scan.root / "color/deep.png"
+    path.write_bytes(encode_png(picture(scan.frames[0].T_world_camera).astype(np.uint16) * 257))
+    deep = replace(scan, frames=(replace(scan.frames[0], color_path=path),))
+    plain = replace(scan, frames=scan.frames[:1])
+    deep_found, found = (vertex_colours(BALL, s, scan.poses[:1]) for s in (deep, plain))
+    assert deep_found is not None and found is not None and np.array_equal(deep_found.rgb, found.rgb)
