@@ -30,6 +30,7 @@ from sl_nerfstudio.model.training.loop import SLTrainer
 from sl_nerfstudio.model.viewer.scene_view import SceneView
 from sl_nerfstudio.progress import track
 
+_WELL_DECODED = 0.8  # share of the pixels with the pattern; above it, decoding again changed poses by less than a half
 _HELD_OUT_PIXELS = 4096  # of one frame, at most: enough for a median to two digits
 
 
@@ -152,7 +153,9 @@ class SLPipeline(VanillaPipeline):
 
     def _say_what_next(self, step: int, trainer: Any) -> None:
         if comms.is_main_process():
-            print(what_next(trainer.config.get_base_dir() / "config.yml", self.datamanager.get_datapath()), flush=True)
+            decoded = float(self.datamanager.samples.coords[:, 0].isfinite().float().mean())
+            config = trainer.config.get_base_dir() / "config.yml"
+            print(what_next(config, self.datamanager.get_datapath(), decoded), flush=True)
 
 
 @contextmanager
@@ -181,15 +184,20 @@ def require_together(config: SLPipelineConfig, weights: Mapping[str, Any], root:
     require_same_scan(root, scan, config.scan_fingerprint, "this run")
 
 
-def what_next(config: Path, scan: Path) -> str:
-    """Where the result is, and the commands to continue with."""
+def what_next(config: Path, scan: Path, decoded: float) -> str:
+    """Where the result is, and the commands to continue with; `decoded` is a share of the pixels with the pattern."""
     settings, data, poses = short_path(config), short_path(scan), "refined/transforms.json"
     steps = [
         command("ns-viewer", "--load-config", settings, "--viewer.websocket-host", "127.0.0.1"),
         command("sl-export", "--load-config", settings, "--output", "mesh.ply", "--poses", "refined"),
         command("sl-eval", "--mesh", "mesh.ply", "--data", data, "--poses", poses, "--report", "report.html"),
     ]
-    return "\n".join([paragraph("result", f"{settings.parent}"), next_steps(steps)])
+    parts = [paragraph("result", f"{settings.parent}")]
+    if decoded < _WELL_DECODED:
+        again = command("sl-redecode", "--load-config", settings, "--output", data.with_name(f"{data.name}-again"))
+        share = f"{decoded:.0%} of the pixels with the pattern are decoded"
+        parts.append(f"{paragraph('decoded', f'{share}; with this surface more can be, which helps the poses:')}\n{again}")
+    return "\n".join([*parts, next_steps(steps)])
 
 
 def mean_over_frames(per_frame: list[dict[str, float]], with_std: bool) -> dict[str, float]:

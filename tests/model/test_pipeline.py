@@ -25,6 +25,13 @@ def test_one_frame_has_a_deviation_of_zero() -> None:
 
 
 def test_commands_to_continue_with_are_quoted_for_a_shell() -> None:
-    text = what_next(Path("/a b/it's/config.yml"), Path("/scan"))
+    text = what_next(Path("/a b/it's/config.yml"), Path("/scan"), 0.9)
     assert """ns-viewer --load-config '/a b/it'"'"'s/config.yml'""" in text
     assert text.startswith("result      /a b/it's\n") and max(map(len, text.splitlines())) <= 80
+    assert "sl-redecode" not in text
+
+
+def test_a_scan_with_much_missing_is_to_be_decoded_again() -> None:
+    text = what_next(Path("/run/config.yml"), Path("/scans/a vase"), 0.404)
+    assert "40% of the pixels" in text and "--output '/scans/a vase-again'" in text
+    assert max(map(len, text.splitlines())) <= 80
