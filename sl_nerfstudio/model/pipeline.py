@@ -195,8 +195,8 @@ def what_next(config: Path, scan: Path, decoded: float) -> str:
     parts = [paragraph("result", f"{settings.parent}")]
     if decoded < _WELL_DECODED:
         again = command("sl-redecode", "--load-config", settings, "--output", data.with_name(f"{data.name}-again"))
-        share = f"{decoded:.0%} of the pixels with the pattern are decoded"
-        parts.append(f"{paragraph('decoded', f'{share}; with this surface more can be, which helps the poses:')}\n{again}")
+        share = f"{decoded:.0%} of the pixels with the pattern"
+        parts += [paragraph("decoded", f"{share}; with this surface more can be decoded, which helps the poses:"), again]
     return "\n".join([*parts, next_steps(steps)])
 
 
