@@ -24,7 +24,7 @@ IMAGES_TRAINED = $(IMAGES_RUN)/nerfstudio_models/step-000000999.ckpt
 PYTHONS := python3.11 python3.12 python3.10 python3 python
 SUITABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
 
-.PHONY: help install demo demo-images test bench lint format clean
+.PHONY: help install demo demo-images test bench lint format docs clean
 
 help:
 	@echo "make install   create .venv with pinned dependencies and this package"
@@ -35,6 +35,7 @@ help:
 	@echo "make bench     run the benchmarks that take minutes; results in benchmarks/results/"
 	@echo "make lint      check with ruff and pyright"
 	@echo "make format    format the code and sort the imports with ruff"
+	@echo "make docs      build the documentation as a site and check its links: build/site/index.html"
 	@echo "make clean     remove .venv, the output of the demos and caches; keeps your own outputs"
 
 install: $(STAMP)
@@ -135,6 +136,11 @@ lint: install
 format: install
 	$(BIN)/ruff check --fix --select I .
 	$(BIN)/ruff format .
+
+# Strict: a link or an anchor that leads nowhere ends the build.
+docs: install
+	$(PIP) --quiet --editable '.[docs]'
+	$(BIN)/python docs/make_site.py
 
 clean:
 	rm -rf $(VENV) $(DEMO) $(IMAGES) build dist .pytest_cache .ruff_cache .hypothesis

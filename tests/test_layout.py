@@ -16,7 +16,7 @@ LAYERS = (
     "errors", "console", "progress", "threads", "compiled", "files", "geometry", "scan", "pattern", "synthesis",
     "decoding", "capture", "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict",
     "object_separation", "processing", "field", "rendering", "dataparser", "model", "meshing", "runs", "redecoding",
-    "evaluation", "cli", "methods",
+    "evaluation", "cli", "methods", "__main__",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds
 MOST_LINES, MOST_FILES = 400, 20

@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+import os
 import subprocess
 import sys
 import urllib.request
@@ -374,16 +375,6 @@ def test_export_pointcloud_in_the_scans_units(config: Path, tmp_path: Path, monk
     assert np.median(distance_to_sphere_mm(np.asarray(cloud.vertices))) < 2
 
 
-def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    call(
-        ns_export.entrypoint,
-        monkeypatch,
-        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
-        *("--num-rays-per-batch", 2000, "--texture-method", "point_cloud"),
-    )
-    assert len(trimesh.load(tmp_path / "poisson_mesh.ply").faces) > 100
-
-
 def test_export_tsdf(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline) -> None:
     call(
         ns_export.entrypoint,
@@ -430,6 +421,70 @@ def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(
     assert err.startswith("error: ns-export marching-cubes needs a GPU") and "sl-export --load-config" in err
 
 
+def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default, `--texture-method nerf`: the whole texture is drawn, and its colours are those of the surface."""
+    call(
+        ns_export.entrypoint,
+        monkeypatch,
+        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
+        *("--num-rays-per-batch", 2000, "--target-num-faces", 500, "--num-pixels-per-side", 64),
+    )
+    assert len(trimesh.load(tmp_path / "poisson_mesh.ply").faces) > 500
+    mesh = trimesh.load(tmp_path / "mesh.obj")
+    assert 100 < len(mesh.faces) <= 500
+    texture = np.asarray(Image.open(tmp_path / "material_0.png"))
+    uv = np.asarray(mesh.visual.uv)
+    column, row = (uv[:, 0] * 64).astype(int).clip(0, 63), ((1 - uv[:, 1]) * 64).astype(int).clip(0, 63)
+    assert (texture[row, column].max(-1) > 0).mean() > 0.9  # shaded, not the black of rays that see nothing
+
+
+def test_trajectories_need_ffmpeg_and_say_so(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SystemExit) as end:
+        call(
+            ns_render.entrypoint,
+            monkeypatch,
+            "interpolate",
+            "--load-config",
+            config,
+            "--output-path",
+            tmp_path / "a.mp4",
+        )
+    assert end.value.code == 1 and "ffmpeg.org" in capfd.readouterr().out  # and in colour what is missing
+
+
+@pytest.mark.parametrize("command", ["interpolate", "camera-path"])
+def test_trajectories_are_rendered_where_ffmpeg_is(
+    command: str, config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline
+) -> None:
+    """With a stand-in for ffmpeg: images are written without it, but nerfstudio asks for it first."""
+    (tmp_path / "ffmpeg").touch(mode=0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    how: tuple[object, ...] = ("--pose-source", "train", "--interpolation-steps", 1, "--downscale-factor", 2)
+    if command == "camera-path":
+        T = pipeline._sl_model.poses_scene()[0][1]
+        path = {
+            "camera_type": "perspective", "render_height": 20, "render_width": 24, "seconds": 1,
+            "camera_path": [{"camera_to_world": T.flatten().tolist(), "fov": 30, "aspect": 1.2}] * 2,
+        }  # fmt: skip
+        (tmp_path / "path.json").write_text(json.dumps(path))
+        how = ("--camera-path-filename", tmp_path / "path.json")
+    call(
+        ns_render.entrypoint,
+        monkeypatch,
+        *(command, "--load-config", config, "--output-path", tmp_path / "way", "--output-format", "images", *how),
+        *("--rendered-output-names", "coordinates", "pattern", "--image-format", "png"),
+    )
+    image = np.asarray(Image.open(tmp_path / "way" / "00000.png")).astype(int)
+    coordinates, pattern = np.split(image, 2, axis=1)
+    seen = coordinates.any(-1)
+    assert seen.mean() > 0.1
+    assert (abs(coordinates[seen][:, 2] - 51) <= 1).all()  # blue marks what has a coordinate; red and green are x and y
+    assert (pattern[..., 0] == pattern[..., 1]).all() and (pattern[..., 0] == pattern[..., 2]).all()
+
+
 def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     call(
         ns_render.entrypoint,
@@ -440,6 +495,7 @@ def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     for split in ("train", "test"):
         for output in ("gt-rgb", "rgb", "depth", "normals", "accumulation", "coordinates", "pattern", "residual"):
             assert Image.open(tmp_path / split / output / "frame_00001.png").size == (24, 20)
+        assert not (tmp_path / split / "coordinate_x").exists()  # pattern pixels are no picture
 
 
 # ---- the viewer

@@ -101,7 +101,8 @@ def test_constraints_are_plain_pins_that_satisfy_the_declared_ranges():
     pins = dict(line.split("==") for line in lines)
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line) for line in lines)
     assert len(pins) == len(lines)
-    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]:
+    extras = PROJECT["optional-dependencies"]
+    for text in PROJECT["dependencies"] + extras["dev"] + extras["docs"]:
         requirement = Requirement(text)
         assert requirement.specifier.contains(pins[requirement.name]), text
 
@@ -114,7 +115,8 @@ def test_exactly_one_opencv():
 def test_imported_packages_are_the_declared_dependencies():
     standard = sys.stdlib_module_names | {"sl_nerfstudio"}
     imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
-    extras = [text for name, texts in PROJECT["optional-dependencies"].items() if name != "dev" for text in texts]
+    extras = [text for name, texts in PROJECT["optional-dependencies"].items()
+              if name not in ("dev", "docs") for text in texts]  # fmt: skip
     declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras} - NOT_IMPORTED.keys()
     assert imported == {IMPORTED_AS.get(name, name) for name in declared}
 

@@ -25,7 +25,7 @@ from sl_nerfstudio.model.decoding_noise import measure_decoding
 from sl_nerfstudio.model.history import History
 from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
 from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
-from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, ray_outputs, residual_output
+from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, picture_outputs, ray_outputs
 from sl_nerfstudio.model.pose_parameters import make_pose_parameters
 from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
 from sl_nerfstudio.model.settings import SLModelSettings
@@ -247,7 +247,7 @@ class SLModel(Model):
         if "sl_uv" not in (bundle.metadata or {}):  # batches of single pixels hold their measured coordinates
             depth = torch.where(outputs["accumulation"] > 0.5, outputs["depth"], 0.0)
             measured = self.measured.at(origins + depth * directions, views, inverse(T_camera).float())
-            outputs["residual"] = residual_output(outputs, measured)
+            outputs = picture_outputs(outputs, measured)
         return outputs
 
     def corrected_rays(self, bundle: RayBundle) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"], Tensor]:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.geometry.se3 import inverse
@@ -13,6 +13,7 @@ _EVAL_SAMPLES = 24
 _OPAQUE = 0.5
 _MODULO = 128.0  # pattern pixels of one cycle of the coordinate colours
 _RESIDUAL_WHITE_PX = 5.0
+_NOTHING = {"depth": 1e3, "normals": 0.5}  # outputs of a ray that sees nothing; the others are 0
 
 
 @torch.no_grad()
@@ -24,9 +25,28 @@ def ray_outputs(
 ) -> dict[str, Tensor]:
     """Float images of 1 or 3 channels: those that nerfstudio's viewer, renderer and exporters need, and our own.
 
-    `depth` is the distance along the unit ray, in scene units, and 1000 where there is no object.
+    `depth` is the distance along the unit ray, in scene units, and 1000 where there is no object. Rays that pass the
+    surface at a distance are not rendered: in most images they are most rays.
     """
-    o, d = origins, directions
+    near = renderer.near_surface(origins, directions)
+    if near.all():
+        return _rendered(renderer, origins, directions, T_scene_projector)
+    some = _rendered(renderer, origins[near], directions[near], T_scene_projector[near])
+    return {name: _spread(values, near, _NOTHING.get(name, 0.0)) for name, values in some.items()}
+
+
+def _spread(values: Float[Tensor, "some c"], where: Bool[Tensor, "rays"], elsewhere: float) -> Float[Tensor, "rays c"]:
+    result = values.new_full((len(where), values.shape[1]), elsewhere)
+    result[where] = values
+    return result
+
+
+def _rendered(
+    renderer: Renderer,
+    o: Float[Tensor, "rays 3"],
+    d: Float[Tensor, "rays 3"],
+    T_scene_projector: Float[Tensor, "rays 4 4"],
+) -> dict[str, Tensor]:
     samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
     seen = renderer.render(o, d, inverse(T_scene_projector), samples, jitter=False)
     p = o + seen.depth[:, None] * d
@@ -45,6 +65,17 @@ def ray_outputs(
         "coordinate_x": torch.where(opaque, seen.coordinates[:, 0], 0.0)[:, None],
         "coordinate_y": torch.where(opaque, seen.coordinates[:, 1], 0.0)[:, None],
     }
+
+
+def picture_outputs(outputs: dict[str, Tensor], measured: Float[Tensor, "rays 2"]) -> dict[str, Tensor]:
+    """The outputs of an image's rays as pictures, with the residual to measured coordinates.
+
+    Grey pictures have three equal channels: nerfstudio would give a single one false colours. The coordinates
+    themselves, in pattern pixels, are no picture and are left out.
+    """
+    pictures = {name: values for name, values in outputs.items() if name not in ("coordinate_x", "coordinate_y")}
+    grey = {"pattern": outputs["pattern"], "residual": residual_output(outputs, measured)}
+    return pictures | {name: values.expand(-1, 3).contiguous() for name, values in grey.items()}
 
 
 def residual_output(outputs: dict[str, Tensor], measured: Float[Tensor, "rays 2"]) -> Float[Tensor, "rays 1"]:

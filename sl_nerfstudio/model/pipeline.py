@@ -21,6 +21,7 @@ from sl_nerfstudio.console import command, next_steps, paragraph, short_path
 from sl_nerfstudio.dataparser.datamanager import SLDataManager
 from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.exporters import quicken_exporters
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.training.checkpoints import SCAN_KEY, SETTINGS_KEY
 from sl_nerfstudio.model.training.fingerprints import as_tensor, as_text
@@ -46,6 +47,7 @@ class SLPipelineConfig(VanillaPipelineConfig):
         """The pipeline, for nerfstudio's commands: faults are messages, and a signal is no traceback."""
         if kwargs.get("test_mode", "val") != "val":
             INTERRUPTION.install()
+            quicken_exporters()
         with faults_as_messages():
             return SLPipeline(self, **kwargs)
 

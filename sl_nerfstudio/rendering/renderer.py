@@ -14,6 +14,7 @@ from sl_nerfstudio.rendering.settings import SamplingConfig
 from sl_nerfstudio.rendering.volume_rendering import Rendered, render
 
 _SHADOW_SAMPLES = 32
+_NEAR_SAMPLES = 32  # along a ray, to find out whether it passes the surface
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,22 @@ class Renderer:
         return render(sdf, t, origins, directions, T_projector_scene, self.projector, self.pattern, self.kappa)
 
     @torch.no_grad()
+    def near_surface(
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+    ) -> Bool[Tensor, "rays"]:
+        """Whether rays come so close to the surface, by the cached grid, that they see anything."""
+        near, far, _ = sphere_interval(origins, directions)
+        t = uniform_samples(near, far, _NEAR_SAMPLES, jitter=False)
+        f = self.cache.look_up((origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3))
+        between = 0.5 * (far - near) / _NEAR_SAMPLES  # the surface may be this much closer than at the samples
+        return f.reshape(t.shape).amin(-1) < self._reach + between
+
+    @property
+    def _reach(self) -> float:
+        """How far from the surface a sample still counts, with the error of the cached grid."""
+        return self.sampling.half_width / self.kappa + self.cache.cell
+
+    @torch.no_grad()
     def _distances(
         self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], samples: int, jitter: bool
     ) -> Float[Tensor, "rays samples"]:
@@ -49,8 +66,7 @@ class Renderer:
         if self.sampling.strategy == "uniform":
             return uniform_samples(near, far, samples, jitter)
         t, found = first_crossing(self.cache.look_up, origins, directions, near, far)
-        half = self.sampling.half_width / self.kappa + self.cache.cell
-        low, high = torch.where(found, t - half, near), torch.where(found, t + half, far)
+        low, high = torch.where(found, t - self._reach, near), torch.where(found, t + self._reach, far)
         return uniform_samples(low, high, samples, jitter)
 
     @torch.no_grad()
