@@ -69,9 +69,7 @@ def steps(folder: Path, iterations: int) -> list[Step]:
             (mesh, poses),
         ),
         Step(("sl-eval", "--mesh", str(mesh), "--data", str(scan), "--report", str(report)), (report,)),
-        Step(
-            ("sl-synth", "--output", str(images), "--images-only", "--frames", "8", "--resolution", "300"), (images,)
-        ),
+        Step(("sl-synth", "--output", str(images), "--images-only", "--frames", "8", "--resolution", "300"), (images,)),
         Step(
             (
                 *("sl-process", "--images", str(images / "images"), "--pattern", str(images / "pattern.json")),
@@ -125,7 +123,9 @@ def main() -> None:
         folder.mkdir(parents=True)
         rows: list[Row] = []
         for row in measure(steps(folder, options.steps), options.busy):
-            print(f"{row.command:12} {row.alone_seconds:7.1f} s {row.beside_seconds:7.1f} s {row.ratio:5.2f}", flush=True)
+            print(
+                f"{row.command:12} {row.alone_seconds:7.1f} s {row.beside_seconds:7.1f} s {row.ratio:5.2f}", flush=True
+            )
             rows.append(row)
             write_rows(options.output, rows, busy=options.busy, steps=options.steps)
 

@@ -91,9 +91,7 @@ def plugin() -> str:
     for group, what in _GROUPS.items():
         entries = [e for e in metadata.entry_points(group=group) if e.value.startswith("sl_nerfstudio.")]
         if not entries:
-            raise Missing(
-                f"ns-train does not know {what} of this package: it is not installed\nremedy: pip install {_DISTRIBUTION}"
-            )
+            raise Missing(f"ns-train knows no {what} of this package\nremedy: pip install {_DISTRIBUTION}")
         for entry in entries:
             try:
                 entry.load()

@@ -1,4 +1,4 @@
-"""`ns-export` without a GPU: two steps of nerfstudio's that take hours there, replaced by equal ones that take seconds."""
+"""`ns-export` without a GPU: two steps of nerfstudio's that take hours there, replaced by ones that take seconds."""
 
 import sys
 from functools import partial

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.geometry.se3 import inverse
-from sl_nerfstudio.rendering.renderer import Renderer
+from sl_nerfstudio.rendering.renderer import Ends, Renderer
 
 _EVAL_SAMPLES = 24
 _OPAQUE = 0.5
@@ -22,16 +22,18 @@ def ray_outputs(
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
     T_scene_projector: Float[Tensor, "rays 4 4"],
+    ends: Ends | None = None,
 ) -> dict[str, Tensor]:
     """Float images of 1 or 3 channels: those that nerfstudio's viewer, renderer and exporters need, and our own.
 
     `depth` is the distance along the unit ray, in scene units, and 1000 where there is no object. Rays that pass the
     surface at a distance are not rendered: in most images they are most rays.
     """
-    near = renderer.near_surface(origins, directions)
+    near = renderer.near_surface(origins, directions, ends)
     if near.all():
-        return _rendered(renderer, origins, directions, T_scene_projector)
-    some = _rendered(renderer, origins[near], directions[near], T_scene_projector[near])
+        return _rendered(renderer, origins, directions, T_scene_projector, ends)
+    some_ends = None if ends is None else (ends[0][near], ends[1][near])
+    some = _rendered(renderer, origins[near], directions[near], T_scene_projector[near], some_ends)
     return {name: _spread(values, near, _NOTHING.get(name, 0.0)) for name, values in some.items()}
 
 
@@ -46,9 +48,10 @@ def _rendered(
     o: Float[Tensor, "rays 3"],
     d: Float[Tensor, "rays 3"],
     T_scene_projector: Float[Tensor, "rays 4 4"],
+    ends: Ends | None,
 ) -> dict[str, Tensor]:
     samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
-    seen = renderer.render(o, d, inverse(T_scene_projector), samples, jitter=False)
+    seen = renderer.render(o, d, inverse(T_scene_projector), samples, jitter=False, ends=ends)
     p = o + seen.depth[:, None] * d
     normal = torch.nn.functional.normalize(renderer.field.sdf_and_gradient(p)[1].detach(), dim=-1)
     opaque = seen.accumulation > _OPAQUE

@@ -1,6 +1,7 @@
 """Rays through a field: where they are sampled, what they see, and which surface points the projector lights."""
 
 from dataclasses import dataclass
+from math import ceil
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +16,10 @@ from sl_nerfstudio.rendering.volume_rendering import Rendered, render
 
 _SHADOW_SAMPLES = 32
 _NEAR_SAMPLES = 32  # along a ray, to find out whether it passes the surface
+_FEWEST_SAMPLES = 6
+
+Ends = tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]
+"""Distances at which rays begin and end, for textures and cropped views."""
 
 
 @dataclass(frozen=True)
@@ -35,23 +40,30 @@ class Renderer:
         T_projector_scene: Float[Tensor, "rays 4 4"],
         samples: int,
         jitter: bool,
+        ends: Ends | None = None,
     ) -> Rendered:
-        """Volume render rays as projector coordinates and pattern, with `samples` samples per ray."""
-        t = self._distances(origins, directions, samples, jitter)
+        """Volume render rays as projector coordinates and pattern, with `samples` samples per ray.
+
+        Rays with `ends` are sampled only between them; short ones with fewer samples, which are as dense.
+        """
+        if ends is not None:
+            samples = min(samples, max(_FEWEST_SAMPLES, ceil(samples * _longest(ends) / (2 * self._reach))))
+        t = self._distances(origins, directions, samples, jitter, ends)
         p = origins[:, None] + t[..., None] * directions[:, None]
         sdf = self.field.sdf(p.reshape(-1, 3)).reshape(t.shape)
         return render(sdf, t, origins, directions, T_projector_scene, self.projector, self.pattern, self.kappa)
 
     @torch.no_grad()
     def near_surface(
-        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], ends: Ends | None = None
     ) -> Bool[Tensor, "rays"]:
         """Whether rays come so close to the surface, by the cached grid, that they see anything."""
-        near, far, _ = sphere_interval(origins, directions)
-        t = uniform_samples(near, far, _NEAR_SAMPLES, jitter=False)
+        near, far = _interval(origins, directions, ends)
+        count = _NEAR_SAMPLES if ends is None else min(_NEAR_SAMPLES, max(2, ceil(_longest(ends) / self.cache.cell)))
+        t = uniform_samples(near, far, count, jitter=False)
         f = self.cache.look_up((origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3))
-        between = 0.5 * (far - near) / _NEAR_SAMPLES  # the surface may be this much closer than at the samples
-        return f.reshape(t.shape).amin(-1) < self._reach + between
+        between = 0.5 * (far - near) / count  # the surface may be this much closer than at the samples
+        return (f.reshape(t.shape).amin(-1) < self._reach + between) & (far > near)
 
     @property
     def _reach(self) -> float:
@@ -60,13 +72,20 @@ class Renderer:
 
     @torch.no_grad()
     def _distances(
-        self, origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], samples: int, jitter: bool
+        self,
+        origins: Float[Tensor, "rays 3"],
+        directions: Float[Tensor, "rays 3"],
+        samples: int,
+        jitter: bool,
+        ends: Ends | None,
     ) -> Float[Tensor, "rays samples"]:
-        near, far, _ = sphere_interval(origins, directions)
-        if self.sampling.strategy == "uniform":
+        near, far = _interval(origins, directions, ends)
+        if self.sampling.strategy == "uniform" or (ends is not None and _longest(ends) <= 2 * self._reach):
             return uniform_samples(near, far, samples, jitter)
         t, found = first_crossing(self.cache.look_up, origins, directions, near, far)
         low, high = torch.where(found, t - self._reach, near), torch.where(found, t + self._reach, far)
+        if ends is not None:
+            low, high = torch.maximum(low, near), torch.minimum(high, far)
         return uniform_samples(low, high, samples, jitter)
 
     @torch.no_grad()
@@ -80,3 +99,14 @@ class Renderer:
         t = uniform_samples(torch.zeros_like(far), far, _SHADOW_SAMPLES, jitter=False)
         between = self.cache.look_up((start[:, None] + t[..., None] * to_projector[:, None]).reshape(-1, 3))
         return (between.reshape(t.shape).amin(-1) > 0) & ((normal * to_projector).sum(-1) > 0)
+
+
+def _interval(
+    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], ends: Ends | None
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    near, far, _ = sphere_interval(origins, directions)
+    return (near, far) if ends is None else (torch.maximum(near, ends[0]), torch.minimum(far, ends[1]))
+
+
+def _longest(ends: Ends) -> float:
+    return float((ends[1] - ends[0]).amax()) if len(ends[0]) else 0.0
