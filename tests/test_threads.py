@@ -4,6 +4,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.compiled import compiled_range
-from sl_nerfstudio.threads import one_library_thread, parallel, split, threads
+from sl_nerfstudio.threads import one_library_thread, parallel, results, split, threads
 
 
 @contextmanager
@@ -89,3 +90,9 @@ def test_a_compiled_loop_does_each_iteration_once(count: int, used: int) -> None
         compiled_range(_add_squares)(count, values, out)
     assert np.array_equal(out[:count], 1 + values[:count] ** 2)
     assert (out[count:] == 1).all()
+
+
+def test_results_are_in_the_order_of_the_tasks() -> None:
+    with torch_threads(4):
+        assert results([partial(pow, k, 2) for k in range(50)]) == [k * k for k in range(50)]
+        assert results([]) == []

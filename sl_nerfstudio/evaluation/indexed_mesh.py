@@ -1,15 +1,16 @@
 """A triangle mesh with a search tree: nearest points, ray hits, occlusion, evenly spread samples."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from sl_nerfstudio.evaluation.triangles import nearest_on_triangle, neighbours, thin
+from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.threads import results, split, threads
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,11 @@ class IndexedMesh:
 
     def closest(self, points: Float[ndarray, "n 3"]) -> Closest:
         """Nearest point of the surface (on its triangles, not its vertices) for each point."""
+        parts = [points[first:last] for first, last in split(len(points), threads(), 1)]
+        found = results([partial(self._closest, part) for part in parts])
+        return Closest(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Closest)))
+
+    def _closest(self, points: Float[ndarray, "n 3"]) -> Closest:
         answer = self._scene.compute_closest_points(o3d.core.Tensor(self._inside(points)))
         face = answer["primitive_ids"].numpy().astype(np.int64)
         # Open3D's nearest point is good to 1e-7 of the size, except on long thin triangles (of a CAD cylinder), where

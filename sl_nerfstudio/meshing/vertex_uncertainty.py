@@ -7,6 +7,8 @@ averages (`sigma_independent`). Errors of poses and intrinsics are shared by the
 is propagated, less the rigid motion of the whole surface, which changes no shape.
 """
 
+from functools import partial
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
@@ -22,6 +24,7 @@ from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, independent_varia
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
 from sl_nerfstudio.scan.types import Scan
+from sl_nerfstudio.threads import parallel
 
 _ENTRIES = 8_000_000  # derivatives that are in memory at a time
 _GAUGE_VERTICES = 4000  # of which the rigid motion of the whole surface is fitted
@@ -66,10 +69,12 @@ def _shared_variance(
     rows = surface_rows(mesh.vertices, normals, scan, poses, views, some)
     motion = np.linalg.lstsq(rigid[some], rows, rcond=None)[0]
     chunk = max(_ENTRIES // len(joint.matrix), 1)
-    for first in range(0, len(seen), chunk):
-        part = seen[first : first + chunk]
+
+    def write(part: Int64[ndarray, "n"]) -> None:
         rows = surface_rows(mesh.vertices, normals, scan, poses, views, part) - rigid[part] @ motion
         out[part] = np.einsum("vi,vi->v", rows @ joint.matrix, rows)
+
+    parallel([partial(write, seen[first : first + chunk]) for first in range(0, len(seen), chunk)])
     return np.maximum(out, 0.0)
 
 

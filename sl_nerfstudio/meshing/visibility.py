@@ -1,6 +1,7 @@
 """For every vertex of a mesh, how many frames see it, and how many of them confirm or contradict it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -16,6 +17,7 @@ from sl_nerfstudio.geometry.se3 import inverse, transform
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
+from sl_nerfstudio.threads import results, split, threads
 
 LEAST_PX, MOST_PX, MEDIANS = 2.0, 16.0, 6.0
 """A prediction agrees with a decoded coordinate within MEDIANS times the frame's median residual, kept between
@@ -59,7 +61,7 @@ class Occluder:
 
     def __init__(self, mesh: Mesh) -> None:
         """`mesh` may be open; both of its sides hide what is behind them."""
-        import open3d as o3d
+        from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 
         self._o3d = o3d
         self._centre = mesh.vertices.mean(0)
@@ -150,24 +152,57 @@ def visible_vertices(
 
     They face camera and projector, project into image and pattern, and the mesh hides them from neither.
     """
-    vertex = np.arange(len(vertices), dtype=np.int64)
+    mask = frame.read_mask()
+    images = _Images(mask, _grown(mask, OFF_MASK_PX), frame.read_coords())
+    devices = (frame.camera, projector, T_world_camera, T_world_projector)
+    parts = results(
+        [
+            partial(_visible_part, vertices, normals, np.arange(first, last), occluder, images, *devices)
+            for first, last in split(len(vertices), threads(), 1)
+        ]
+    )
+    return VisibleVertices(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(VisibleVertices))
+    )
+
+
+@dataclass(frozen=True)
+class _Images:
+    """What a frame decoded, and where."""
+
+    mask: Bool[ndarray, "h w"]
+    grown_mask: Bool[ndarray, "h w"]
+    coords: Float[ndarray, "h w 2"]
+
+
+def _visible_part(
+    vertices: Float[ndarray, "v 3"],
+    normals: Float[ndarray, "v 3"],
+    vertex: Int64[ndarray, "n"],
+    occluder: Occluder,
+    images: _Images,
+    camera: Device,
+    projector: Device,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+) -> VisibleVertices:
+    """The same for the vertices numbered `vertex`."""
     for T in (T_world_camera, T_world_projector):
         vertex = vertex[_faces(vertices[vertex], normals[vertex], T)]
-    uv_camera, inside = _pixels(vertices[vertex], frame.camera, T_world_camera)
+    uv_camera, inside = _pixels(vertices[vertex], camera, T_world_camera)
     vertex, uv_camera = vertex[inside], uv_camera[inside]
     uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
     vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
-    mask = frame.read_mask()
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
         vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
-    on_mask, around_mask = _look_up(mask, uv_camera), _look_up(_grown(mask, OFF_MASK_PX), uv_camera)
+    on_mask, around_mask = _look_up(images.mask, uv_camera), _look_up(images.grown_mask, uv_camera)
     least, most = np.full((2, len(vertex)), np.nan)
     lit, uv_camera, uv_projector = vertex[on_mask], uv_camera[on_mask], uv_projector[on_mask]
     jacobian = _jacobian(
-        vertices[lit], normals[lit], uv_camera, uv_projector, frame.camera, T_world_camera, projector, T_world_projector
+        vertices[lit], normals[lit], uv_camera, uv_projector, camera, T_world_camera, projector, T_world_projector
     )
-    least[on_mask], most[on_mask] = _offset_from_decoded(frame.read_coords(), uv_camera, uv_projector, jacobian)
+    least[on_mask], most[on_mask] = _offset_from_decoded(images.coords, uv_camera, uv_projector, jacobian)
     return VisibleVertices(vertex, ~around_mask, around_mask & ~on_mask, least, most)
 
 

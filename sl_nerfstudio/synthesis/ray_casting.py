@@ -25,7 +25,7 @@ class RayCaster:
 
     def __init__(self, scene: Scene, surroundings: Scene | None = None) -> None:
         """Build the search tree of one mesh; in `self.scene` the object's faces come before its surroundings'."""
-        import open3d as o3d
+        from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 
         self._object_faces = len(scene.faces)
         scene = scene if surroundings is None else joined(scene, surroundings)

@@ -1,8 +1,10 @@
-"""From a configuration to files: each frame is rendered, disturbed and written before the next one."""
+"""From a configuration to files: a few frames at a time are rendered, disturbed and written."""
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords, distu
 from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
 from sl_nerfstudio.synthesis.scenes.scene import Scene
 from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
+from sl_nerfstudio.threads import results, threads
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
 GAIN = 1.05  # exposure: a surface of mean albedo that faces the lamp in full light has 0.82 of full scale
@@ -83,12 +86,18 @@ def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
 
 
 def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
-    """Rendered and disturbed frames, one in memory at a time."""
+    """Rendered and disturbed frames, as many in memory as there are threads."""
+    together = max(threads(), 1)
+    groups = [range(first, min(first + together, config.frames)) for first in range(0, config.frames, together)]
+    rendered = chain.from_iterable(results([partial(_frame, config, setup, k) for k in group]) for group in groups)
+    yield from track(rendered, "rendering", config.frames)
+
+
+def _frame(config: SynthConfig, setup: Setup, index: int) -> SyntheticFrame:
+    frame = _captured(config, setup, index)
     noise = CoordinateNoise(config.noise, config.missing, config.wrong)
-    for index in track(range(config.frames), "rendering", config.frames):
-        frame = _captured(config, setup, index)
-        decoder = random_stream(config.seed, Stream.COORDS, index)
-        yield replace(frame, coords=disturb_coords(frame.coords, frame.mask, setup.cells, noise, decoder))
+    decoder = random_stream(config.seed, Stream.COORDS, index)
+    return replace(frame, coords=disturb_coords(frame.coords, frame.mask, setup.cells, noise, decoder))
 
 
 def _captured(config: SynthConfig, setup: Setup, index: int) -> SyntheticFrame:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
@@ -16,6 +15,7 @@ from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.colour_layers import ColourLayer
 from sl_nerfstudio.evaluation.report.pictures import CLAY
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 from sl_nerfstudio.meshing.mesh import Mesh
 
 MOST_TRIANGLES = 40_000  # about 1 MB in the page
