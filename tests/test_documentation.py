@@ -200,3 +200,14 @@ def test_make_explains_every_target():
     assert targets
     explained = set(re.findall(r'@echo "make ([a-z-]+) ', makefile))
     assert explained == set(targets[1].split()) - {"help"}
+
+
+def test_the_site_has_every_page_of_the_documentation_and_every_folder_of_the_code():
+    """`make docs` checks their links; a page that is not in the navigation would end it."""
+    from docs.make_site import packages
+
+    text = (ROOT / "docs" / "mkdocs.yml").read_text()
+    listed = set(re.findall(r"[:-] ([\w/.-]+\.md)$", text, re.MULTILINE))
+    assert listed == {str(page.relative_to(ROOT)) for page in PAGES}
+    folders = {path.parent.name for path in (ROOT / "sl_nerfstudio").glob("*/__init__.py")}
+    assert folders <= set(packages()) and "__main__" not in packages()
