@@ -16,23 +16,22 @@ def what_to_recapture(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]
 
 
 def _lost(frames: Sequence[FrameRecord]) -> list[str]:
-    """One sentence for each frame that was left out; those that are connected with each other share one."""
-    lost = [f for f in frames if not f.in_scan]
-    groups: dict[int, list[str]] = {}
-    for frame in lost:
-        if frame.component > 0:
-            groups.setdefault(frame.component, []).append(frame.name)
+    """One sentence for all frames that were left out for the same reason, or are connected with each other."""
+    together: dict[tuple[int, str], list[FrameRecord]] = {}
+    for frame in frames:
+        if not frame.in_scan:
+            key = (frame.component, "") if frame.component > 0 else (-1, first_line(frame.reason))
+            together.setdefault(key, []).append(frame)
     sentences = []
-    for frame in lost:
-        group = groups.get(frame.component, [])
-        why = f"left out ({first_line(frame.reason)})"
-        if len(group) < 2:
-            sentences.append(f"{frame.name}: capture it again; it was {why}")
-        elif frame.name == group[0]:
-            sentences.append(
-                f"{', '.join(group)}: capture views that connect this group {frame.component} with the scan; "
-                f"{frame.name} was {why}"
-            )
+    for (component, _), group in together.items():
+        names, why = ", ".join(f.name for f in group), f"left out ({first_line(group[0].reason)})"
+        if len(group) == 1:
+            sentences.append(f"{names}: capture it again; it was {why}")
+        elif component > 0:
+            connect = f"capture views that connect this group {component} with the scan"
+            sentences.append(f"{names}: {connect}; {group[0].name} was {why}")
+        else:
+            sentences.append(f"{names}: capture them again; each was {why}")
     return sentences
 
 

@@ -43,10 +43,12 @@ def test_unordered_frames_with_a_single_connection():
 def test_frames_of_one_group_share_a_sentence():
     apart = {"in_scan": False, "stage": "registering", "reason": "it may slip\n    cause:  round"}
     frames = [_frame("a", component=0), _frame("b", **apart, component=2), _frame("c", **apart, component=-1),
-              _frame("d", **apart, component=2), _frame("e", component=0)]  # fmt: skip
+              _frame("d", **apart, component=2), _frame("e", component=0),
+              _frame("f", **{**apart, "reason": "it is dark"}), _frame("g", **apart)]  # fmt: skip
     assert what_to_recapture(frames, [_edge("a", "e")], ordered=True) == (
         "b, d: capture views that connect this group 2 with the scan; b was left out (it may slip)",
-        "c: capture it again; it was left out (it may slip)",
+        "c, g: capture them again; each was left out (it may slip)",
+        "f: capture it again; it was left out (it is dark)",
     )
     assert unconnected_neighbours(frames, [_edge("a", "e")]) == []
     assert unconnected_neighbours(frames, [_edge("a", "b")]) == [("a", "e")]

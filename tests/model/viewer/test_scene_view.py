@@ -12,7 +12,7 @@ import viser.transforms as vtf
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.model.viewer.device_nodes import vertical_fov
+from sl_nerfstudio.model.viewer.device_nodes import DeviceNodes, vertical_fov
 from sl_nerfstudio.model.viewer.scene_view import SceneView, first_view
 from sl_nerfstudio.model.viewer.surface import MODES
 from tests.dataparser.tiny_scan import RADIUS
@@ -21,6 +21,11 @@ from tests.model.viewer.conftest import SCALE
 
 def model_of(view: SceneView) -> Any:
     return view._model
+
+
+def devices_of(view: SceneView) -> tuple[DeviceNodes, DeviceNodes]:
+    assert view._devices is not None
+    return view._devices
 
 
 def messages(view: SceneView, kind: str) -> dict[str, Any]:
@@ -48,7 +53,7 @@ def test_every_device_is_named_coloured_and_where_it_stood(view: SceneView) -> N
     frusta, labels = messages(view, "CameraFrustumMessage"), messages(view, "LabelMessage")
     colours = {"camera": (90, 160, 255), "projector": (255, 140, 40)}
     for devices, kind, T in zip(
-        view._devices, colours, (scan.poses.T_world_camera, scan.poses.T_world_projector), strict=True
+        devices_of(view), colours, (scan.poses.T_world_camera, scan.poses.T_world_projector), strict=True
     ):
         for k, name in enumerate(names):
             r, g, b = colours[kind]
@@ -95,7 +100,7 @@ def test_devices_follow_their_poses_with_a_line_from_the_start(view: SceneView) 
     T[1, :3, 3] += [5.0, -3.0, 2.0]
     model.current = DevicePoses(T, start.T_world_projector)
     view.update(force=True)
-    cameras, projectors = view._devices
+    cameras, projectors = devices_of(view)
     np.testing.assert_allclose(cameras.refined[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
     np.testing.assert_allclose(cameras.labels[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
     np.testing.assert_allclose(cameras.starting[1].position, 10 * SCALE * start.T_world_camera[1, :3, 3], rtol=1e-6)
@@ -115,11 +120,11 @@ def test_frames_that_cannot_be_placed_are_red(view: SceneView) -> None:
         assert messages(view, "CameraFrustumMessage")[f"/refined/{kind}/frame_00001"].color == 230 << 16 | 60 << 8 | 50
         assert messages(view, "LabelMessage")[f"/names/{kind}/frame_00001"].text == f"{kind} 1: not placed"
     T = model_of(view).scan.poses.T_world_camera
-    np.testing.assert_allclose(view._devices[0].refined[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
+    np.testing.assert_allclose(devices_of(view)[0].refined[1].position, 10 * SCALE * T[1, :3, 3], rtol=1e-6)
 
 
 def test_the_panel_hides_and_shows(view: SceneView) -> None:
-    cameras, projectors = view._devices
+    cameras, projectors = devices_of(view)
 
     def shown() -> list[bool]:
         nodes = (cameras.refined, cameras.starting, projectors.refined, projectors.starting)
