@@ -194,9 +194,10 @@ def what_next(config: Path, scan: Path, decoded: float) -> str:
     ]
     parts = [paragraph("result", f"{settings.parent}")]
     if decoded < _WELL_DECODED:
-        again = command("sl-redecode", "--load-config", settings, "--output", data.with_name(f"{data.name}-again"))
         share = f"{decoded:.0%} of the pixels with the pattern"
-        parts += [paragraph("decoded", f"{share}; with this surface more can be decoded, which helps the poses:"), again]
+        again = command("sl-redecode", "--load-config", settings, "--output", data.with_name(f"{data.name}-again"))
+        parts.append(paragraph("decoded", f"{share}; this surface shows how to decode more, which helps the poses:"))
+        parts.append(again)
     return "\n".join([*parts, next_steps(steps)])
 
 

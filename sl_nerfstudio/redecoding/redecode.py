@@ -16,6 +16,7 @@ from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.coordinates import encode_coords
 from sl_nerfstudio.scan.document import TRANSFORMS, Record, read_document
 from sl_nerfstudio.scan.file_error import read_bytes
+from sl_nerfstudio.scan.partial_frame import FRAME_FILES
 from sl_nerfstudio.scan.writing import encode_json
 from sl_nerfstudio.threads import one_library_thread
 
@@ -102,7 +103,7 @@ def _put_coords(document: Record, index: int, name: str) -> str:
 
 def _copy_others(folder: NewFolder, scan: Scan, document: Record) -> None:
     """Every file that transforms.json names, except coordinates; the truth; and descriptions (JSON) beside them."""
-    keys = ("file_path", "sl_pattern_path", "mask_path")
+    keys = [key for key in FRAME_FILES if key != "sl_coords_path"]
     named = [document["projector"]["pattern_path"]]
     named += [record[key] for record in document["frames"] for key in keys if record.get(key)]
     truth = sorted(path for path in (scan.root / "ground_truth").rglob("*") if path.is_file())

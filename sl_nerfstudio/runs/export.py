@@ -72,8 +72,8 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     if settings.target_faces is not None:
         decimated = decimate(mesh, settings.target_faces)
         mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
-        if settings.watertight:
-            _require_closed(mesh, settings.target_faces)
+    if settings.watertight:
+        _require_closed(mesh, settings)
     write_mesh(settings.mesh, mesh, properties, scan.units)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
@@ -83,12 +83,18 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     return Exported(mesh, properties, surface, decimated, colours, points, model.pose_sigma(), seconds)
 
 
-def _require_closed(mesh: Mesh, triangles: int) -> None:
-    if not mesh.is_closed():
+def _require_closed(mesh: Mesh, settings: ExportSettings) -> None:
+    if mesh.is_closed():
+        return
+    if settings.target_faces is not None:
         raise UserError(
-            f"--target-faces {triangles}: the surface is no longer closed with so few triangles\n"
+            f"--target-faces {settings.target_faces}: the surface is no longer closed with so few triangles\n"
             "    cause:  thin parts of it collapse\n    remedy: keep more triangles, or leave --watertight out"
         )
+    raise UserError(
+        f"--watertight: the surface is not closed at --resolution {settings.resolution}\n"
+        "    cause:  parts of it are thinner than a cell\n    remedy: give another --resolution"
+    )
 
 
 def _write_poses(path: Path, model: TrainedModel) -> None:

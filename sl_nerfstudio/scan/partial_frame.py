@@ -18,8 +18,8 @@ from sl_nerfstudio.scan.types import Frame, PoseSigma
 
 POSES = ("transform_matrix", "projector_transform_matrix")
 SIGMA_KEYS = tuple(PoseSigma.__dataclass_fields__)
-_PATHS = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path", "sl_color_path")
-_FRAME_KEYS = (*_PATHS, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
+FRAME_FILES = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path", "sl_color_path")
+_FRAME_KEYS = (*FRAME_FILES, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
 
 
 @dataclass
@@ -56,7 +56,7 @@ def read_frame(frame: Fields, top: Fields, root: Path, common: Device | None, ne
     result = PartialFrame(frame.frame or "")
     frame.check_spelling(_FRAME_KEYS)
     result.camera = read_frame_camera(frame, top) if any(key in frame.record for key in CAMERA_KEYS) else common
-    for key in _PATHS:
+    for key in FRAME_FILES:
         if key == "file_path" or (key == "sl_coords_path" and need_coords) or frame.record.get(key) is not None:
             path = read_path(frame, key, root)
             if path is not None:

@@ -166,6 +166,8 @@ def test_too_few_triangles_for_a_closed_solid(scan, tmp_path, monkeypatch):
     monkeypatch.setattr("sl_nerfstudio.meshing.mesh.Mesh.is_closed", lambda _: False)
     with pytest.raises(UserError, match=r"--target-faces 8: the surface is no longer closed(.|\n)*keep more triangles"):
         export(scan, tmp_path / "a.stl", watertight=True, target_faces=8)
+    with pytest.raises(UserError, match=r"--watertight: the surface is not closed at --resolution 48(.|\n)*remedy"):
+        export(scan, tmp_path / "a.stl", watertight=True)
     assert not (tmp_path / "a.stl").exists()
 
 
