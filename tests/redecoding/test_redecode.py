@@ -54,7 +54,8 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
     ) as writer:  # fmt: skip
         for k, (turn, image) in enumerate([(np.eye(4), picture()), (HALF_TURN, np.full(MASK.shape, 0.5))]):
             writer.add_frame(
-                f"frame_{k}", color=None if k else eight_bit(0.5 * MASK), image=eight_bit(image), coords=with_holes(truth(), 0.6, k), mask=MASK,
+                f"frame_{k}", color=None if k else eight_bit(0.5 * MASK), image=eight_bit(image),
+                coords=with_holes(truth(), 0.6, k), mask=MASK,
                 T_world_camera=turn @ T_CAMERA, T_world_projector=turn @ T_PROJECTOR, pose_sigma=sigma,
                 true_poses=(turn @ T_CAMERA, turn @ T_PROJECTOR),
             )  # fmt: skip
