@@ -56,9 +56,10 @@ def evaluate_scan(config: EvalConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     _check(config)
     from sl_nerfstudio.files.results import held_results
+    from sl_nerfstudio.threads import one_library_thread
 
     marks = {path: mark for path, mark in ((config.json, _JSON_MARK), (config.report, _REPORT_MARK)) if path}
-    with held_results(marks):
+    with held_results(marks), one_library_thread():
         _evaluate(config)
 
 
