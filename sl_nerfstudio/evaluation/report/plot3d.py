@@ -35,7 +35,7 @@ MOST_TRIANGLES = 40_000  # about 1 MB in the page
 
 MEASURED_LINE = {
     "type": "scatter3d", "mode": "lines+markers", "name": "measured", "x": [], "y": [], "z": [], "hoverinfo": "skip",
-    "showlegend": False, "line": {"color": "#111111", "width": 6}, "marker": {"color": "#111111", "size": 4},
+    "showlegend": False, "line": {"color": "#111111", "width": 6}, "marker": {"color": "#111111", "size": 6},
 }  # fmt: skip
 
 

@@ -52,7 +52,7 @@ def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
     assert document["planes"][0]["left_out"] and document["planes_left_out"] > 0.3
     assert [frame["name"] for frame in document["frames"]] == list(NAMES)
     page = (scan.root / "processing.html").read_text()
-    assert page.count("What was left out of ") == len(NAMES) and "What was left out around the object" in page
+    assert page.count('alt="What was left out of ') == len(NAMES) and "What was left out around the object" in page
     assert "object only: left out" in log and "plane with" in log
 
 
