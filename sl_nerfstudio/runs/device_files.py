@@ -6,7 +6,7 @@ from numpy import ndarray
 from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.runs.cameras.blender import encode_blender
-from sl_nerfstudio.runs.cameras.colmap import encode_colmap
+from sl_nerfstudio.runs.cameras.colmap import encode_colmap, require_possible
 from sl_nerfstudio.runs.cameras.posed_device import posed_frames
 from sl_nerfstudio.runs.cameras.tracks import surface_tracks
 from sl_nerfstudio.runs.cameras.trajectory import encode_kitti, encode_tum
@@ -15,10 +15,16 @@ from sl_nerfstudio.runs.trained_run import TrainedModel
 from sl_nerfstudio.scan.types import UNITS
 
 
+def require_possible_files(settings: ExportSettings, model: TrainedModel) -> None:
+    """Raise UserError, before anything slow, for what a format cannot hold."""
+    if "colmap" in settings.cameras:
+        require_possible(posed_frames(model.scan, model.poses(), model.unplaced()), model.scan.root)
+
+
 def write_device_files(
     settings: ExportSettings, model: TrainedModel, mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None
 ) -> None:
-    """Write what the settings ask for; COLMAP gets points of `mesh`. Raises UserError for what a format cannot hold."""
+    """Write what the settings ask for; COLMAP gets points of `mesh`."""
     scan, folder, poses = model.scan, settings.device_folder, model.poses()
     frames, unit_m = posed_frames(scan, poses, model.unplaced()), UNITS[scan.units]
     files: dict[str, bytes] = {}

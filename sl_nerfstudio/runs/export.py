@@ -19,7 +19,7 @@ from sl_nerfstudio.meshing.vertex_colour import VertexColours, vertex_colours
 from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
 from sl_nerfstudio.runs.covariance_file import write_covariance
-from sl_nerfstudio.runs.device_files import write_device_files
+from sl_nerfstudio.runs.device_files import require_possible_files, write_device_files
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.runs.surface import Surface, build_surface
@@ -56,6 +56,7 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     Raises UserError if there is no surface, if no part of it was observed, or if a file cannot be written.
     """
     model, start = run.model, time.perf_counter()
+    require_possible_files(settings, model)
     surface = build_surface(model, settings)
     mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()
     joint = model.joint_covariance()

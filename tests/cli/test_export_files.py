@@ -179,3 +179,10 @@ def test_the_script_for_blender_lists_every_frame(scan, tmp_path):
     place = np.array(devices["cameras"][2]["matrix"])[:3, 3]
     np.testing.assert_allclose(place * 1000, scan.poses.T_world_camera[2, :3, 3], rtol=1e-12)
     assert Path(devices["cameras"][2]["image"]) == scan.frames[2].image_path
+
+
+def test_names_that_colmap_cannot_hold_are_refused_before_anything_is_computed(scan, tmp_path, monkeypatch):
+    monkeypatch.setattr("sl_nerfstudio.runs.export.build_surface", lambda *_: pytest.fail("computed"))
+    spaced = replace(scan.frames[0], image_path=scan.root / "images/my photo.png")
+    with pytest.raises(UserError, match=r"'images/my photo.png' has a space"):
+        export(replace(scan, frames=(spaced, *scan.frames[1:])), tmp_path / "m.ply", cameras=("colmap",))

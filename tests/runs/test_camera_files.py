@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.runs.cameras.blender import encode_blender
-from sl_nerfstudio.runs.cameras.colmap import encode_colmap
+from sl_nerfstudio.runs.cameras.colmap import encode_colmap, require_possible
 from sl_nerfstudio.runs.cameras.posed_device import PosedDevice, PosedFrames
 from sl_nerfstudio.runs.cameras.tracks import SurfaceTracks
 from sl_nerfstudio.runs.cameras.trajectory import encode_kitti, encode_tum
@@ -123,12 +123,15 @@ def test_frames_that_are_not_placed_are_no_images_of_colmap(tmp_path):
 def test_what_colmap_cannot_hold_is_refused():
     bent = Device(**{**vars(DOE), "k1": 0.1})
     with pytest.raises(UserError, match=r"diffractive element and lens distortion(.|\n)*remedy"):
-        encode_colmap(frames(projector=bent), Path("/scan"), tracks(frames(projector=bent)))
+        require_possible(frames(projector=bent), Path("/scan"))
     spaced = frames()
     first = PosedDevice("a", CAMERA, POSES[0], Path("/scan/images/a b.png"))
     spaced = PosedFrames((first, *spaced.cameras[1:]), spaced.projectors, spaced.placed)
     with pytest.raises(UserError, match=r"'images/a b.png' has a space(.|\n)*rename"):
-        encode_colmap(spaced, Path("/scan"), tracks(frames()))
+        require_possible(spaced, Path("/scan"))
+    require_possible(frames(), Path("/scan"))
+    with pytest.raises(UserError, match=r"no frame agrees with the others(.|\n)*remedy"):
+        require_possible(frames(placed=(False, False, False)), Path("/scan"))
 
 
 class _Collection(list):

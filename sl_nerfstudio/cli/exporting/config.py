@@ -19,10 +19,9 @@ class ExportConfig:
     poses: Path | None = None
     """Folder for transforms.json with the refined poses, and training.json with settings, versions and curves."""
     cameras: tuple[Literal["colmap", "blender"], ...] = ()
-    """Cameras and projectors for other programs, in the --poses folder, else beside the mesh: a COLMAP model in
-    colmap/, or cameras_blender.py."""
+    """Cameras and projectors for other programs, in the --poses folder, else beside the mesh."""
     trajectory: tuple[Literal["tum", "kitti"], ...] = ()
-    """Refined poses as text files in the same folder, in metres: camera_tum.txt, projector_tum.txt, ..._kitti.txt."""
+    """Refined poses of cameras and of projectors as text files in the same folder, in metres."""
     points: Path | None = None
     """Point cloud to write, of what frames observed, with normals, sigma and views: .ply, or .las with laspy."""
     resolution: int = 512

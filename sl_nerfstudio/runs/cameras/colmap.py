@@ -24,11 +24,36 @@ _SINE = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)
 _RIGID = 1e-6  # largest change of a rotation's entries, and of the translation in baselines, within one rig
 
 
+def require_possible(frames: PosedFrames, root: Path) -> None:
+    """Raise UserError for devices that COLMAP has no model of, and for names that its text format cannot hold."""
+    if not any(frames.placed):
+        raise UserError(
+            "--cameras colmap: no frame agrees with the others, so there is no pose to write\n"
+            "    remedy: check the scan with sl-check, or leave --cameras out"
+        )
+    projector = frames.projectors[0].device
+    if projector.model == "DOE" and any((projector.k1, projector.k2, projector.p1, projector.p2)):
+        raise UserError(
+            "--cameras colmap: the projector has a diffractive element and lens distortion\n"
+            "    cause:  COLMAP has no such model\n"
+            "    remedy: leave --cameras out, or make a scan whose projector has no distortion"
+        )
+    for camera in frames.cameras:
+        name = camera.image.relative_to(root).as_posix()
+        if any(c.isspace() for c in name):
+            raise UserError(
+                f"--cameras colmap: {name!r} has a space in it\n"
+                "    cause:  COLMAP's text files end a name there\n"
+                "    remedy: rename the image and its entry in transforms.json, and train again; or leave --cameras out"
+            )
+
+
 def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dict[str, bytes]:
     """The files by name; images are named by their paths below `root`, frames that are not placed are left out.
 
-    Raises UserError for devices that COLMAP has no model of, and for names that its text format cannot hold.
+    Raises UserError as `require_possible` does.
     """
+    require_possible(frames, root)
     placed = [k for k, good in enumerate(frames.placed) if good]
     kinds = list(dict.fromkeys(frames.cameras[k].device for k in placed))
     devices = [*kinds, frames.projectors[0].device]
@@ -101,22 +126,10 @@ def _camera(device: Device) -> str:
     distortion = (device.k1, device.k2, device.p1, device.p2)
     if device.model == "OPENCV":
         return f"OPENCV {size} {focal} {' '.join(map(repr, distortion))}"
-    if any(distortion):
-        raise UserError(
-            "--cameras colmap: the projector has a diffractive element and lens distortion\n"
-            "    cause:  COLMAP has no such model\n"
-            "    remedy: leave --cameras out, or make a scan whose projector has no distortion"
-        )
     return f"OPENCV_FISHEYE {size} {focal} {' '.join(map(repr, _SINE))}"
 
 
 def _image(number: int, device: PosedDevice, camera: int, name: str) -> str:
-    if any(c.isspace() for c in name):
-        raise UserError(
-            f"--cameras colmap: {name!r} has a space in it\n"
-            "    cause:  COLMAP's text files end a name there\n"
-            "    remedy: rename the image and its entry in transforms.json, and train again; or leave --cameras out"
-        )
     return f"{number} {_pose(np.linalg.inv(device.T_world_cv))} {camera} {name}"
 
 
