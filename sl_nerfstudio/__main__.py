@@ -105,13 +105,15 @@ def devices() -> str:
     """What torch can compute on."""
     import torch
 
-    cores = f"{torch.get_num_threads()} threads of {os.cpu_count()} cores"
+    from sl_nerfstudio.cores import cores
+
+    used = f"{torch.get_num_threads()} threads; {cores()} of {os.cpu_count()} cores may be used"
     if not torch.cuda.is_available():
         built = torch.version.cuda
         why = "torch is built without CUDA" if built is None else f"torch, built for CUDA {built}, finds no GPU"
-        return f"cpu ({cores}); no cuda: {why}"
+        return f"cpu ({used}); no cuda: {why}"
     names = [torch.cuda.get_device_properties(k) for k in range(torch.cuda.device_count())]
-    return f"cpu ({cores}); " + ", ".join(f"cuda: {gpu.name}, {gpu.total_memory / 2**30:.0f} GiB" for gpu in names)
+    return f"cpu ({used}); " + ", ".join(f"cuda: {gpu.name}, {gpu.total_memory / 2**30:.0f} GiB" for gpu in names)
 
 
 def backends() -> str:

@@ -15,7 +15,12 @@ from typing import TypeVar
 import torch
 from threadpoolctl import threadpool_limits
 
+from sl_nerfstudio.cores import cores
+
 T = TypeVar("T")
+
+if torch.get_num_threads() > cores():  # torch does not know of quotas
+    torch.set_num_threads(cores())
 
 _ours: int | None = None  # threads of our own loops while torch has one
 

@@ -1,6 +1,5 @@
 """The frame stage: every capture decoded and calibrated by itself, in several processes."""
 
-import os
 from collections.abc import Generator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -8,6 +7,7 @@ from contextlib import closing
 
 import numpy as np
 
+from sl_nerfstudio.cores import cores
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -76,11 +76,6 @@ def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Gen
             f"a process that decoded frames was killed\n    cause:  {jobs} processes need more memory than there is\n"
             "    remedy: give a smaller number with --jobs; frames decoded so far are kept"
         ) from error
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 _worker: FrameWorker | None = None  # of a worker process
