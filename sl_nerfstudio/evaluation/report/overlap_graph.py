@@ -42,7 +42,7 @@ def _line(place: dict[str, tuple[float, float]], edge: EdgeRecord) -> str:
 
 def _node(frame: FrameRecord, place: tuple[float, float], label: str) -> str:
     x, y = place
-    fill = "#ffffff" if frame.in_scan else "#f6c7c2"
+    fill = "#f6c7c2" if not frame.in_scan else "#f7dc8f" if frame.undecided else "#ffffff"
     return (
         f'<g><title>{escape(frame.name)}</title><circle cx="{x:.1f}" cy="{y:.1f}" r="11" fill="{fill}" '
         f'stroke="{INK}"/><text x="{x:.1f}" y="{y + 3.5:.1f}" text-anchor="middle" font-size="10" '

@@ -173,4 +173,5 @@ def test_links_lead_to_frames_and_pictures_can_be_enlarged():
     assert set(parsed.anchors) <= set(parsed.ids) and len(parsed.ids) == len(set(parsed.ids))
     assert page.count('<button type="button" aria-label=') == 12 and 'dialog id="large"' in page
     assert re.search(r'<div class="scroll"><table>\s*<caption>Captures are counted', page)  # never wider than the page
+    assert page.count('fill="#f7dc8f"') == 1 and page.count('fill="#f6c7c2"') == 3  # in the overlap graph
     assert page.count('class="frame undecided"') == 1 and page.count('class="frame out"') == 3
