@@ -1,4 +1,4 @@
-"""Small cases with ray-cast truth, made once."""
+"""Small cases with ray-cast truth, made and separated once."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks.separation.cases import Case, Conditions, make_case
 from benchmarks.separation.objects import OBJECTS
+from sl_nerfstudio.object_separation.separate import Separation, separate
 
 
 @pytest.fixture(scope="session")
@@ -18,5 +19,19 @@ def cases() -> Callable[..., Case]:
         if key not in made:
             made[key] = make_case(OBJECTS[name](), background, Conditions(10, 110, zoom))
         return made[key]
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def separated(cases: Callable[..., Case]) -> Callable[..., Separation]:
+    """What is found in a case, which takes seconds; arguments as for `cases`."""
+    found: dict[tuple, Separation] = {}
+
+    def get(name: str, background: str, zoom: float = 0.75) -> Separation:
+        key = (name, background, zoom)
+        if key not in found:
+            found[key] = separate(cases(*key).frames)
+        return found[key]
 
     return get

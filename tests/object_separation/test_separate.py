@@ -23,26 +23,23 @@ def _shares(case, found):
 
 @pytest.mark.parametrize("background", ["table", "walls", "room", "plate"])
 @pytest.mark.parametrize("name", ["box", "medal"])
-def test_the_object_stays_and_its_surroundings_go(cases, name, background):
-    case = cases(name, background)
-    found = separate(case.frames)
+def test_the_object_stays_and_its_surroundings_go(cases, separated, name, background):
+    case, found = cases(name, background), separated(name, background)
     own, left = _shares(case, found)
     assert own > 0.985 and left < 0.01
     assert len(found.surroundings) >= 1
 
 
 @pytest.mark.parametrize("name", ["box", "medal", "plaque", "cone-and-cylinder"])
-def test_nothing_is_taken_from_an_object_without_surroundings(cases, name):
+def test_nothing_is_taken_from_an_object_without_surroundings(cases, separated, name):
     """Flat sides, a flat object, and a plate with solids on it: their planes are part of them."""
-    case = cases(name, "none")
-    found = separate(case.frames)
+    case, found = cases(name, "none"), separated(name, "none")
     assert found.findings and not found.surroundings
     assert _shares(case, found)[0] > 0.99
 
 
-def test_what_was_seen_but_not_decoded_is_as_its_neighbours(cases):
-    case = cases("box", "table")
-    found = separate(case.frames)
+def test_what_was_seen_but_not_decoded_is_as_its_neighbours(cases, separated):
+    case, found = cases("box", "table"), separated("box", "table")
     frame = case.frames[0]
     parts = found.parts(0, frame)
     assert ((parts != Part.NOTHING) == frame.seen).all()
@@ -51,9 +48,9 @@ def test_what_was_seen_but_not_decoded_is_as_its_neighbours(cases):
     assert gaps.sum() > 500 and right.mean() > 0.97
 
 
-def test_points_of_a_surface_are_judged_like_pixels(cases):
+def test_points_of_a_surface_are_judged_like_pixels(separated):
     """On top of the box and on the table, 40 mm beside it; the table is at z = 0."""
-    found = separate(cases("box", "table").frames)
+    found = separated("box", "table")
     x, y = np.meshgrid(np.linspace(-30, 30, 9), np.linspace(-20, 20, 9))
     top = np.stack([x, y, np.full_like(x, 90.0)], -1).reshape(-1, 3)
     beside = np.stack([np.full(9, 75.0), np.linspace(-20, 20, 9), np.zeros(9)], -1)
@@ -61,9 +58,9 @@ def test_points_of_a_surface_are_judged_like_pixels(cases):
     assert not found.keeps(np.array([[0.0, 0.0, 500.0], [900.0, 0.0, 40.0]])).any()
 
 
-def test_the_same_frames_and_seed_give_the_same_answer(cases):
+def test_the_same_frames_and_seed_give_the_same_answer(cases, separated):
     frames = cases("box", "table").frames
-    first, second = separate(frames, 3), separate(frames, 3)
+    first, second = separated("box", "table"), separate(frames)
     for k, frame in enumerate(frames):
         np.testing.assert_array_equal(first.parts(k, frame), second.parts(k, frame))
 
