@@ -9,7 +9,6 @@ measured time over that.
 
 import argparse
 import multiprocessing
-import os
 import shutil
 import tempfile
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.whole_runs import run
+from sl_nerfstudio.cores import cores
 
 
 @dataclass(frozen=True)
@@ -101,13 +101,13 @@ def busy(count: int) -> Iterator[None]:
 
 def measure(todo: Sequence[Step], count: int) -> Iterator[Row]:
     """Each command twice: beside busy processes and alone, the first time not counted (compilation)."""
-    cores = len(os.sched_getaffinity(0))
+    available = cores()
     for step in todo:
         step.timed()
         alone = step.timed()
         with busy(count):
             beside = step.timed()
-        yield Row(step.words[0], alone, beside, beside / (alone * (cores + count) / cores))
+        yield Row(step.words[0], alone, beside, beside / (alone * (available + count) / available))
 
 
 def main() -> None:

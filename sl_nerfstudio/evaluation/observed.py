@@ -3,13 +3,12 @@
 from collections.abc import Iterable
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.rays import world_pixels
 
 
 def observable(
@@ -37,10 +36,6 @@ def faces_and_falls_inside(
     points: Float[ndarray, "m 3"], normals: Float[ndarray, "m 3"], device: Device, T_world_device: Float[ndarray, "4 4"]
 ) -> Bool[ndarray, "m"]:
     """Whether points with outward `normals` face the device and project into its image."""
-    T = torch.as_tensor(T_world_device, dtype=torch.float64)
-    p_device = transform(inverse(T), torch.as_tensor(points, dtype=torch.float64))
-    uv, in_front = project(Intrinsics.of(device, torch.float64), p_device)
-    x, y = uv.numpy().T
-    inside = (x >= 0) & (x < device.w) & (y >= 0) & (y < device.h)
+    _, inside = world_pixels(device, T_world_device, points)
     facing = ((T_world_device[:3, 3] - points) * normals).sum(1) > 0
-    return in_front.numpy() & inside & facing
+    return inside & facing

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float64, Int64, UInt8
 from numpy import ndarray
 from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.rays import world_pixels
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_properties import GREY
 from sl_nerfstudio.meshing.visibility import Occluder
@@ -58,10 +56,7 @@ def _seen(
     way = eye - mesh.vertices
     cosine = np.einsum("vi,vi->v", way, normals) / np.linalg.norm(way, axis=1)
     vertex = np.flatnonzero(cosine > _LEAST_COSINE)
-    T = inverse(torch.as_tensor(T_world_camera, dtype=torch.float64))
-    p_camera = transform(T, torch.from_numpy(mesh.vertices[vertex]))
-    uv, in_front = (x.numpy() for x in project(Intrinsics.of(frame.camera, torch.float64), p_camera))
-    inside = in_front & (uv >= 0).all(1) & (uv < [frame.camera.w, frame.camera.h]).all(1)
+    uv, inside = world_pixels(frame.camera, T_world_camera, mesh.vertices[vertex])
     vertex, uv = vertex[inside], uv[inside]
     free = ~occluder.hidden(mesh.vertices[vertex], normals[vertex], eye)
     return vertex[free], cosine[vertex[free]], uv[free]

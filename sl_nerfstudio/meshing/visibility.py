@@ -11,9 +11,8 @@ from numpy import ndarray
 from scipy.ndimage import binary_dilation
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.rays import pixel_rays, world_pixels
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
@@ -189,9 +188,9 @@ def _visible_part(
     """The same for the vertices numbered `vertex`."""
     for T in (T_world_camera, T_world_projector):
         vertex = vertex[_faces(vertices[vertex], normals[vertex], T)]
-    uv_camera, inside = _pixels(vertices[vertex], camera, T_world_camera)
+    uv_camera, inside = world_pixels(camera, T_world_camera, vertices[vertex])
     vertex, uv_camera = vertex[inside], uv_camera[inside]
-    uv_projector, inside = _pixels(vertices[vertex], projector, T_world_projector)
+    uv_projector, inside = world_pixels(projector, T_world_projector, vertices[vertex])
     vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
     for T in (T_world_camera, T_world_projector):
         free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
@@ -226,17 +225,6 @@ def _dot(a: Float[ndarray, "n k"], b: Float[ndarray, "n k"]) -> Float[ndarray, "
     return np.einsum("nk,nk->n", a, b)
 
 
-def _pixels(
-    points: Float[ndarray, "n 3"], device: Device, T_world_device: Float[ndarray, "4 4"]
-) -> tuple[Float[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pixels of world points, and which of them lie inside the image and in front of the device."""
-    T = inverse(torch.as_tensor(T_world_device, dtype=torch.float64))
-    uv, in_front = project(Intrinsics.of(device, torch.float64), transform(T, torch.from_numpy(points)))
-    uv = uv.numpy()
-    u, v = uv.T
-    return uv, in_front.numpy() & (u >= 0) & (v >= 0) & (u < device.w) & (v < device.h)
-
-
 def _jacobian(
     points: Float[ndarray, "n 3"],
     normals: Float[ndarray, "n 3"],
@@ -255,7 +243,7 @@ def _jacobian(
         o, d = origin.numpy(), direction.numpy()
         towards = _dot(d, normals)
         distance = _dot(points - o, normals) / np.where(towards < 0, towards, -1e-12)
-        there, _ = _pixels(o + distance[:, None] * d, projector, T_world_projector)
+        there, _ = world_pixels(projector, T_world_projector, o + distance[:, None] * d)
         columns.append((there - uv_projector).clip(-MOST_PX, MOST_PX))
     return np.stack(columns, -1)
 

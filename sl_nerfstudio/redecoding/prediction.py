@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays, world_pixels
 from sl_nerfstudio.meshing.mesh import Mesh
 
 _PUSH = 1e-4  # of the depth: how far a point is moved along its ray to see where its coordinate goes
@@ -35,7 +34,7 @@ class Surface:
 
     def __init__(self, mesh: Mesh) -> None:
         """`mesh` may be open; both of its sides are seen and give shade."""
-        import open3d as o3d
+        from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 
         self._tensor = o3d.core.Tensor
         self._centre = mesh.vertices.mean(0)  # open3d computes in single precision
@@ -68,8 +67,8 @@ class Surface:
         lit = _dot(eye - p_world, normal) * _dot(lamp - p_world, normal) > 0
         lit &= self._reached(lamp, p_world)
         seen, p_world = seen[lit], p_world[lit]
-        place, inside = _pixels(projector, T_world_projector, p_world)
-        pushed, _ = _pixels(projector, T_world_projector, p_world + _PUSH * distance[seen, None] * direction[seen])
+        place, inside = world_pixels(projector, T_world_projector, p_world)
+        pushed, _ = world_pixels(projector, T_world_projector, p_world + _PUSH * distance[seen, None] * direction[seen])
         moved = pushed - place
         length = np.linalg.norm(moved, axis=1)
         inside &= length > 0
@@ -101,16 +100,6 @@ class Surface:
         rays = np.empty((len(direction), 6), dtype=np.float32)
         rays[:, :3], rays[:, 3:] = (origin - self._centre) * self._scale, direction
         return self._scene.cast_rays(self._tensor(rays))
-
-
-def _pixels(
-    device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "n 3"]
-) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pixels of points, and which of them the device has."""
-    T = inverse(torch.as_tensor(T_world_device, dtype=torch.float64))
-    uv, in_front = project(Intrinsics.of(device, torch.float64), transform(T, torch.from_numpy(p_world)))
-    u, v = uv.numpy().T
-    return uv.numpy(), in_front.numpy() & (u >= 0) & (v >= 0) & (u < device.w) & (v < device.h)
 
 
 def _dot(a: Float[ndarray, "n k"], b: Float[ndarray, "n k"]) -> Float[ndarray, "n"]:

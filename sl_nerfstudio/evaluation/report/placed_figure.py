@@ -15,6 +15,7 @@ from sl_nerfstudio.evaluation.report.view3d import (
     DrawnDevices,
     PlotBox,
     as_json,
+    camera_buttons,
     frustum_length,
     menu,
     view_buttons,
@@ -33,7 +34,7 @@ class _Scene:
     name: str
     traces: list[dict[str, Any]]
     layout: dict[str, Any]  # axes and camera
-    views: list[dict[str, Any]]  # Plotly's cameras: of everything, of the object
+    buttons: list[dict[str, Any]]  # which look at everything, and at the object
 
 
 def placed_figure(
@@ -47,26 +48,18 @@ def placed_figure(
     scenes = [_scene(group, set(undecided), missing, numbers) for group in groups]
     traces = [{**trace, "visible": k == 0} for k, scene in enumerate(scenes) for trace in scene.traces]
     owner = [k for k, scene in enumerate(scenes) for _ in scene.traces]
-    menus = [view_buttons(_view_buttons(scenes[0]))]
+    menus = [view_buttons(scenes[0].buttons)]
     if len(scenes) > 1:
         buttons = [
             {"label": scene.name, "method": "update", "args": [
                 {"visible": [o == k for o in owner]},
-                {**scene.layout, "updatemenus[1].buttons": _view_buttons(scene)},
+                {**scene.layout, "updatemenus[1].buttons": scene.buttons},
             ]}
             for k, scene in enumerate(scenes)
         ]  # fmt: skip
         menus.insert(0, menu(buttons))
     first = {key.removeprefix("scene."): value for key, value in scenes[0].layout.items()}
     return as_json(traces, {"scene": first, "updatemenus": menus})
-
-
-def _view_buttons(scene: _Scene) -> list[dict[str, Any]]:
-    names = ("all devices", "object")
-    return [
-        {"label": name, "method": "relayout", "args": [{"scene.camera": view}]}
-        for name, view in zip(names, scene.views, strict=True)
-    ]
 
 
 def _scene(
@@ -84,10 +77,13 @@ def _scene(
     length = frustum_length(cameras, centre)
     everything = np.concatenate([points, *(d.points(length).reshape(-1, 3) for d in drawn)])
     box = PlotBox.around(everything)
-    views = [box.camera(viewpoint(seen, centre, cameras)) for seen in (everything, points)]
+    views = {
+        label: box.camera(viewpoint(seen, centre, cameras))
+        for label, seen in (("all devices", everything), ("object", points))
+    }
     traces = [_cloud(frames, numbers), *(d.trace(length) for d in drawn), _names(frames, numbers)]
-    layout = {f"scene.{key}": value for key, value in {**box.axes(), "camera": views[0]}.items()}
-    return _Scene(_group_name(group), traces, layout, views)
+    layout = {f"scene.{key}": value for key, value in {**box.axes(), "camera": views["all devices"]}.items()}
+    return _Scene(_group_name(group), traces, layout, camera_buttons(views))
 
 
 def _group_name(group: PlacedGroup) -> str:

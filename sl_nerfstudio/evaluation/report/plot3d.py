@@ -21,6 +21,7 @@ from sl_nerfstudio.evaluation.report.view3d import (
     DrawnDevices,
     PlotBox,
     as_json,
+    camera_buttons,
     frustum_length,
     menu,
     view_buttons,
@@ -112,17 +113,16 @@ def mesh_figure(
     length = frustum_length(poses.stacked(), centre)
     everything = np.concatenate([small.vertices, *(d.points(length).reshape(-1, 3) for d in drawn)])
     box = PlotBox.around(everything)
-    views = [viewpoint(points, centre, poses.T_world_camera) for points in (small.vertices, everything)]
-    buttons = [
-        {"label": name, "method": "relayout", "args": [{"scene.camera": box.camera(view)}]}
-        for name, view in zip(("object", "all devices"), views, strict=True)
-    ]
-    menus = [view_buttons(buttons)]
+    cameras = {
+        label: box.camera(viewpoint(points, centre, poses.T_world_camera))
+        for label, points in (("object", small.vertices), ("all devices", everything))
+    }
+    menus = [view_buttons(camera_buttons(cameras))]
     if len(layers) > 1:
         menus.insert(0, _menu(layers, nearest))
     return as_json(
         [surface, *(d.trace(length) for d in drawn), MEASURED_LINE],
-        {"scene": {**box.axes(), "camera": box.camera(views[0])}, "updatemenus": menus},
+        {"scene": {**box.axes(), "camera": cameras["object"]}, "updatemenus": menus},
     )
 
 

@@ -118,6 +118,13 @@ def menu(buttons: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"buttons": list(buttons), "x": 0, "xanchor": "left", "y": 1, "yanchor": "top", "bgcolor": "white"}
 
 
+def camera_buttons(cameras: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Buttons that look through Plotly's cameras, by their labels."""
+    return [
+        {"label": label, "method": "relayout", "args": [{"scene.camera": camera}]} for label, camera in cameras.items()
+    ]
+
+
 def view_buttons(buttons: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Buttons side by side at the lower right of the view."""
     place = {"x": 1, "xanchor": "right", "y": 0, "yanchor": "bottom", "bgcolor": "white"}

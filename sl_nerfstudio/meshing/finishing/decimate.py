@@ -28,7 +28,7 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
 
     A mesh that has no more stays as it is.
     """
-    import open3d as o3d
+    from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 
     centre, scale = mesh.vertices.mean(0), max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
     fewer = mesh
@@ -56,7 +56,7 @@ def _closest(
     mesh: Mesh, points: Float64[ndarray, "n 3"], centre: Float64[ndarray, "3"], scale: float
 ) -> tuple[Float64[ndarray, "n"], Int64[ndarray, "n"], Int64[ndarray, "n"]]:
     """Distance of points from a surface, the nearest triangle, and which of its corners (0, 1, 2) is nearest."""
-    import open3d as o3d
+    from sl_nerfstudio.geometry.open3d_core import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
     vertices = ((mesh.vertices - centre) / scale).astype(np.float32)
