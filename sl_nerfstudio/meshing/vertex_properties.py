@@ -1,6 +1,6 @@
 """Everything that is written with a vertex beside its place."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -29,6 +29,4 @@ class VertexProperties:
         """Those of vertices that were moved away from the surface: a further error in their uncertainty."""
         q = self.quality
         sigma, independent = (np.hypot(values, distance) for values in (q.sigma, q.sigma_independent))
-        return VertexProperties(
-            VertexQuality(sigma, independent, q.views, q.residual, q.ray_angle), self.invented, self.colour
-        )
+        return replace(self, quality=replace(q, sigma=sigma, sigma_independent=independent))

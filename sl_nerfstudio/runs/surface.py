@@ -1,7 +1,7 @@
 """The surface of a trained run, as an export wants it: observed, filled, cut out, or closed."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -42,7 +42,7 @@ def build_surface(model: TrainedModel, settings: ExportSettings) -> Surface:
     if not settings.largest_component:
         return surface
     pieces = int(surface.marked.mesh.component_of_faces().max(initial=-1)) + 1
-    return Surface(**{**vars(surface), "marked": surface.marked.largest_component(), "other_pieces": pieces - 1})
+    return replace(surface, marked=surface.marked.largest_component(), other_pieces=pieces - 1)
 
 
 def _open_surface(model: TrainedModel, settings: ExportSettings) -> Surface:

@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float64, Int64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.rays import world_pixels
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_properties import GREY
@@ -40,8 +38,8 @@ def surface_tracks(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, scan: Scan,
     uv_camera, uv_projector = np.zeros((len(p_world), 2)), np.zeros((len(p_world), 2))
     for k, frame in enumerate(scan.frames):
         mine = views.frame == k
-        uv_camera[mine] = _pixels(frame.camera, poses.T_world_camera[k], p_world[mine])
-        uv_projector[mine] = _pixels(scan.projector, poses.T_world_projector[k], p_world[mine])
+        uv_camera[mine] = world_pixels(frame.camera, poses.T_world_camera[k], p_world[mine])[0]
+        uv_projector[mine] = world_pixels(scan.projector, poses.T_world_projector[k], p_world[mine])[0]
     rgb = np.full((len(mesh.vertices), 3), GREY, dtype=np.uint8) if colour is None else colour
     return SurfaceTracks(
         mesh.vertices[chosen],
@@ -52,8 +50,3 @@ def surface_tracks(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, scan: Scan,
         uv_projector - views.residual,
         np.linalg.norm(views.residual, axis=1).astype(np.float64),
     )
-
-
-def _pixels(device: Device, T_world_device: Float64[ndarray, "4 4"], p_world: Float64[ndarray, "n 3"]) -> ndarray:
-    T = inverse(torch.from_numpy(T_world_device))
-    return project(Intrinsics.of(device, torch.float64), transform(T, torch.from_numpy(p_world)))[0].numpy()
