@@ -62,14 +62,17 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def parallel(tasks: Sequence[Callable[[], object]]) -> None:
-    """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises."""
+    """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises.
+
+    Tasks may themselves call this: a thread that has not begun when the tasks are done is not waited for.
+    """
     queue = itertools.count()
     others = min(threads(), len(tasks)) - 1
     futures = [_pool(os.getpid()).submit(_work, tasks, queue) for _ in range(others)]
     try:
         _work(tasks, queue)
     finally:
-        errors = [future.exception() for future in futures]
+        errors = [future.exception() for future in futures if not future.cancel()]
     for error in errors:
         if error is not None:
             raise error

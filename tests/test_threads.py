@@ -1,6 +1,8 @@
 """Pieces of work on several threads, and compiled loops cut into pieces."""
 
+import os
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -96,3 +98,24 @@ def test_results_are_in_the_order_of_the_tasks() -> None:
     with torch_threads(4):
         assert results([partial(pow, k, 2) for k in range(50)]) == [k * k for k in range(50)]
         assert results([]) == []
+
+
+def test_tasks_may_have_tasks_of_their_own() -> None:
+    """More than there are threads, at two levels: a thread that waited for another's place would wait for ever."""
+    many = 4 * (os.cpu_count() or 1)
+    found: list[list[int]] = []
+    with torch_threads(many):
+        thread = threading.Thread(target=lambda: found.extend(results([partial(row, many, k) for k in range(many)])))
+        thread.daemon = True
+        thread.start()
+        thread.join(20)
+    assert found == [[many * k + j for j in range(many)] for k in range(many)]
+
+
+def row(many: int, k: int) -> list[int]:
+    return results([partial(product, many * k + j) for j in range(many)])
+
+
+def product(number: int) -> int:
+    time.sleep(0.001)
+    return number

@@ -144,11 +144,8 @@ class SDFField(nn.Module):
         return self._numba
 
     def _buffer(self, state: FieldState) -> TableGradient | None:
-        """The table's persistent gradient buffer, if one is used (compiled kernels, one process)."""
-        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-        if distributed or self._backend(state) is self._torch:
-            return None
-        return TableGradient.of(self.encoding.table)
+        """The table's persistent gradient buffer, if the compiled kernels write to one."""
+        return None if self._backend(state) is self._torch else TableGradient.of(self.encoding.table)
 
 
 def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:

@@ -84,6 +84,12 @@ class TableGradient:
             self._version = self.buffer._version
         return self.marks
 
+    def put(self, marks: Tensor, rows: Tensor, values: Tensor) -> None:
+        """Replace rows; `marks` are those of all rows that may not be zero from now on."""
+        self.buffer[rows] = values
+        self.marks.copy_(marks)
+        self._version = self.buffer._version
+
     def clear(self) -> None:
         """Set the buffer to zero."""
         marks, gradient = self.trusted_marks().numpy(), self.buffer.numpy().reshape(-1)

@@ -9,8 +9,9 @@ from numpy import ndarray
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.connectivity import component_labels
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.meshing.lit_vertices import Occluder
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.visibility import FrameCounts, Occluder, count_frames
+from sl_nerfstudio.meshing.visibility import FrameCounts, count_frames
 from sl_nerfstudio.scan.types import Scan
 
 HOLE_SHARE, UNDECODED_HOLE_SHARE, PIECE_SHARE = 2e-3, 2e-2, 1e-4

@@ -9,9 +9,9 @@ from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.rays import world_pixels
+from sl_nerfstudio.meshing.lit_vertices import Occluder
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_properties import GREY
-from sl_nerfstudio.meshing.visibility import Occluder
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
 

@@ -1,6 +1,7 @@
 """For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,11 +14,13 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.meshing.lit_vertices import Occluder, lit_vertices
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.surface_derivatives import FrameDevices, SurfaceView, view_surface
-from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX, Occluder, visible_vertices
+from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
+from sl_nerfstudio.threads import results, threads
 
 _LOOKED_UP = 2000  # vertices of a frame, to compare the noise of windows with that of pixels
 _FEWEST = 20  # values of which a spread is stated
@@ -68,14 +71,15 @@ def collect_views(
     """All frames that see, light and confirm each vertex (or each of the `chosen` ones).
 
     A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
-    predicts; `task` names the progress. One frame's images are in memory at a time.
+    predicts; `task` names the progress. As many frames' images are in memory at a time as there are threads.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
     points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
     occluder = Occluder(mesh)
-    found = [
-        _views_of(points, normals, occluder, frame, scan, poses, k) for k, frame in enumerate(track(scan.frames, task))
-    ]
+    found: list[_FrameViews] = []
+    for first in track(range(0, len(scan.frames), threads()), task):
+        frames = list(enumerate(scan.frames))[first : first + threads()]
+        found += results([partial(_views_of, points, normals, occluder, frame, scan, poses, k) for k, frame in frames])
     vertex = np.concatenate([f.vertex for f in found])
     order = np.argsort(vertex, kind="stable")
     frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
@@ -106,8 +110,8 @@ def _views_of(
     poses: DevicePoses,
     k: int,
 ) -> _FrameViews:
-    seen = visible_vertices(
-        points, normals, occluder, frame, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k]
+    seen = lit_vertices(
+        points, normals, occluder, frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k]
     ).vertex
     devices, coords = devices_of(scan, poses, k), frame.read_coords()
     view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))

@@ -1,6 +1,6 @@
 """For every vertex of a mesh, how many frames see it, and how many of them confirm or contradict it."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.rays import pixel_rays, world_pixels
+from sl_nerfstudio.meshing.lit_vertices import LitVertices, Occluder, dot, lit_vertices
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
@@ -53,36 +54,6 @@ class FrameCounts:
     def decided(self) -> Bool[ndarray, "v"]:
         """Vertices that need not be checked in further frames."""
         return self.confirmed - self.against >= ENOUGH
-
-
-class Occluder:
-    """Finds out whether a mesh hides its own vertices from a device."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        """`mesh` may be open; both of its sides hide what is behind them."""
-        from sl_nerfstudio.geometry.open3d_core import open3d as o3d
-
-        self._o3d = o3d
-        self._centre = mesh.vertices.mean(0)
-        self._scale = 1 / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
-        self._start = 2 * mesh.edge_length()
-        self._scene = o3d.t.geometry.RaycastingScene()
-        vertices = ((mesh.vertices - self._centre) * self._scale).astype(np.float32)
-        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-
-    def hidden(
-        self, points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]
-    ) -> Bool[ndarray, "n"]:
-        """Whether the mesh is between `eye` and points on the mesh that face `eye`.
-
-        Rays start two edge lengths away from the surface, along the normal and towards the eye, so that they do not hit
-        the triangles they start from.
-        """
-        way = eye - points
-        distance = np.sqrt(_dot(way, way))[:, None]
-        start = points + self._start * (normals + way / distance)
-        rays = np.concatenate([(start - self._centre) * self._scale, (eye - start) * self._scale], 1).astype(np.float32)
-        return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
 def count_frames(
@@ -147,62 +118,41 @@ def visible_vertices(
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
 ) -> VisibleVertices:
-    """The vertices that a frame should see and light, compared with what it decoded.
-
-    They face camera and projector, project into image and pattern, and the mesh hides them from neither.
-    """
-    mask = frame.read_mask()
-    images = _Images(mask, _grown(mask, OFF_MASK_PX), frame.read_coords())
+    """The vertices that a frame should see and light (see `lit_vertices`), compared with what it decoded."""
     devices = (frame.camera, projector, T_world_camera, T_world_projector)
+    lit = lit_vertices(vertices, normals, occluder, *devices)
+    mask, coords = frame.read_mask(), frame.read_coords()
+    on_mask, around_mask = _look_up(mask, lit.uv_camera), _look_up(_grown(mask, OFF_MASK_PX), lit.uv_camera)
+    least, most = np.full((2, len(lit.vertex)), np.nan)
+    compared = np.flatnonzero(on_mask)
     parts = results(
         [
-            partial(_visible_part, vertices, normals, np.arange(first, last), occluder, images, *devices)
-            for first, last in split(len(vertices), threads(), 1)
+            partial(_compared, vertices, normals, lit, compared[first:last], coords, *devices)
+            for first, last in split(len(compared), threads(), 1)
         ]
     )
-    return VisibleVertices(
-        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(VisibleVertices))
-    )
+    least[compared], most[compared] = np.concatenate(parts, 1)
+    return VisibleVertices(lit.vertex, ~around_mask, around_mask & ~on_mask, least, most)
 
 
-@dataclass(frozen=True)
-class _Images:
-    """What a frame decoded, and where."""
-
-    mask: Bool[ndarray, "h w"]
-    grown_mask: Bool[ndarray, "h w"]
-    coords: Float[ndarray, "h w 2"]
-
-
-def _visible_part(
+def _compared(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
-    vertex: Int64[ndarray, "n"],
-    occluder: Occluder,
-    images: _Images,
+    lit: LitVertices,
+    part: Int64[ndarray, "n"],
+    coords: Float[ndarray, "h w 2"],
     camera: Device,
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> VisibleVertices:
-    """The same for the vertices numbered `vertex`."""
-    for T in (T_world_camera, T_world_projector):
-        vertex = vertex[_faces(vertices[vertex], normals[vertex], T)]
-    uv_camera, inside = world_pixels(camera, T_world_camera, vertices[vertex])
-    vertex, uv_camera = vertex[inside], uv_camera[inside]
-    uv_projector, inside = world_pixels(projector, T_world_projector, vertices[vertex])
-    vertex, uv_camera, uv_projector = vertex[inside], uv_camera[inside], uv_projector[inside]
-    for T in (T_world_camera, T_world_projector):
-        free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
-        vertex, uv_camera, uv_projector = vertex[free], uv_camera[free], uv_projector[free]
-    on_mask, around_mask = _look_up(images.mask, uv_camera), _look_up(images.grown_mask, uv_camera)
-    least, most = np.full((2, len(vertex)), np.nan)
-    lit, uv_camera, uv_projector = vertex[on_mask], uv_camera[on_mask], uv_projector[on_mask]
+) -> Float[ndarray, "2 n"]:
+    """Bounds of the distance between predicted and decoded coordinates, for a part of the lit vertices."""
+    vertex, uv_camera, uv_projector = lit.vertex[part], lit.uv_camera[part], lit.uv_projector[part]
     jacobian = _jacobian(
-        vertices[lit], normals[lit], uv_camera, uv_projector, camera, T_world_camera, projector, T_world_projector
+        *(vertices[vertex], normals[vertex], uv_camera, uv_projector),
+        *(camera, T_world_camera, projector, T_world_projector),
     )
-    least[on_mask], most[on_mask] = _offset_from_decoded(images.coords, uv_camera, uv_projector, jacobian)
-    return VisibleVertices(vertex, ~around_mask, around_mask & ~on_mask, least, most)
+    return np.stack(_offset_from_decoded(coords, uv_camera, uv_projector, jacobian))
 
 
 def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:
@@ -212,17 +162,6 @@ def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:
 def _look_up(mask: Bool[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Bool[ndarray, "n"]:
     pixel = np.floor(uv).astype(np.int64)
     return mask[pixel[:, 1], pixel[:, 0]]
-
-
-def _faces(
-    points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"]
-) -> Bool[ndarray, "n"]:
-    return _dot(T[:3, 3] - points, normals) > 0
-
-
-def _dot(a: Float[ndarray, "n k"], b: Float[ndarray, "n k"]) -> Float[ndarray, "n"]:
-    """Dot products of rows; `(a * b).sum(1)` takes five times as long."""
-    return np.einsum("nk,nk->n", a, b)
 
 
 def _jacobian(
@@ -241,8 +180,8 @@ def _jacobian(
         uv = torch.from_numpy(uv_camera + step)
         origin, direction = pixel_rays(Intrinsics.of(camera, torch.float64), torch.from_numpy(T_world_camera), uv)
         o, d = origin.numpy(), direction.numpy()
-        towards = _dot(d, normals)
-        distance = _dot(points - o, normals) / np.where(towards < 0, towards, -1e-12)
+        towards = dot(d, normals)
+        distance = dot(points - o, normals) / np.where(towards < 0, towards, -1e-12)
         there, _ = world_pixels(projector, T_world_projector, o + distance[:, None] * d)
         columns.append((there - uv_projector).clip(-MOST_PX, MOST_PX))
     return np.stack(columns, -1)

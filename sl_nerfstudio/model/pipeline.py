@@ -54,20 +54,24 @@ class SLPipelineConfig(VanillaPipelineConfig):
 
 
 class SLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline with four differences.
+    """nerfstudio's pipeline with five differences.
 
     - The random numbers of a training step depend only on the seed and the step: a resumed run continues as an
       uninterrupted one would.
     - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
     - The viewer shows the scan (viewer/), and at the end of training the next commands are printed.
+    - Several processes average their gradients without DistributedDataParallel (training/shared_training.py).
     """
 
     config: SLPipelineConfig
     datamanager: SLDataManager
 
-    def __init__(self, config: SLPipelineConfig, device: str | torch.device, **kwargs: Any) -> None:
-        super().__init__(config, str(device), **kwargs)
+    def __init__(
+        self, config: SLPipelineConfig, device: str | torch.device, world_size: int = 1, **kwargs: Any
+    ) -> None:
+        super().__init__(config, str(device), world_size=1, **kwargs)
+        self.world_size = world_size
         self._seed = torch.initial_seed()
         self.register_buffer(SCAN_KEY, as_tensor(config.scan_fingerprint))
         self.register_buffer(SETTINGS_KEY, as_tensor(config.settings_fingerprint))

@@ -9,10 +9,12 @@ from typing import Literal
 import torch
 import tyro
 import yaml
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sl_nerfstudio.console import short_path
+from sl_nerfstudio.cores import cores
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
 from sl_nerfstudio.dataparser.fingerprint import require_same_scan
 from sl_nerfstudio.errors import UserError
@@ -26,6 +28,7 @@ from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.training.checkpoints import Checkpoint, checkpoints_in, find_checkpoint, read_checkpoint
 from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION
+from sl_nerfstudio.model.training.launching import launch_well
 from sl_nerfstudio.model.training.loop import SLTrainer
 from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
@@ -65,6 +68,8 @@ class SLTrainerConfig(TrainerConfig):
         quiet_nerfstudio(not self.verbose)
         if self.machine.num_devices * self.machine.num_machines == 1:
             INTERRUPTION.install()
+        else:
+            launch_well()
         try:
             begun = self._continue() if self.last_step is not None else self.prepare()
             super().set_timestamp()
@@ -81,7 +86,7 @@ class SLTrainerConfig(TrainerConfig):
         """
         root = self._scan_root()
         self._require_flags()
-        _require_device(self.machine.device_type)
+        _require_devices(self.machine)
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
         with phase("check") as check:
@@ -246,12 +251,19 @@ def default_device() -> Literal["cpu", "cuda"]:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _require_device(device_type: str) -> None:
-    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not available[device_type]:
+def _require_devices(machine: MachineConfig) -> None:
+    """Raise UserError unless this machine has the devices that are asked for."""
+    kind, count = machine.device_type, machine.num_devices
+    available = {"cpu": cores(), "cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available())}
+    if not available[kind]:
         raise UserError(
-            f"--machine.device-type {device_type}: torch {torch.__version__} finds no such device on this machine. "
+            f"--machine.device-type {kind}: torch {torch.__version__} finds no such device on this machine. "
             "Leave the option out to train on an available device."
+        )
+    if not 1 <= count <= available[kind]:
+        unit = "cores" if kind == "cpu" else f"devices of type {kind}"
+        raise UserError(
+            f"--machine.num-devices {count}: this machine has {available[kind]} {unit}; give 1 to that many"
         )
 
 

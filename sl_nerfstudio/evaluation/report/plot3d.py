@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.report.colour_layers import ColourLayer
 from sl_nerfstudio.evaluation.report.pictures import CLAY
 from sl_nerfstudio.evaluation.report.view3d import (
@@ -74,8 +73,8 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
         o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
     )
     if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
-        cell = float(np.sqrt(IndexedMesh(mesh).area / (2 * most))) / size
-        plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Quadric)
+        cell = float(np.sqrt(mesh.face_areas().sum() / most)) / size
+        plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Average)
     small = plain.simplify_quadric_decimation(most)
     vertices = np.asarray(small.vertices) * size + centre
     used = np.unique(mesh.faces)

@@ -53,6 +53,15 @@ class Interruption:
         self._held = False
         self._raise_received()
 
+    @property
+    def received(self) -> int:
+        """Number of the first signal; 0 if there was none."""
+        return self._received or 0
+
+    def receive(self, number: int) -> None:
+        """Count a signal that another process of this training received."""
+        self._received = number or self._received
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Let a signal wait for the end of the block, or of the block around it."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, cast
 
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 
@@ -17,6 +18,7 @@ from sl_nerfstudio.model.training.checkpoints import SCHEDULE_KEY, checkpoint_na
 from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
 from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
+from sl_nerfstudio.model.training.shared_training import greatest, several, share_state, shared_optimizers
 from sl_nerfstudio.progress import Phase, phase
 from sl_nerfstudio.threads import one_library_thread
 
@@ -24,10 +26,11 @@ if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel
 
 LEAST_STEPS = 100  # between two checkpoints that are written because of the time
+_STEPS_PER_AGREEMENT = 10  # of several processes on whether to stop: each agreement waits for all of them
 
 
 class SLTrainer(Trainer):
-    """nerfstudio's trainer with six differences.
+    """nerfstudio's trainer with seven differences.
 
     - Poses are adjusted before the first step, whose time would otherwise include it, and saved.
     - Each phase prints one line, with a bar or the time left while it runs; nerfstudio itself is quiet.
@@ -37,6 +40,8 @@ class SLTrainer(Trainer):
     - A checkpoint that does not fit the model gives a message.
     - When the schedule has ended, the optimisers forget their moments, two thirds of a checkpoint: what goes on from
       there, at once or later, starts with new ones.
+    - Several processes take the same steps, along the mean of their gradients. The main one adjusts the poses; all stop
+      together.
     """
 
     config: Any
@@ -47,6 +52,8 @@ class SLTrainer(Trainer):
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         quiet_nerfstudio(not config.verbose)  # also in the processes of several GPUs
         super().__init__(config, local_rank, world_size)
+        if several() and comms.is_main_process():
+            INTERRUPTION.install()  # a process alone did so when it checked its settings
         self._phases = ExitStack()
         self._training = Phase("train")
 
@@ -56,6 +63,12 @@ class SLTrainer(Trainer):
             super().setup(test_mode)
         for line in getattr(self.viewer_state, "viewer_info", []):
             print(paragraph("viewer", line), flush=True)
+
+    def setup_optimizers(self) -> Optimizers:
+        """Make the optimisers; see nerfstudio's Trainer."""
+        if several():
+            return shared_optimizers(self.config.optimizers, self.pipeline.get_param_groups())
+        return super().setup_optimizers()
 
     def train(self) -> None:
         """Train; see nerfstudio's Trainer. If interrupted, save what has been trained and say how to go on."""
@@ -74,9 +87,11 @@ class SLTrainer(Trainer):
     def _init_viewer_state(self) -> None:
         """Show the scene and adjust the poses: nerfstudio calls this last before the first step."""
         super()._init_viewer_state()
-        if self._start_step == 0 and self.config.load_checkpoint is None:
+        if self._start_step == 0 and self.config.load_checkpoint is None and comms.is_main_process():
             with self.train_lock:
                 self._adjust_poses()
+        if several():
+            share_state(self._model)
         self._training = self._phases.enter_context(_shown_phase("train"))
 
     def _adjust_poses(self) -> None:
@@ -111,7 +126,11 @@ class SLTrainer(Trainer):
         since = step - (self._start_step - 1 if saved is None else saved)
         if since >= LEAST_STEPS and time.monotonic() - when >= self.config.seconds_per_save:
             self.save_checkpoint(step)
-        INTERRUPTION.release()
+        if not several():
+            INTERRUPTION.release()
+        elif step % _STEPS_PER_AGREEMENT == 0:
+            INTERRUPTION.receive(greatest(INTERRUPTION.received, self.device))
+            INTERRUPTION.release()
 
     def save_checkpoint(self, step: int) -> None:
         """Write weights and optimisers after a step; -1: before the first one."""
@@ -179,10 +198,14 @@ class SLTrainer(Trainer):
             if self._done is not None and self._done != self._saved[0]:
                 self.save_checkpoint(self._done)
             assert self.config.method_name is not None
-            print(f"to go on: {go_on_command(self.config.method_name, self.base_dir)}", file=sys.stderr)
+            if comms.is_main_process():
+                print(f"to go on: {go_on_command(self.config.method_name, self.base_dir)}", file=sys.stderr, flush=True)
+            if several() and self._done is not None:
+                comms.synchronize()  # a process that ends earlier ends the others
             raise
         except UserError as error:
-            print(f"error: {error}", file=sys.stderr)
+            if comms.is_main_process():
+                print(f"error: {error}", file=sys.stderr, flush=True)
             raise SystemExit(1) from None
 
     def _leave_folder(self) -> None:
