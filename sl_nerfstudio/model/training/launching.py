@@ -49,7 +49,9 @@ def launch(
     ranks = (num_devices_per_machine, num_machines, machine_rank)
     context = mp.spawn(_work, (main_func, *ranks, url, config, device_type), nprocs=num_devices_per_machine, join=False)
     assert context is not None
-    with _signals_forwarded_to(context.processes[0]) as received:
+    first = context.processes[0]
+    assert first is not None
+    with _signals_forwarded_to(first) as received:
         try:
             while not context.join():
                 pass

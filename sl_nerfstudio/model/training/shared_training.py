@@ -13,7 +13,7 @@ import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import comms
 from torch import Tensor, nn
-from torch.amp.grad_scaler import GradScaler
+from torch.cuda.amp.grad_scaler import GradScaler
 
 from sl_nerfstudio.field.table_gradient import TableGradient
 
