@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
+from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, of_one_frame
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, rough_weight
@@ -145,8 +145,6 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
     """Move frame k alone, first as a whole, then its projector too; returns the rig and the frame's support in it."""
     settings, n = problem.settings, rig.frames
     s = settings.relocalisation
-    B = torch.zeros(12 * n, 12, dtype=torch.float64)
-    B[6 * k : 6 * k + 6, :6] = B[6 * (n + k) : 6 * (n + k) + 6, 6:] = torch.eye(6, dtype=torch.float64)
     allowed = placed.clone()
     allowed[k] = True
     width = torch.full((n,), float("inf"), dtype=torch.float64)
@@ -166,7 +164,7 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
         weight = rough_weight(problem.noise, residuals, settings.independent_residuals)
         term = PriorTerm(problem.prior, problem.start, weight)
         kernel = Kernel(width, problem.anchors.frame, pair)
-        free = B[:, :6] if step < s.frame_steps else B
+        free = of_one_frame(k, n, with_projector=step >= s.frame_steps)
         state = lm_step(state, linear, rows, problem.maps, kernel, term, free, settings.steps)
     support = problem.support(state.rig, _rows_of(state.rig, k, allowed, problem))[k]
     return state.rig, float(support.nan_to_num())
