@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
-from sl_nerfstudio.bundle_adjustment.windows import WindowMemory, look_up_windows
+from sl_nerfstudio.bundle_adjustment.loops.drawing import draw_pixels
+from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory, look_up_windows
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,14 @@ class MapSample:
     uv_projector: Float[Tensor, "n 2"]
     jacobian: Float[Tensor, "n 2 2"]  # d uv_projector / d uv_camera
     valid: Bool[Tensor, "n"]  # enough decoded pixels, and a paraboloid fits them
+
+
+@dataclass(frozen=True)
+class DrawnPixels:
+    """Centres of some pixels of some frames."""
+
+    frame: Int[Tensor, "n"]
+    uv_camera: Float[Tensor, "n 2"]
 
 
 @dataclass(frozen=True)
@@ -59,22 +69,19 @@ class CoordinateMaps:
         """Number of frames."""
         return len(self.offsets)
 
-    def draw(self, frame: int, count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
-        """Up to `count` random decoded pixel centres of a frame, one for each occupied square of a lattice."""
-        w, h = int(self.widths[frame]), int(self.heights[frame])
-        start = int(self.offsets[frame])
-        decoded = torch.isfinite(self.values[start : start + w * h, 0]).nonzero().squeeze(-1)
-        if len(decoded) == 0:
-            return torch.zeros(0, 2, dtype=torch.float64)
-        step = max(1, int((len(decoded) / count) ** 0.5))
-        decoded = decoded[torch.randperm(len(decoded), generator=generator)]
-        square = decoded // w // step * (w // step + 1) + decoded % w // step
-        order = torch.argsort(square, stable=True)
-        first = torch.ones(len(order), dtype=torch.bool)
-        first[1:] = square[order][1:] != square[order][:-1]
-        chosen = decoded[order[first]]
-        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:count]]
-        return torch.stack([chosen % w + 0.5, chosen // w + 0.5], -1).double()
+    def draw(self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator) -> "DrawnPixels":
+        """Up to `count` random decoded pixel centres of each of some frames, one of each occupied square of a lattice."""
+        pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
+        draw_pixels(len(frames), frames.numpy(), *self.arrays, seed_from(generator), pixels, counts)
+        frame = torch.repeat_interleave(frames, torch.from_numpy(counts))
+        pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
+        w = self.widths[frame]
+        return DrawnPixels(frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double())
+
+    @property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """For compiled loops: values, offsets, widths, heights."""
+        return self.values.numpy(), self.offsets.numpy(), self.widths.numpy(), self.heights.numpy()
 
     def look_up(
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory | None = None
@@ -95,10 +102,7 @@ class CoordinateMaps:
         fit, roughness = np.zeros((n, 3, 2)), np.full(n, np.inf)
         look_up_windows(
             n,
-            self.values.numpy(),
-            self.offsets.numpy(),
-            self.widths.numpy(),
-            self.heights.numpy(),
+            *self.arrays,
             frame.numpy(),
             uv_camera.detach().double().numpy(),
             (self.settings.half_window, self.settings.least_pixels, self.settings.least_pivot),
@@ -111,16 +115,12 @@ class CoordinateMaps:
     def _median_roughness(self) -> float:
         """Median roughness of windows all over the frames; 0 if nothing is decoded."""
         generator = torch.Generator().manual_seed(0)
-        drawn = [self.draw(k, self.settings.sampled_windows, generator) for k in range(self.frames)]
-        frame = torch.repeat_interleave(torch.arange(self.frames), torch.tensor([len(d) for d in drawn]))
-        _, roughness = self._fit(frame, torch.cat(drawn), WindowMemory.empty(len(frame)))
+        drawn = self.draw(torch.arange(self.frames), self.settings.sampled_windows, generator)
+        _, roughness = self._fit(drawn.frame, drawn.uv_camera, WindowMemory.empty(len(drawn.frame)))
         found = roughness[torch.isfinite(roughness)]
         return float(found.median()) if len(found) else 0.0
 
-    def decoded_at(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """The decoded coordinate of the pixel under each position; NaN outside the image."""
-        w, h, start = self.widths[frame], self.heights[frame], self.offsets[frame]
-        inside = (uv_camera >= 0).all(-1) & (uv_camera[:, 0] < w) & (uv_camera[:, 1] < h)
-        uv = torch.where(inside[:, None], uv_camera, torch.zeros_like(uv_camera)).long()
-        found = self.values[start + uv[:, 1] * w + uv[:, 0]].double()
-        return torch.where(inside[:, None], found, torch.full_like(found, float("nan")))
+
+def seed_from(generator: torch.Generator) -> int:
+    """A new seed for choices in compiled loops."""
+    return int(torch.randint(2**62, (), generator=generator))

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.grouping import Groups
+from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
 from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, NormalEquations, normal_equations
-from sl_nerfstudio.bundle_adjustment.normal_loops import block_sums
+from sl_nerfstudio.bundle_adjustment.loops.normal_equations import block_sums
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, array, pixels_of_rows
 from sl_nerfstudio.bundle_adjustment.rig import Rig

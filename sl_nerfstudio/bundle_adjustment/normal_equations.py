@@ -12,8 +12,8 @@ from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.grouping import Groups
-from sl_nerfstudio.bundle_adjustment.normal_loops import depth_couplings, depth_steps, frame_sums
+from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
+from sl_nerfstudio.bundle_adjustment.loops.normal_equations import depth_couplings, depth_steps, frame_sums, mirror
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Observations, array
 
 Sums = tuple[ndarray, ndarray, ndarray, ndarray]
@@ -83,14 +83,15 @@ def normal_equations(
     slot = np.full(frames, -1)
     slot[frame_of] = np.arange(len(frame_of))
     m = len(frame_of)
-    H, g, border = np.zeros((m, 12, m, 12)), np.zeros((m, 12)), np.zeros((m, 12, common))
+    H, g, border = np.zeros((12 * m, 12 * m)), np.zeros((m, 12)), np.zeros((m, 12, common))
     groups = [Groups.of(frame, frames), Groups.of(viewer, frames), depths.rows]
     frame_sums(
         m, frame_of, slot, tuple(part for group in groups for part in (group.first, group.entries)),
         (anchor, source, viewer), own, cross, depths.arrays, H, g, border,
     )  # fmt: skip
+    mirror(m, H)
     H_common, g_common = _of_common(own, cross, depths)
-    return NormalEquations(*(torch.from_numpy(part) for part in (H, g, border, H_common, g_common)), depths)
+    return NormalEquations(*(torch.from_numpy(part) for part in (H.reshape(m, 12, m, 12), g, border, H_common, g_common)), depths)
 
 
 def _couplings(

@@ -40,11 +40,11 @@ class _Problem:
         return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
-        """See _every_row."""
-        return _every_row(rig, self.anchors, self.maps, self.settings, self.generator, around)
+        """See _rows_of_all."""
+        return _rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
 
 
-def _every_row(
+def _rows_of_all(
     rig: Rig,
     anchors: Anchors,
     maps: CoordinateMaps,
@@ -52,8 +52,9 @@ def _every_row(
     generator: torch.Generator,
     around: int | None = None,
 ) -> Observations:
-    """Every anchor in every other frame that may see it."""
-    return observe(rig, anchors, maps, rig.frames, float("inf"), settings.least_cosine, generator, around)
+    """Every anchor in other frames that may see it."""
+    most = settings.relocalisation.frames_per_anchor
+    return observe(rig, anchors, maps, most, float("inf"), settings.least_cosine, generator, around)
 
 
 def support_of(
@@ -61,20 +62,19 @@ def support_of(
 ) -> Float[Tensor, "frames"]:
     """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
     r = residuals_of(rig, anchors, rows, maps)
-    inlier = r.cross.norm(dim=-1) < within_px
-    out = torch.full((rig.frames,), float("nan"), dtype=torch.float64)
-    for k in range(rig.frames):
-        mine = r.cross_valid & ((anchors.frame[rows.anchor] == k) | (rows.frame == k))
-        if mine.any():
-            out[k] = inlier[mine].double().mean()
-    return out
+    inlier = r.cross_valid & (r.cross.norm(dim=-1) < within_px)
+    counts = torch.zeros(2, rig.frames, dtype=torch.float64)
+    for frame in rows.pairs(anchors):
+        for k, counted in enumerate((inlier, r.cross_valid)):
+            counts[k] += torch.bincount(frame[counted], minlength=rig.frames)
+    return counts[0] / counts[1]
 
 
 def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
     """Frames that see too little of the surface on which the others agree, in order."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = _every_row(rig, anchors, maps, settings, generator)
+    rows = _rows_of_all(rig, anchors, maps, settings, generator)
     support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
     wrong = support.isnan() | (support < s.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())

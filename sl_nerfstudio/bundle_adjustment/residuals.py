@@ -25,9 +25,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residual_loops import cross_residuals, device_arrays, own_residuals, positions
+from sl_nerfstudio.bundle_adjustment.loops.residuals import cross_residuals, own_residuals, positions
+from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.windows import WindowMemory
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def pixels_of_rows(
     n = len(observations.anchor)
     uv, in_front = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
     rows = (array(observations.anchor), array(observations.frame))
-    positions(n, device_arrays(rig), *_anchor_arrays(anchors), *rows, uv, in_front)
+    positions(n, rig.arrays, *_anchor_arrays(anchors), *rows, uv, in_front)
     return torch.from_numpy(uv), torch.from_numpy(in_front)
 
 
@@ -134,7 +134,7 @@ def _residuals(
 ) -> Residuals:
     """Residuals; their derivatives are written to arrays that are not empty."""
     own_by_pose, own_by_depth, by_pose, by_depth = (part.numpy() for part in derivatives)
-    devices, points = device_arrays(rig), _anchor_arrays(anchors)
+    devices, points = rig.arrays, _anchor_arrays(anchors)
     own = np.empty((len(anchors.frame), 2))
     own_residuals(len(own), devices, *points, array(anchors.uv_projector), own, own_by_pose, own_by_depth)
     uv, in_front = pixels_of_rows(rig, anchors, observations)

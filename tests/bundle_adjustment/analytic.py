@@ -137,6 +137,12 @@ def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03
     return rig.moved(x[0] * size, x[1] * size * relative)
 
 
+def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:
+    """The decoded coordinates of pixels inside the images."""
+    pixel = uv.long()
+    return maps.values[maps.offsets[frame] + pixel[:, 1] * maps.widths[frame] + pixel[:, 0]].double()
+
+
 def dense(equations: NormalEquations) -> tuple[Tensor, Tensor]:
     """Matrix and gradient by delta of all frames, then rho of all frames."""
     size, frames = equations.g.numel(), len(equations.g)

@@ -77,7 +77,7 @@ def adjusted(
         true, camera=changed(true.camera, camera_change), projector=changed(true.projector, projector_change)
     )
     parts = (torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.03, 0.02, 0.05, 0.02))
-    settings = AdjustmentSettings(anchors_per_frame=60, frames_per_anchor=3, max_iterations=14)
+    settings = AdjustmentSettings(anchors_per_frame=120, frames_per_anchor=3, max_iterations=14)
     return adjust(stated, ExactMaps.around(true, SIZE), PosePrior(*parts, sigma, refined), "free", settings)
 
 

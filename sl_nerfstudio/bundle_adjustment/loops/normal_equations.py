@@ -45,36 +45,53 @@ def depth_couplings(first, last, by_anchor, own, cross, depth_by_own, depth_by_r
 
 
 @compiled
-def _add(block, w, J, i, ni, K, k, nk, x0, y0):
-    """block[x0 + x, y0 + y] += w J[:, i + x] . K[:, k + y] for x < ni, y < nk."""
-    for x in range(ni):
-        a, b = w * J[0, i + x], w * J[1, i + x]
-        for y in range(nk):
-            block[x0 + x, y0 + y] += a * K[0, k + y] + b * K[1, k + y]
+def _add(H, x0, y0, w, J, first, K, second, width):
+    """H[x0 + x, y0 + y] += w J[:, first + x] . K[:, second + y] for x < 6 and y < width."""
+    for x in range(6):
+        a, b = w * J[0, first + x], w * J[1, first + x]
+        row = H[x0 + x]
+        for y in range(width):
+            row[y0 + y] += a * K[0, second + y] + b * K[1, second + y]
 
 
 @compiled
-def _subtract(block, scale, v, u):
-    """block -= scale v u^T."""
-    for x in range(len(v)):
-        a = scale * v[x]
+def _subtract(H, x0, y0, scale, v, u):
+    """H[x0 : x0 + 12, y0 : y0 + 12] -= scale v u^T."""
+    for x in range(12):
+        a, row = scale * v[x], H[x0 + x]
+        for y in range(12):
+            row[y0 + y] -= a * u[y]
+
+
+@compiled
+def _subtract_common(border, g, scale, v, u, u_g):
+    """The same for the columns of common unknowns and for the gradient."""
+    for x in range(12):
+        g[x] -= scale * v[x] * u_g
         for y in range(len(u)):
-            block[x, y] -= a * u[y]
+            border[x, y] -= scale * v[x] * u[y]
 
 
 @compiled
-def _add_to_gradient(g, w, J, i, n, r, x0):
+def _add_to_gradient(g, w, J, first, n, r, x0):
     for x in range(n):
-        g[x0 + x] += w * (J[0, i + x] * r[0] + J[1, i + x] * r[1])
+        g[x0 + x] += w * (J[0, first + x] * r[0] + J[1, first + x] * r[1])
+
+
+@compiled
+def _own_side(s, t):
+    """Whether s, rather than t, sums the block that couples both: about half of its partners for each."""
+    return t >= 0 and (s == t or (s < t) == ((s + t) % 2 == 1))
 
 
 @compiled_range
 def frame_sums(first, last, chosen, slot, groups, rows, own, cross, couplings, H, g, border):
-    """The rows of H, of the gradient and of `border` (by common unknowns) that belong to some of the chosen frames.
+    """What some of the chosen frames add to H, to the gradient and to `border` (by common unknowns).
 
-    `H[s, x, t, y]` couples unknown x of chosen frame s with y of t; `slot` gives the number of a frame among the
-    chosen, or -1. `groups` are the anchors of each frame, its rows as seeing frame, and the rows of each anchor; `rows`
-    the anchor and the two frames of each row. Depths are eliminated.
+    `H[12 s + x, 12 t + y]` couples unknown x of chosen frame s with y of t; only one of the blocks (s, t) and (t, s) is
+    written (see `mirror`). `slot` gives the number of a frame among the chosen, or -1. `groups` are the anchors of each
+    frame, its rows as seeing frame, and the rows of each anchor; `rows` the anchor and the two frames of each row.
+    Depths are eliminated.
     """
     anchor_first, anchor_entries, seen_first, seen_entries, row_first, row_entries = groups
     anchor, source, viewer = rows
@@ -83,47 +100,57 @@ def frame_sums(first, last, chosen, slot, groups, rows, own, cross, couplings, H
     by_own, by_row, by_common, H_depth, g_depth = couplings
     common = border.shape[2]
     for s in range(first, last):
-        f = chosen[s]
+        f, at = chosen[s], 12 * s
         for e in range(anchor_first[f], anchor_first[f + 1]):
             a = anchor_entries[e]
             scale, v = 1 / H_depth[a], by_own[a]
-            _add(H[s, :, s], w_own[a], J_own[a], 0, 6, J_own[a], 0, 6, 6, 6)
-            _add(border[s], w_own[a], J_own[a], 0, 6, J_own[a], 6, common, 6, 0)
+            _add(H, at + 6, at + 6, w_own[a], J_own[a], 0, J_own[a], 0, 6)
+            _add(border[s], 6, 0, w_own[a], J_own[a], 0, J_own[a], 6, common)
             _add_to_gradient(g[s], w_own[a], J_own[a], 0, 6, r_own[a], 6)
-            for x in range(12):
-                g[s, x] -= scale * v[x] * g_depth[a]
-            _subtract(H[s, :, s], scale, v, v)
-            _subtract(border[s], scale, v, by_common[a])
+            _subtract(H, at, at, scale, v, v)
+            _subtract_common(border[s], g[s], scale, v, by_common[a], g_depth[a])
             for k in range(row_first[a], row_first[a + 1]):
                 n = row_entries[k]
                 if w_cross[n] > 0:
                     J = J_cross[n]
-                    _add(H[s, :, s], w_cross[n], J, 0, 6, J, 0, 6, 0, 0)
-                    _add(border[s], w_cross[n], J, 0, 6, J, 18, common, 0, 0)
+                    _add(H, at, at, w_cross[n], J, 0, J, 0, 6)
+                    _add(border[s], 0, 0, w_cross[n], J, 0, J, 18, common)
                     _add_to_gradient(g[s], w_cross[n], J, 0, 6, r_cross[n], 0)
                     t = slot[viewer[n]]
-                    if t >= 0:
-                        _add(H[s, :, t], w_cross[n], J, 0, 6, J, 6, 12, 0, 0)
-                        _subtract(H[s, :, t], scale, v, by_row[n])
+                    if _own_side(s, t):
+                        _add(H, at, 12 * t, w_cross[n], J, 0, J, 6, 12)
+                        _subtract(H, at, 12 * t, scale, v, by_row[n])
         for e in range(seen_first[f], seen_first[f + 1]):
             n = seen_entries[e]
             if not w_cross[n] > 0:
                 continue
             a, J, v = anchor[n], J_cross[n], by_row[n]
             scale, t = 1 / H_depth[a], slot[source[n]]
-            _add(H[s, :, s], w_cross[n], J, 6, 12, J, 6, 12, 0, 0)
-            _add(border[s], w_cross[n], J, 6, 12, J, 18, common, 0, 0)
+            for half in (0, 6):
+                _add(H, at + half, at, w_cross[n], J, 6 + half, J, 6, 12)
+                _add(border[s], half, 0, w_cross[n], J, 6 + half, J, 18, common)
             _add_to_gradient(g[s], w_cross[n], J, 6, 12, r_cross[n], 0)
-            for x in range(12):
-                g[s, x] -= scale * v[x] * g_depth[a]
-            _subtract(border[s], scale, v, by_common[a])
-            if t >= 0:
-                _add(H[s, :, t], w_cross[n], J, 6, 12, J, 0, 6, 0, 0)
-                _subtract(H[s, :, t], scale, v, by_own[a])
+            _subtract_common(border[s], g[s], scale, v, by_common[a], g_depth[a])
+            if _own_side(s, t):
+                for half in (0, 6):
+                    _add(H, at + half, 12 * t, w_cross[n], J, 6 + half, J, 0, 6)
+                _subtract(H, at, 12 * t, scale, v, by_own[a])
             for k in range(row_first[a], row_first[a + 1]):
-                t = slot[viewer[row_entries[k]]]
-                if t >= 0 and w_cross[row_entries[k]] > 0:
-                    _subtract(H[s, :, t], scale, v, by_row[row_entries[k]])
+                m = row_entries[k]
+                t = slot[viewer[m]]
+                if w_cross[m] > 0 and _own_side(s, t):
+                    _subtract(H, at, 12 * t, scale, v, by_row[m])
+
+
+@compiled_range
+def mirror(first, last, H):
+    """The blocks that `frame_sums` left out, of some frames."""
+    for s in range(first, last):
+        for t in range(H.shape[0] // 12):
+            if not _own_side(s, t):
+                for x in range(12):
+                    for y in range(12):
+                        H[12 * s + x, 12 * t + y] = H[12 * t + y, 12 * s + x]
 
 
 @compiled_range

@@ -1,54 +1,13 @@
-"""Residuals of the bundle adjustment and their derivatives, in compiled loops; `residuals` says what they are.
+"""Residuals and their derivatives; `bundle_adjustment/residuals.py` says what they are.
 
-`devices` are the arrays of a rig (`device_arrays`): poses of the cameras in the world, their inverses, those of the
+`devices` are a rig's arrays (`Rig.arrays`): poses of the cameras in the world, their inverses, those of the
 cameras in their projectors, and parameters and model codes of cameras and projector. Arrays for derivatives may be
 empty: then none are computed.
 """
 
-import numpy as np
-from numpy import ndarray
-
-from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.compiled_view import view_of
-from sl_nerfstudio.geometry.devices.models import MODELS
-from sl_nerfstudio.geometry.se3 import inverse
-
-
-def device_arrays(rig: Rig) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
-    """The rig for the loops of this module."""
-    T_world_camera, T_camera_world, T_projector_camera, cameras = (
-        np.ascontiguousarray(tensor.numpy())
-        for tensor in (
-            rig.T_world_camera,
-            inverse(rig.T_world_camera),
-            inverse(rig.T_camera_projector),
-            rig.camera.params,
-        )
-    )
-    projector = np.ascontiguousarray(rig.projector.params.numpy())
-    codes = MODELS[rig.camera.model].code, MODELS[rig.projector.model].code
-    return T_world_camera, T_camera_world, T_projector_camera, cameras, codes[0], projector, codes[1]
-
-
-@compiled
-def _moved(T, x, y, z):
-    """A point under a rigid motion."""
-    return (
-        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-    )
-
-
-@compiled
-def _row_times(T, a, b, c):
-    """A row vector times the rotation of a rigid motion."""
-    return (
-        a * T[0, 0] + b * T[1, 0] + c * T[2, 0],
-        a * T[0, 1] + b * T[1, 1] + c * T[2, 1],
-        a * T[0, 2] + b * T[1, 2] + c * T[2, 2],
-    )
+from sl_nerfstudio.geometry.rigid import moved, row_times_rotation
 
 
 @compiled
@@ -63,7 +22,7 @@ def _by_increment(out, first, sign, a, b, c, x, y, z):
 @compiled
 def _world_point(devices, frame, depth, ray):
     """A point along a camera ray."""
-    return _moved(devices[0][frame], depth * ray[0], depth * ray[1], depth * ray[2])
+    return moved(devices[0][frame], depth * ray[0], depth * ray[1], depth * ray[2])
 
 
 @compiled_range
@@ -74,11 +33,11 @@ def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, 
     for k in range(first, last):
         T, ray = T_projector_camera[frame[k]], rays[k]
         x, y, z = depths[k] * ray[0], depths[k] * ray[1], depths[k] * ray[2]
-        u, v, _, ux, uy, uz, vx, vy, vz = view_of(code, *_moved(T, x, y, z), projector)
+        u, v, _, ux, uy, uz, vx, vy, vz = view_of(code, *moved(T, x, y, z), projector)
         residual[k, 0], residual[k, 1] = u - decoded[k, 0], v - decoded[k, 1]
         if derivatives:
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
-                a, b, d = _row_times(T, row[0], row[1], row[2])
+                a, b, d = row_times_rotation(row[0], row[1], row[2], T)
                 _by_increment(by_pose[k, c], 0, -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * ray[0] + b * ray[1] + d * ray[2]
 
@@ -90,7 +49,7 @@ def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_
     for k in range(first, last):
         a, j = anchor[k], viewer[k]
         x, y, z = _world_point(devices, frame[a], depths[a], rays[a])
-        x, y, z = _moved(T_camera_world[j], x, y, z)
+        x, y, z = moved(T_camera_world[j], x, y, z)
         uv[k, 0], uv[k, 1], in_front[k] = view_of(code, x, y, z, cameras[j])[:3]
 
 
@@ -105,9 +64,9 @@ def cross_residuals(
         n, j = anchor[k], viewer[k]
         i, ray = frame[n], rays[n]
         x, y, z = _world_point(devices, i, depths[n], ray)
-        xj, yj, zj = _moved(T_camera_world[j], x, y, z)
+        xj, yj, zj = moved(T_camera_world[j], x, y, z)
         T = T_projector_camera[j]
-        u, v, _, ux, uy, uz, vx, vy, vz = view_of(projector_code, *_moved(T, xj, yj, zj), projector)
+        u, v, _, ux, uy, uz, vx, vy, vz = view_of(projector_code, *moved(T, xj, yj, zj), projector)
         residual[k, 0], residual[k, 1] = u - seen[k, 0], v - seen[k, 1]
         if derivatives:
             _, _, _, cux, cuy, cuz, cvx, cvy, cvz = view_of(camera_code, xj, yj, zj, cameras[j])
@@ -116,11 +75,11 @@ def cross_residuals(
             dy = R[1, 0] * ray[0] + R[1, 1] * ray[1] + R[1, 2] * ray[2]
             dz = R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2]
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
-                a, b, d = _row_times(T, row[0], row[1], row[2])
+                a, b, d = row_times_rotation(row[0], row[1], row[2], T)
                 _by_increment(by_pose[k, c], 12, -1.0, a, b, d, xj, yj, zj)
                 du, dv = seen_by_pixel[k, c, 0], seen_by_pixel[k, c, 1]
                 a, b, d = a - du * cux - dv * cvx, b - du * cuy - dv * cvy, d - du * cuz - dv * cvz
-                a, b, d = _row_times(T_camera_world[j], a, b, d)
+                a, b, d = row_times_rotation(a, b, d, T_camera_world[j])
                 _by_increment(by_pose[k, c], 0, 1.0, a, b, d, x, y, z)
                 _by_increment(by_pose[k, c], 6, -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * dx + b * dy + d * dz
