@@ -11,8 +11,11 @@ from sl_nerfstudio.threads import parallel, split, threads
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function compiled for one thread; without the run-time type checks that tests wrap it in."""
-    return numba.njit(cache=True)(inspect.unwrap(function))
+    """The function compiled for one thread; without the run-time type checks that tests wrap it in.
+
+    Other threads run beside it.
+    """
+    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
 
 
 def compiled_range(function: Callable[..., None]) -> Callable[..., None]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import Evidence, gauge_free, pose_covariance
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, free_parameters
+from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters, RefinePoses, free_parameters
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
@@ -133,8 +133,8 @@ def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
         per_frame = float(r.cross_valid.sum()) / start.frames
         weight = rough_weight(noise, per_frame, s.independent_residuals) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
-        B = free_parameters(stage.refine, found.state.rig)
-        state = lm_step(found.state, linear, found.rows, maps, kernel, prior, B, s.steps)
+        free = free_parameters(stage.refine, found.state.rig)
+        state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free, s.steps)
         # a step may also be small because it was damped
         small = state.size < s.steps.converged and (state.damping < 1 or state.size == 0)
         settled = bool((widths >= s.steps.settled * found.widths).all()) and small
@@ -201,8 +201,8 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     evidence = Evidence(state.rig, state.anchors, found.rows, extended, kernel, problem.settings.image_blocks)
-    B = free_parameters(refine, state.rig)
-    known = pose_covariance(evidence, B, problem.start, problem.prior, found.noise)
+    free = free_parameters(refine, state.rig)
+    known = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(
         rig=state.rig,
         joint=known.joint,
@@ -215,10 +215,10 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     )
 
 
-def _unmoved(start: Rig, prior: PosePrior, B: Tensor, settings: AdjustmentSettings) -> Adjustment:
+def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters, settings: AdjustmentSettings) -> Adjustment:
     """The starting poses with the prior's uncertainty, if no step is allowed or no frame sees what another decoded."""
-    H = B.T @ prior_equations(prior, start, start)[0] @ B
+    H, _ = prior_equations(prior, start, start)
     nan = float("nan")
     noise = settings.kernel.noise_floor_px
-    joint = torch.block_diag(gauge_free(start, B, H, 1.0), (prior.intrinsics_sigma**2).diag())
+    joint = torch.block_diag(gauge_free(start, free, H), (prior.intrinsics_sigma**2).diag())
     return Adjustment(start, joint, None, noise, 0, nan, nan, ())

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
-from sl_nerfstudio.compiled import compiled, compiled_range
+from sl_nerfstudio.bundle_adjustment.loops.drawing import draw_pixels
+from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory, look_up_windows
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,14 @@ class MapSample:
     uv_projector: Float[Tensor, "n 2"]
     jacobian: Float[Tensor, "n 2 2"]  # d uv_projector / d uv_camera
     valid: Bool[Tensor, "n"]  # enough decoded pixels, and a paraboloid fits them
+
+
+@dataclass(frozen=True)
+class DrawnPixels:
+    """Centres of some pixels of some frames."""
+
+    frame: Int[Tensor, "n"]
+    uv_camera: Float[Tensor, "n 2"]
 
 
 @dataclass(frozen=True)
@@ -59,43 +69,44 @@ class CoordinateMaps:
         """Number of frames."""
         return len(self.offsets)
 
-    def draw(self, frame: int, count: int, generator: torch.Generator) -> Float[Tensor, "n 2"]:
-        """Up to `count` random decoded pixel centres of a frame, one for each occupied square of a lattice."""
-        w, h = int(self.widths[frame]), int(self.heights[frame])
-        start = int(self.offsets[frame])
-        decoded = torch.isfinite(self.values[start : start + w * h, 0]).nonzero().squeeze(-1)
-        if len(decoded) == 0:
-            return torch.zeros(0, 2, dtype=torch.float64)
-        step = max(1, int((len(decoded) / count) ** 0.5))
-        decoded = decoded[torch.randperm(len(decoded), generator=generator)]
-        square = decoded // w // step * (w // step + 1) + decoded % w // step
-        order = torch.argsort(square, stable=True)
-        first = torch.ones(len(order), dtype=torch.bool)
-        first[1:] = square[order][1:] != square[order][:-1]
-        chosen = decoded[order[first]]
-        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:count]]
-        return torch.stack([chosen % w + 0.5, chosen // w + 0.5], -1).double()
+    def draw(self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator) -> "DrawnPixels":
+        """Up to `count` random decoded pixel centres of each of some frames, one of each occupied square of a lattice."""
+        pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
+        draw_pixels(len(frames), frames.numpy(), *self.arrays, seed_from(generator), pixels, counts)
+        frame = torch.repeat_interleave(frames, torch.from_numpy(counts))
+        pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
+        w = self.widths[frame]
+        return DrawnPixels(frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double())
 
-    def look_up(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> MapSample:
-        """Fit around positions in the camera images of `frame`; invalid outside the image."""
-        fit, roughness = self._fit(frame, uv_camera)
+    @property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """For compiled loops: values, offsets, widths, heights."""
+        return self.values.numpy(), self.offsets.numpy(), self.widths.numpy(), self.heights.numpy()
+
+    def look_up(
+        self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory | None = None
+    ) -> MapSample:
+        """Fit around positions in the camera images of `frame`; invalid outside the image.
+
+        `memory` is that of an earlier look-up for the same frames: where a position is still in the same pixel, it
+        saves the work.
+        """
+        fit, roughness = self._fit(frame, uv_camera, memory or WindowMemory.empty(len(frame)))
         return MapSample(fit[:, 0], fit[:, 1:].transpose(1, 2), roughness < self.max_roughness)
 
     def _fit(
-        self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]
+        self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory
     ) -> tuple[Float[Tensor, "n 3 2"], Float[Tensor, "n"]]:
         """Value, derivatives by x and y, and the window's RMS distance from the paraboloid (infinite without a fit)."""
         n = len(frame)
         fit, roughness = np.zeros((n, 3, 2)), np.full(n, np.inf)
-        _fit_paraboloids(
+        look_up_windows(
             n,
-            self.values.numpy(),
-            self.offsets.numpy(),
-            self.widths.numpy(),
-            self.heights.numpy(),
+            *self.arrays,
             frame.numpy(),
             uv_camera.detach().double().numpy(),
             (self.settings.half_window, self.settings.least_pixels, self.settings.least_pivot),
+            (memory.pixel, memory.fit, memory.roughness),
             fit,
             roughness,
         )
@@ -104,92 +115,12 @@ class CoordinateMaps:
     def _median_roughness(self) -> float:
         """Median roughness of windows all over the frames; 0 if nothing is decoded."""
         generator = torch.Generator().manual_seed(0)
-        drawn = [self.draw(k, self.settings.sampled_windows, generator) for k in range(self.frames)]
-        frame = torch.repeat_interleave(torch.arange(self.frames), torch.tensor([len(d) for d in drawn]))
-        _, roughness = self._fit(frame, torch.cat(drawn))
+        drawn = self.draw(torch.arange(self.frames), self.settings.sampled_windows, generator)
+        _, roughness = self._fit(drawn.frame, drawn.uv_camera, WindowMemory.empty(len(drawn.frame)))
         found = roughness[torch.isfinite(roughness)]
         return float(found.median()) if len(found) else 0.0
 
-    def decoded_at(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """The decoded coordinate of the pixel under each position; NaN outside the image."""
-        w, h, start = self.widths[frame], self.heights[frame], self.offsets[frame]
-        inside = (uv_camera >= 0).all(-1) & (uv_camera[:, 0] < w) & (uv_camera[:, 1] < h)
-        uv = torch.where(inside[:, None], uv_camera, torch.zeros_like(uv_camera)).long()
-        found = self.values[start + uv[:, 1] * w + uv[:, 0]].double()
-        return torch.where(inside[:, None], found, torch.full_like(found, float("nan")))
 
-
-@compiled_range
-def _fit_paraboloids(first, last, values, offsets, widths, heights, frame, uv, limits, fit, roughness):
-    """Least-squares fit of `c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2` to the window of each position."""
-    half_window, least_pixels, least_pivot = limits
-    for k in range(first, last):
-        f, px, py = frame[k], uv[k, 0], uv[k, 1]
-        w, h = widths[f], heights[f]
-        if not (px >= 0 and py >= 0 and px < w and py < h):
-            continue
-        column, row = int(px), int(py)
-        A = np.zeros((6, 8))  # normal equations, two right-hand sides
-        basis = np.ones(6)
-        n = aa = 0.0
-        origin_a = origin_b = np.nan
-        for y in range(max(row - half_window, 0), min(row + half_window + 1, h)):
-            for x in range(max(column - half_window, 0), min(column + half_window + 1, w)):
-                pixel = offsets[f] + y * w + x
-                a, b = float(values[pixel, 0]), float(values[pixel, 1])
-                if not (np.isfinite(a) and np.isfinite(b)):
-                    continue
-                if n == 0.0:
-                    origin_a, origin_b = a, b  # keeps the sums small
-                a, b = a - origin_a, b - origin_b
-                dx, dy = x + 0.5 - px, y + 0.5 - py
-                basis[1], basis[2], basis[3], basis[4], basis[5] = dx, dy, dx * dx, dx * dy, dy * dy
-                for i in range(6):
-                    for j in range(i + 1):
-                        A[i, j] += basis[i] * basis[j]
-                    A[i, 6] += basis[i] * a
-                    A[i, 7] += basis[i] * b
-                n += 1.0
-                aa += a * a + b * b
-        if n < least_pixels:
-            continue
-        right = A[:, 6:].copy()
-        if not _solve(A, least_pivot):
-            continue
-        rough2 = aa
-        for i in range(6):
-            rough2 -= A[i, 6] * right[i, 0] + A[i, 7] * right[i, 1]
-        fit[k, :, :] = A[:3, 6:]
-        fit[k, 0, 0] += origin_a
-        fit[k, 0, 1] += origin_b
-        roughness[k] = np.sqrt(max(rough2, 0.0) / n)
-
-
-@compiled
-def _solve(A, least_pivot):
-    """Cholesky of the lower triangle of A[:, :6], then A[:, 6:] <- solution. False where the window is degenerate."""
-    for j in range(6):
-        d = A[j, j]
-        scale = d
-        for i in range(j):
-            d -= A[j, i] * A[j, i]
-        if not d > least_pivot * scale:
-            return False
-        A[j, j] = np.sqrt(d)
-        for i in range(j + 1, 6):
-            v = A[i, j]
-            for m in range(j):
-                v -= A[i, m] * A[j, m]
-            A[i, j] = v / A[j, j]
-    for c in range(6, 8):
-        for i in range(6):
-            v = A[i, c]
-            for m in range(i):
-                v -= A[i, m] * A[m, c]
-            A[i, c] = v / A[i, i]
-        for i in range(5, -1, -1):
-            v = A[i, c]
-            for m in range(i + 1, 6):
-                v -= A[m, i] * A[m, c]
-            A[i, c] = v / A[i, i]
-    return True
+def seed_from(generator: torch.Generator) -> int:
+    """A new seed for choices in compiled loops."""
+    return int(torch.randint(2**62, (), generator=generator))

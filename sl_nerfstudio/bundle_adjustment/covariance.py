@@ -8,6 +8,7 @@ uncertain, too (`self_calibration`).
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,17 +16,22 @@ from jaxtyping import Float, Float64, Int
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
+from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
+from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, NormalEquations, normal_equations
+from sl_nerfstudio.bundle_adjustment.loops.normal_equations import block_sums
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, array, pixels_of_rows
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, matrix_by_kind
 from sl_nerfstudio.geometry.devices import project
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.threads import results
 
 _EXACT = 1e-9  # used for an uncertainty of zero
+_FRAMES_AT_ONCE = 16  # whose blocks are summed together: bounds memory
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,11 @@ class Evidence:
     kernel: Kernel
     image_blocks: int  # along each side of the decoded part of an image
 
+    @property
+    def blocks(self) -> int:
+        """Number of blocks of all images."""
+        return self.rig.frames * self.image_blocks**2
+
 
 @dataclass(frozen=True)
 class PoseCovariance:
@@ -49,74 +60,119 @@ class PoseCovariance:
 
 
 def pose_covariance(
-    evidence: Evidence, B: Float[Tensor, "unknowns k"], start: Rig, prior: PosePrior, noise: float
+    evidence: Evidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
 ) -> PoseCovariance:
     """Second moments of the errors of poses that were found with the current intrinsics.
 
-    `B` spans the free parameters, `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. How
-    far the poses would move if the intrinsics followed the captures counts as an error, too.
+    `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. How far the poses would move if the
+    intrinsics followed the captures counts as an error, too.
     """
     e, n = evidence, evidence.rig.frames
-    if B.shape[1] == 0:
+    if free.count == 0:
         poses_exact = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
         return PoseCovariance(torch.block_diag(poses_exact, (prior.intrinsics_sigma**2).diag()), None)
-    eye = torch.eye(UNKNOWNS, dtype=torch.float64)
-    B = torch.block_diag(B, eye)
     poses_H, poses_g = prior_equations(prior, start, e.rig)
     weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
-    H_prior = noise**2 * torch.block_diag(poses_H, weight.diag())
-    g_prior = noise**2 * torch.cat(
-        [poses_g, weight * torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)]
-    )
+    prior_H = noise**2 * poses_H, noise**2 * weight
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
-    H = B.T @ (equations.H + H_prior) @ B
-    H_inverse = torch.linalg.inv(H)
-    P = _without_gauge(e.rig, len(B))
-    formal = noise**2 * P @ B @ H_inverse @ B.T @ P.T
-    sums = _block_sums(e, equations, *weights) @ B
-    blocks = int((sums != 0).any(1).sum())
-    free = max(blocks - B.shape[1], blocks / 4)  # degrees of freedom left after the fit of the poses
-    spread = blocks / max(free, 1.0) * sums.T @ sums + noise**2 * B.T @ H_prior @ B
-    robust = P @ B @ H_inverse @ spread @ H_inverse @ B.T @ P.T
-    larger = (robust.diagonal() / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
-    covariance = larger[:, None] * formal * larger
-    step = -P @ B @ H_inverse @ B.T @ (equations.g + g_prior)
-    intrinsics = slice(12 * n, None)
-    return PoseCovariance(
-        covariance + torch.outer(step, step),
-        SelfCalibration(step[intrinsics], covariance[intrinsics, intrinsics]),
+    each = torch.arange(n)
+    equations.H[each, :, each] += prior_H[0]
+    equations.H_common.diagonal().add_(prior_H[1])
+    change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
+    g = torch.cat(
+        [(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change]
     )
+    G = _gauge(e.rig, len(g))
+    inverse_H = _expanded_inverse(free, equations)
+    C = _without_gauge(inverse_H, G)
+    formal = _without_gauge(C.T, G)
+    squares, blocks = _spread(e, equations.depths, weights, C)
+    free_blocks = max(blocks - free.count - UNKNOWNS, blocks / 4)  # degrees of freedom left after the fit of the poses
+    robust = blocks / max(free_blocks, 1.0) * squares + noise**2 * _quadratic(C, *prior_H)
+    formal *= noise**2
+    larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
+    formal *= larger
+    formal *= larger[:, None]
+    step = -C @ g
+    intrinsics = slice(12 * n, None)
+    calibration = SelfCalibration(step[intrinsics].clone(), formal[intrinsics, intrinsics].clone())
+    formal.addr_(step, step)
+    return PoseCovariance(matrix_by_kind(formal, n), calibration)
 
 
-def _block_sums(
-    e: Evidence,
-    equations: NormalEquations,
-    own_weight: Float[Tensor, "anchors"],
-    cross_weight: Float[Tensor, "rows"],
-) -> Float[Tensor, "blocks unknowns"]:
-    """Gradient of the poses from each block of each image, with depths eliminated."""
-    n, r, size = e.rig.frames, e.linear.residuals, e.linear.unknowns
+def _expanded_inverse(free: FreeParameters, equations: NormalEquations) -> Float[Tensor, "unknowns unknowns"]:
+    """The inverse of the normal matrix of the free parameters and the intrinsics, as increments of all frames."""
+    count, common = free.count, UNKNOWNS
+    H = torch.zeros(count + common, count + common, dtype=torch.float64)
+    H[:count, :count] = free.matrix(equations.H)
+    H[:count, count:] = free.vector(equations.border)
+    H[count:, :count] = H[:count, count:].T
+    H[count:, count:] = equations.H_common
+    inverse_H = torch.cholesky_inverse(torch.linalg.cholesky(H))
+    if free.own.shape[2] == 12:
+        return inverse_H
+    half = _expanded(free, inverse_H)
+    return _expanded(free, half.T)
+
+
+def _expanded(free: FreeParameters, x: Float[Tensor, "count c"]) -> Float[Tensor, "unknowns c"]:
+    """Sets of free parameters and intrinsics as increments of all frames and intrinsics."""
+    return torch.cat([free.steps(x[: free.count]).flatten(0, 1), x[free.count :]])
+
+
+def _quadratic(
+    C: Float[Tensor, "unknowns unknowns"], frames_H: Float[Tensor, "frames 12 12"], common: Float[Tensor, "common"]
+) -> Float[Tensor, "unknowns"]:
+    """The diagonal of `C H C^T` for a matrix of blocks of frames and a diagonal."""
+    n = len(frames_H)
+    columns = C[:, : 12 * n].reshape(-1, n, 12).transpose(0, 1)
+    return ((columns @ frames_H) * columns).sum((0, 2)) + C[:, 12 * n :].square() @ common
+
+
+def _spread(
+    e: Evidence, depths: DepthCouplings, weights: tuple[Tensor, Tensor], C: Float[Tensor, "unknowns unknowns"]
+) -> tuple[Float[Tensor, "unknowns"], int]:
+    """Variances that the gradients of all blocks of images cause through `C`, and the number of blocks with any."""
     own_block, cross_block = _blocks_of(e)
-    out = torch.zeros(n * e.image_blocks**2 * size, dtype=torch.float64)
-    pull = torch.zeros(n * e.image_blocks**2, len(e.anchors.frame), dtype=torch.float64)  # on each depth
-    every = torch.arange(len(e.anchors.frame))
-    own, cross = own_weight[:, None] * r.own, cross_weight[:, None] * r.cross
-    for block, J, J_depth, wr, cols, anchor in (
-        (own_block, e.linear.own, e.linear.own_depth, own, e.linear.own_columns, every),
-        (cross_block, e.linear.cross, e.linear.cross_depth, cross, e.linear.cross_columns, e.rows.anchor),
-    ):
-        out.index_add_(0, (block[:, None] * size + cols).reshape(-1), (J * wr[..., None]).sum(1).reshape(-1))
-        pull.view(-1).index_add_(0, block * pull.shape[1] + anchor, (J_depth * wr).sum(-1))
-    return out.reshape(-1, size) - pull @ (equations.depth_by_rest / equations.H_depth[:, None])
+    frames = range(0, e.rig.frames, _FRAMES_AT_ONCE)
+    groups = Groups.of(array(own_block), e.blocks), Groups.of(array(cross_block), e.blocks)
+    parts = results([partial(_spread_of, e, depths, weights, groups, C, first) for first in frames])
+    return torch.stack([squares for squares, _ in parts]).sum(0), sum(blocks for _, blocks in parts)
+
+
+def _spread_of(
+    e: Evidence,
+    depths: DepthCouplings,
+    weights: tuple[Tensor, Tensor],
+    groups: tuple[Groups, Groups],
+    C: Float[Tensor, "unknowns unknowns"],
+    first: int,
+) -> tuple[Float[Tensor, "unknowns"], int]:
+    """The same for the blocks of some frames' images."""
+    per_frame, r = e.image_blocks**2, e.linear.residuals
+    blocks = np.arange(first * per_frame, min(first + _FRAMES_AT_ONCE, e.rig.frames) * per_frame)
+    own, cross = (
+        (array(w[:, None] * value), array(J), array(by_depth))
+        for w, value, J, by_depth in (
+            (weights[0], r.own, e.linear.own, e.linear.own_depth),
+            (weights[1], r.cross, e.linear.cross, e.linear.cross_depth),
+        )
+    )
+    sums = np.zeros((len(blocks), len(C)))
+    block_sums(
+        blocks, tuple(part for g in (*groups, depths.rows) for part in (g.first, g.entries)),
+        (array(e.rows.anchor), depths.frame, depths.viewer), own, cross, depths.arrays, sums,
+    )  # fmt: skip
+    gradient = torch.from_numpy(sums)
+    return (gradient @ C.T).square().sum(0), int((gradient != 0).any(1).sum())
 
 
 def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
     """The block that holds an anchor in its own image, and the block of the other image in which it is looked up."""
-    rig, p_camera = e.rig, e.anchors.depth[:, None] * e.anchors.d_camera
-    at = project(rig.camera[e.anchors.frame], p_camera)[0]
-    p_world = transform(rig.T_world_camera[e.anchors.frame], p_camera)[e.rows.anchor]
-    seen_at = project(rig.camera[e.rows.frame], transform(inverse(rig.T_world_camera)[e.rows.frame], p_world))[0]
+    rig = e.rig
+    at = project(rig.camera[e.anchors.frame], e.anchors.d_camera)[0]
+    seen_at, _ = pixels_of_rows(rig, e.anchors, e.rows)
     low, high = torch.zeros(rig.frames, 2).double(), torch.ones(rig.frames, 2).double()
     for k in range(rig.frames):
         mine = at[e.anchors.frame == k]
@@ -137,16 +193,28 @@ def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndar
     return parts * np.array([unit, 180 / np.pi, unit, 180 / np.pi])
 
 
-def gauge_free(rig: Rig, B: Tensor, H: Tensor, noise: float) -> Float[Tensor, "unknowns unknowns"]:
-    """`noise^2 / H` with the gauge projected out; correct if residuals are independent."""
-    if B.shape[1] == 0:
-        return torch.zeros(12 * rig.frames, 12 * rig.frames, dtype=torch.float64)
-    P = _without_gauge(rig, len(B))
-    return noise**2 * P @ B @ torch.linalg.inv(H) @ B.T @ P.T
+def gauge_free(rig: Rig, free: FreeParameters, H: Float[Tensor, "frames 12 12"]) -> Float[Tensor, "unknowns unknowns"]:
+    """`1 / H` for information about each frame alone, along the free parameters, with the gauge projected out."""
+    n = rig.frames
+    if free.count == 0:
+        return torch.zeros(12 * n, 12 * n, dtype=torch.float64)
+    dense = torch.zeros(n, 12, n, 12, dtype=torch.float64)
+    each = torch.arange(n)
+    dense[each, :, each] = H
+    half = free.steps(torch.linalg.inv(free.matrix(dense))).flatten(0, 1)
+    C, G = free.steps(half.T).flatten(0, 1), _gauge(rig, 12 * n)
+    return matrix_by_kind(_without_gauge(_without_gauge(C, G).T, G), n)
 
 
-def _without_gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns unknowns"]:
-    """Projection of steps of the poses (and of unknowns after them) that removes motion of the whole scene."""
+def _gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns 7"]:
+    """Motion and growth of the whole scene, by steps of the poses (frame by frame) and of unknowns after them."""
     G = torch.zeros(unknowns, 7, dtype=torch.float64)
-    G[: 12 * rig.frames] = gauge_directions(rig)
-    return torch.eye(unknowns, dtype=torch.float64) - G @ torch.linalg.solve(G.T @ G, G.T)
+    G[: 12 * rig.frames] = by_frame(gauge_directions(rig)).flatten(0, 1)
+    return G
+
+
+def _without_gauge(
+    x: Float[Tensor, "unknowns c"], G: Float[Tensor, "unknowns 7"]
+) -> Float[Tensor, "unknowns c"]:
+    """What remains of steps (in columns) without motion and growth of the whole scene."""
+    return x - G @ (torch.linalg.solve(G.T @ G, G.T) @ x)

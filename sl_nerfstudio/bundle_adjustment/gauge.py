@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame
 from sl_nerfstudio.geometry.se3 import hat, pose, rotate
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
@@ -36,8 +37,9 @@ def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
     for _ in range(_MOST_STEPS):
         now = restore(start, rig, scale)
         H, g = prior_equations(prior, start, now)
-        G = gauge_directions(now)
-        step = float(torch.linalg.solve(G.T @ H @ G, -G.T @ g)[6])
+        G = by_frame(gauge_directions(now))
+        information, gradient = (G.transpose(1, 2) @ H @ G).sum(0), (G.transpose(1, 2) @ g[..., None]).sum(0)[:, 0]
+        step = float(torch.linalg.solve(information, -gradient)[6])
         scale *= math.exp(step)
         if abs(step) < _CONVERGED:
             break

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PriorTerm
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, residuals_of
@@ -32,30 +33,46 @@ def lm_step(
     maps: CoordinateMaps,
     kernel: Kernel,
     prior: PriorTerm,
-    B: Float[Tensor, "unknowns k"],
+    free: FreeParameters,
     settings: StepSettings,
 ) -> LMState:
-    """Take a step along the columns of `B`, damped until it lowers the whole objective (Levenberg-Marquardt).
+    """Take a step along the free parameters, damped until it lowers the whole objective (Levenberg-Marquardt).
 
     The objective is the robust cost of the residuals that exist before and after the step, plus the prior.
     """
-    rig, anchors, r, n = state.rig, state.anchors, linear.residuals, state.rig.frames
-    if not B.shape[1]:
+    rig, anchors, r = state.rig, state.anchors, linear.residuals
+    if not free.count:
         return LMState(rig, anchors, state.damping)
-    equations = normal_equations(linear, rows, *kernel.weights(r))
-    H_prior, g_prior = prior.equations(rig)
-    H, g = B.T @ (equations.H + H_prior) @ B, B.T @ (equations.g + g_prior)
+    equations = normal_equations(linear, rows, *kernel.weights(r), free.frames)
+    H_prior, g_prior = (part[free.frames] for part in prior.equations(rig))
+    each = torch.arange(len(H_prior))
+    equations.H[each, :, each] += H_prior
+    H, g = free.matrix(equations.H), free.vector(equations.g + g_prior)
     energy = prior.energy(rig)
     damping = state.damping
     for _ in range(settings.tries):
-        x = B @ torch.linalg.solve(H + damping * torch.diag(torch.diag(H)), -g)
-        depth = anchors.depth + equations.depth_step(x)
+        x = _damped_solution(H, g, damping)
+        if x is None:
+            damping = damping * settings.tighten
+            continue
+        step = free.step(x)
+        depth = anchors.depth + equations.depth_step(step)
         depth = depth.clamp(settings.least_depth * anchors.depth, settings.most_depth * anchors.depth)
-        moved = rig.moved(x[: 6 * n].reshape(n, 6), x[6 * n :].reshape(n, 6))
+        moved = rig.moved(step[:, :6], step[:, 6:])
         after = residuals_of(moved, anchors.at(depth), rows, maps)
         both = r.cross_valid & after.cross_valid
         if kernel.cost(after, both) + prior.energy(moved) < kernel.cost(r, both) + energy:
             damping = max(damping / settings.relax, settings.least_damping)
-            return LMState(moved, anchors.at(depth), damping, float(x.abs().max()))
+            return LMState(moved, anchors.at(depth), damping, float(step.abs().max()))
         damping = damping * settings.tighten
     return LMState(rig, anchors, damping)
+
+
+def _damped_solution(
+    H: Float[Tensor, "k k"], g: Float[Tensor, "k"], damping: float
+) -> Float[Tensor, "k"] | None:
+    """Solution of the damped equations; None if they are not positive definite, which rounding can cause."""
+    damped = H.clone()
+    damped.diagonal().mul_(1 + damping)
+    factor, failed = torch.linalg.cholesky_ex(damped)
+    return None if bool(failed) else torch.cholesky_solve(-g[:, None], factor)[:, 0]

@@ -1,47 +1,45 @@
 """Which decoded pixels take part in the bundle adjustment, and in which other frames they are looked up."""
 
-from dataclasses import fields
-
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, seed_from
+from sl_nerfstudio.bundle_adjustment.loops.visibility import choose_frames, count_chosen, mark_visible
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, array
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.devices import project, unproject
-from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
+from sl_nerfstudio.geometry.devices import unproject
+from sl_nerfstudio.geometry.se3 import rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
+
+_ENTRIES_AT_ONCE = 2**23  # pairs of an anchor and a frame: bounds memory
 
 
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
     """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
-    parts = []
-    for frame in range(rig.frames):
-        uv = maps.draw(frame, per_frame, generator)
-        index = torch.full((len(uv),), frame)
-        seen = maps.look_up(index, uv)
-        beside = uv[:, None] + torch.eye(2, dtype=uv.dtype)
-        there = seen.uv_projector[:, None] + seen.jacobian.transpose(-1, -2)
-        (p, good), (q, _) = (_meet(rig, frame, *pixels) for pixels in ((uv, seen.uv_projector), (beside, there)))
-        edge = q - p[:, None]
-        normal = torch.nn.functional.normalize(torch.linalg.cross(edge[:, 0], edge[:, 1]), dim=-1)
-        normal = -normal * (normal * p).sum(-1, keepdim=True).sign()
-        depth = p.norm(dim=-1)
-        parts.append(Anchors(index, p / depth[:, None], seen.uv_projector, depth, normal).chosen(seen.valid & good))
-    return Anchors(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Anchors)))
+    drawn = maps.draw(torch.arange(rig.frames), per_frame, generator)
+    frame, uv = drawn.frame, drawn.uv_camera
+    seen = maps.look_up(frame, uv)
+    p, good = _meet(rig, frame, uv, seen.uv_projector)
+    edges = []
+    for axis in range(2):
+        beside, there = uv + torch.eye(2, dtype=uv.dtype)[axis], seen.uv_projector + seen.jacobian[..., axis]
+        edges.append(_meet(rig, frame, beside, there)[0] - p)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
+    normal = -normal * (normal * p).sum(-1, keepdim=True).sign()
+    depth = p.norm(dim=-1)
+    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal).chosen(seen.valid & good)
 
 
 def _meet(
-    rig: Rig, frame: int, uv_camera: Float[Tensor, "*n 2"], uv_projector: Float[Tensor, "*n 2"]
-) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
-    """Points on a frame's camera rays nearest to its projector rays, in camera axes; whether in front of both."""
+    rig: Rig, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], uv_projector: Float[Tensor, "n 2"]
+) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Points on camera rays nearest to their projector rays, in camera axes; whether in front of both devices."""
     d_camera = unproject(rig.camera[frame], uv_camera)
     T = rig.T_camera_projector[frame]
     d_projector = rotate(T, unproject(rig.projector, uv_projector))
-    depth, depth_projector = closest_approach(
-        torch.zeros_like(d_camera), d_camera, T[:3, 3].expand_as(d_camera), d_projector
-    )
+    depth, depth_projector = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
     return depth[..., None] * d_camera, (depth > 0) & (depth_projector > 0)
 
 
@@ -59,29 +57,45 @@ def observe(
 
     Frames whose camera or projector is behind the anchor's surface, or sees it at a cosine below `least_cosine`, are
     left out: they see, or light, another side of the object. With `around`, only observations that involve one frame.
+    Rows are ordered by anchor, then by frame.
     """
-    chosen = []
-    devices = (rig.T_world_camera, rig.T_world_projector)
-    p_world = transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)
-    normal = rotate(rig.T_world_camera[anchors.frame], anchors.normal)
-    for j in range(rig.frames):
-        others = anchors.frame != j if around in (None, j) else anchors.frame == around
-        anchor = others.nonzero().squeeze(-1)
-        frame = torch.full_like(anchor, j)
-        p_j = transform(inverse(rig.T_world_camera[j]), p_world[anchor])
-        uv_camera, in_front = project(rig.camera[j], p_j)
-        expected, lit = project(rig.projector, transform(inverse(rig.T_camera_projector[j]), p_j))
-        miss = (maps.decoded_at(frame, uv_camera) - expected).norm(dim=-1)
-        faces = [_cosine(normal[anchor], T[j, :3, 3] - p_world[anchor]) > least_cosine for T in devices]
-        keep = in_front & lit & faces[0] & faces[1] & (miss < gate_px)  # False where nothing is decoded
-        chosen.append(torch.stack([anchor[keep], frame[keep]]))
-    rows = torch.cat(chosen, 1)
-    rows = rows[:, torch.randperm(rows.shape[1], generator=generator)]
-    rows = rows[:, torch.argsort(rows[0], stable=True)]
-    starts = torch.searchsorted(rows[0].contiguous(), rows[0].contiguous())
-    rows = rows[:, torch.arange(rows.shape[1]) - starts < per_anchor]
-    return Observations(rows[0], rows[1])
+    allowed = ~torch.eye(rig.frames, dtype=torch.bool)
+    if around is not None:
+        involved = torch.arange(rig.frames) == around
+        allowed &= involved[:, None] | involved
+    seed = seed_from(generator)
+    step = max(_ENTRIES_AT_ONCE // rig.frames, 1)
+    parts = [
+        _visible_rows(rig, anchors, maps, torch.arange(first, min(first + step, len(anchors.frame))), per_anchor,
+                      (gate_px, least_cosine), allowed, seed)
+        for first in range(0, len(anchors.frame), step)
+    ]  # fmt: skip
+    none = torch.zeros(0, dtype=torch.int64)
+    return Observations(*(torch.cat([none, *part]) for part in ([p[k] for p in parts] for k in range(2))))
 
 
-def _cosine(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-    return (a * b).sum(-1) / (a.norm(dim=-1) * b.norm(dim=-1))
+def _visible_rows(
+    rig: Rig,
+    anchors: Anchors,
+    maps: CoordinateMaps,
+    number: Int[Tensor, "n"],
+    per_anchor: int,
+    limits: tuple[float, float],
+    allowed: Bool[Tensor, "frames frames"],
+    seed: int,
+) -> tuple[Int[Tensor, "rows"], Int[Tensor, "rows"]]:
+    """The rows of some anchors: numbers of anchors and frames."""
+    mine = anchors.chosen(number)
+    T, n = rig.T_world_camera[mine.frame], len(number)
+    p_world, normal = transform(T, mine.depth[:, None] * mine.d_camera), rotate(T, mine.normal)
+    centres = torch.stack([rig.T_world_camera[:, :3, 3], rig.T_world_projector[:, :3, 3]])
+    visible, counts = np.empty((rig.frames, n), dtype=np.bool_), np.empty(n, dtype=np.int64)
+    mark_visible(
+        rig.frames, rig.arrays, maps.arrays, array(mine.frame), array(p_world), array(normal), array(centres),
+        array(allowed), limits, visible,
+    )  # fmt: skip
+    count_chosen(n, visible, per_anchor, counts)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    frames = np.empty(starts[-1], dtype=np.int64)
+    choose_frames(n, visible, starts, seed, array(number), frames)
+    return torch.repeat_interleave(number, torch.from_numpy(counts)), torch.from_numpy(frames)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.unknowns import matrix_by_kind
 from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 
@@ -54,16 +55,16 @@ class PriorTerm:
         squares = torch.cat([_frame_departure(self.start, rig), _relative_departure(self.start, rig)], 1) ** 2
         return self.weight * float((squares / self.prior.sigma**2).sum())
 
-    def equations(self, rig: Rig) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
-        """Information matrix and gradient by the increments (delta, rho) of all frames."""
+    def equations(self, rig: Rig) -> tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "frames 12"]]:
+        """Information matrix and gradient by the increments (delta, rho) of each frame."""
         H, g = prior_equations(self.prior, self.start, rig)
         return self.weight * H, self.weight * g
 
 
 def prior_equations(
     prior: PosePrior, start: Rig, rig: Rig
-) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"]]:
-    """Information matrix and gradient of the difference from the starting poses, by (delta, rho) of all frames."""
+) -> tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "frames 12"]]:
+    """Information matrix and gradient of the difference from the starting poses, by (delta, rho) of each frame."""
     n = rig.frames
     weight = 1 / prior.sigma**2
     w_frame, w_relative = weight[:, :6], weight[:, 6:]
@@ -71,12 +72,21 @@ def prior_equations(
     eye = torch.eye(3, dtype=torch.float64).expand(n, 3, 3)
     J = torch.cat([torch.cat([eye, -hat(t)], -1), torch.cat([torch.zeros_like(eye), eye], -1)], -2)
     JtW = J.transpose(1, 2) * w_relative[:, None, :]
-    H = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-    H[: 6 * n, : 6 * n] = torch.diag(w_frame.reshape(-1))
-    H[6 * n :, 6 * n :] = torch.block_diag(*(JtW @ J))
-    g_frame = w_frame * _frame_departure(start, rig)
+    H = torch.zeros(n, 12, 12, dtype=torch.float64)
+    H[:, :6, :6] = torch.diag_embed(w_frame)
+    H[:, 6:, 6:] = JtW @ J
     g_relative = (JtW @ _relative_departure(start, rig)[..., None]).squeeze(-1)
-    return H, torch.cat([g_frame.reshape(-1), g_relative.reshape(-1)])
+    return H, torch.cat([w_frame * _frame_departure(start, rig), g_relative], 1)
+
+
+def prior_covariance(prior: PosePrior, start: Rig) -> Float[Tensor, "unknowns unknowns"]:
+    """Covariance of delta of all frames, then rho of all frames, before any residual is computed."""
+    H, _ = prior_equations(prior, start, start)
+    n = start.frames
+    out = torch.zeros(n, 12, n, 12, dtype=torch.float64)
+    each = torch.arange(n)
+    out[each, :, each] = torch.linalg.inv(H)
+    return matrix_by_kind(out.reshape(12 * n, 12 * n), n)
 
 
 def _frame_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
+from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, of_one_frame
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, rough_weight
@@ -40,11 +40,11 @@ class _Problem:
         return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
-        """See _every_row."""
-        return _every_row(rig, self.anchors, self.maps, self.settings, self.generator, around)
+        """See _rows_of_all."""
+        return _rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
 
 
-def _every_row(
+def _rows_of_all(
     rig: Rig,
     anchors: Anchors,
     maps: CoordinateMaps,
@@ -52,8 +52,9 @@ def _every_row(
     generator: torch.Generator,
     around: int | None = None,
 ) -> Observations:
-    """Every anchor in every other frame that may see it."""
-    return observe(rig, anchors, maps, rig.frames, float("inf"), settings.least_cosine, generator, around)
+    """Every anchor in other frames that may see it."""
+    most = settings.relocalisation.frames_per_anchor
+    return observe(rig, anchors, maps, most, float("inf"), settings.least_cosine, generator, around)
 
 
 def support_of(
@@ -61,20 +62,19 @@ def support_of(
 ) -> Float[Tensor, "frames"]:
     """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
     r = residuals_of(rig, anchors, rows, maps)
-    inlier = r.cross.norm(dim=-1) < within_px
-    out = torch.full((rig.frames,), float("nan"), dtype=torch.float64)
-    for k in range(rig.frames):
-        mine = r.cross_valid & ((anchors.frame[rows.anchor] == k) | (rows.frame == k))
-        if mine.any():
-            out[k] = inlier[mine].double().mean()
-    return out
+    inlier = r.cross_valid & (r.cross.norm(dim=-1) < within_px)
+    counts = torch.zeros(2, rig.frames, dtype=torch.float64)
+    for frame in rows.pairs(anchors):
+        for k, counted in enumerate((inlier, r.cross_valid)):
+            counts[k] += torch.bincount(frame[counted], minlength=rig.frames)
+    return counts[0] / counts[1]
 
 
 def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
     """Frames that see too little of the surface on which the others agree, in order."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = _every_row(rig, anchors, maps, settings, generator)
+    rows = _rows_of_all(rig, anchors, maps, settings, generator)
     support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
     wrong = support.isnan() | (support < s.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
@@ -145,8 +145,6 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
     """Move frame k alone, first as a whole, then its projector too; returns the rig and the frame's support in it."""
     settings, n = problem.settings, rig.frames
     s = settings.relocalisation
-    B = torch.zeros(12 * n, 12, dtype=torch.float64)
-    B[6 * k : 6 * k + 6, :6] = B[6 * (n + k) : 6 * (n + k) + 6, 6:] = torch.eye(6, dtype=torch.float64)
     allowed = placed.clone()
     allowed[k] = True
     width = torch.full((n,), float("inf"), dtype=torch.float64)
@@ -166,7 +164,7 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
         weight = rough_weight(problem.noise, residuals, settings.independent_residuals)
         term = PriorTerm(problem.prior, problem.start, weight)
         kernel = Kernel(width, problem.anchors.frame, pair)
-        free = B[:, :6] if step < s.frame_steps else B
+        free = of_one_frame(k, n, with_projector=step >= s.frame_steps)
         state = lm_step(state, linear, rows, problem.maps, kernel, term, free, settings.steps)
     support = problem.support(state.rig, _rows_of(state.rig, k, allowed, problem))[k]
     return state.rig, float(support.nan_to_num())

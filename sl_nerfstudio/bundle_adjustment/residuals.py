@@ -16,15 +16,18 @@ moves its projector against its camera.
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.loops.residuals import cross_residuals, own_residuals, positions
+from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.devices import project, project_jacobian
-from sl_nerfstudio.geometry.se3 import hat, inverse, rotate, transform
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,11 @@ class Observations:
         """Frame of the anchor, frame that looks it up."""
         return torch.stack([anchors.frame[self.anchor], self.frame])
 
+    @cached_property
+    def memory(self) -> WindowMemory:
+        """Of the look-ups of these rows: anchors move little from one step to the next."""
+        return WindowMemory.empty(len(self.anchor))
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -69,77 +77,80 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals with their derivatives, before weighting."""
+    """Residuals with their derivatives, before weighting.
+
+    The unknowns, without the depths, are delta of all frames, then rho of all frames, then those common to all frames.
+    """
 
     residuals: Residuals
-    own: Float[Tensor, "anchors 2 a"]  # with respect to rho of the anchor's frame
-    own_columns: Int[Tensor, "anchors a"]  # which of the unknowns those are
+    own: Float[Tensor, "anchors 2 a"]  # with respect to rho of the anchor's frame; common unknowns
     own_depth: Float[Tensor, "anchors 2"]
-    cross: Float[Tensor, "rows 2 b"]  # delta of the anchor's frame; delta, rho of the seeing frame
-    cross_columns: Int[Tensor, "rows b"]
+    own_frame: Int[Tensor, "anchors"]
+    cross: Float[Tensor, "rows 2 b"]  # delta of the anchor's frame; delta, rho of the seeing frame; common unknowns
     cross_depth: Float[Tensor, "rows 2"]
-    unknowns: int  # without the depths: delta of all frames, then rho of all frames
+    cross_frames: Int[Tensor, "2 rows"]  # frame of the anchor, seeing frame
+    frames: int
+
+    @property
+    def common(self) -> int:
+        """Number of unknowns that all frames share."""
+        return self.own.shape[-1] - 6
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns without the depths."""
+        return 12 * self.frames + self.common
 
 
 def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Linearisation:
     """Residuals and first derivatives at the current state."""
-    i = anchors.frame
-    p_camera = anchors.depth[:, None] * anchors.d_camera
-    own, own_rho, own_point = _projector_view(rig, i, p_camera)
-    own_depth = (own_point * anchors.d_camera[:, None, :]).sum(-1)
-
-    j, a = observations.frame, observations.anchor
-    p_world = transform(rig.T_world_camera[i], p_camera)[a]
-    d_world = rotate(rig.T_world_camera[i], anchors.d_camera)[a]
-    T_camera_world = inverse(rig.T_world_camera)[j]
-    p_j = transform(T_camera_world, p_world)
-    uv_camera, in_front = project(rig.camera[j], p_j)
-    seen = maps.look_up(j, uv_camera)
-    uv_projector, cross_rho, by_point = _projector_view(rig, j, p_j)
-    by_point = by_point - seen.jacobian @ project_jacobian(rig.camera[j], p_j)
-    by_world = by_point @ T_camera_world[:, :3, :3]
-    by_delta = torch.cat([by_world, -by_world @ hat(p_world)], -1)
-    own_columns, cross_columns = _pose_columns(anchors, observations, rig.frames)
-    return Linearisation(
-        residuals=Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front),
-        own=own_rho,
-        own_columns=own_columns,
-        own_depth=own_depth,
-        cross=torch.cat([by_delta, -by_delta, cross_rho], -1),
-        cross_columns=cross_columns,
-        cross_depth=(by_world * d_world[:, None, :]).sum(-1),
-        unknowns=12 * rig.frames,
-    )
+    m, n = len(anchors.frame), len(observations.anchor)
+    derivatives = tuple(torch.empty(*size, dtype=torch.float64) for size in ((m, 2, 6), (m, 2), (n, 2, 18), (n, 2)))
+    residuals = _residuals(rig, anchors, observations, maps, derivatives)
+    own, own_depth, cross, cross_depth = derivatives
+    pairs = observations.pairs(anchors)
+    return Linearisation(residuals, own, own_depth, anchors.frame, cross, cross_depth, pairs, rig.frames)
 
 
 def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Residuals:
     """Residuals without derivatives."""
-    i, j, a = anchors.frame, observations.frame, observations.anchor
-    p_camera = anchors.depth[:, None] * anchors.d_camera
-    own = project(rig.projector, transform(inverse(rig.T_camera_projector)[i], p_camera))[0]
-    p_j = transform(inverse(rig.T_world_camera)[j], transform(rig.T_world_camera[i], p_camera)[a])
-    uv_camera, in_front = project(rig.camera[j], p_j)
-    seen = maps.look_up(j, uv_camera)
-    uv_projector = project(rig.projector, transform(inverse(rig.T_camera_projector)[j], p_j))[0]
-    return Residuals(own - anchors.uv_projector, uv_projector - seen.uv_projector, seen.valid & in_front)
+    none = (torch.empty(0, 2, 6), torch.empty(0, 2), torch.empty(0, 2, 18), torch.empty(0, 2))
+    return _residuals(rig, anchors, observations, maps, tuple(part.double() for part in none))
 
 
-def _projector_view(
-    rig: Rig, frame: Int[Tensor, "n"], p_camera: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 6"], Float[Tensor, "n 2 3"]]:
-    """Projector pixel of points in camera axes, and its derivatives by rho and by the point."""
-    T_projector_camera = inverse(rig.T_camera_projector)[frame]
-    p_projector = transform(T_projector_camera, p_camera)
-    uv, _ = project(rig.projector, p_projector)
-    by_point = project_jacobian(rig.projector, p_projector) @ T_projector_camera[:, :3, :3]
-    return uv, torch.cat([-by_point, by_point @ hat(p_camera)], -1), by_point
+def pixels_of_rows(
+    rig: Rig, anchors: Anchors, observations: Observations
+) -> tuple[Float[Tensor, "rows 2"], Bool[Tensor, "rows"]]:
+    """Where the seeing cameras have the anchors, and whether in front of them."""
+    n = len(observations.anchor)
+    uv, in_front = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
+    rows = (array(observations.anchor), array(observations.frame))
+    positions(n, rig.arrays, *_anchor_arrays(anchors), *rows, uv, in_front)
+    return torch.from_numpy(uv), torch.from_numpy(in_front)
 
 
-def _pose_columns(
-    anchors: Anchors, observations: Observations, frames: int
-) -> tuple[Int[Tensor, "anchors 6"], Int[Tensor, "rows 18"]]:
-    """The unknowns (delta of all frames, then rho of all frames) that own and cross residuals depend on."""
-    n, columns = frames, torch.arange(6)
-    i, j = observations.pairs(anchors)[..., None]
-    own = 6 * n + 6 * anchors.frame[:, None] + columns
-    return own, torch.cat([6 * i + columns, 6 * j + columns, 6 * (n + j) + columns], -1)
+def _residuals(
+    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, derivatives: tuple[Tensor, ...]
+) -> Residuals:
+    """Residuals; their derivatives are written to arrays that are not empty."""
+    own_by_pose, own_by_depth, by_pose, by_depth = (part.numpy() for part in derivatives)
+    devices, points = rig.arrays, _anchor_arrays(anchors)
+    own = np.empty((len(anchors.frame), 2))
+    own_residuals(len(own), devices, *points, array(anchors.uv_projector), own, own_by_pose, own_by_depth)
+    uv, in_front = pixels_of_rows(rig, anchors, observations)
+    seen = maps.look_up(observations.frame, uv, observations.memory)
+    cross = np.empty((len(uv), 2))
+    cross_residuals(
+        len(cross), devices, *points, array(observations.anchor), array(observations.frame),
+        array(seen.uv_projector), array(seen.jacobian), cross, by_pose, by_depth,
+    )  # fmt: skip
+    return Residuals(torch.from_numpy(own), torch.from_numpy(cross), seen.valid & in_front)
+
+
+def array(tensor: Tensor) -> ndarray:
+    """The numbers of a tensor one after the other, as compiled loops expect them."""
+    return np.ascontiguousarray(tensor.numpy())
+
+
+def _anchor_arrays(anchors: Anchors) -> tuple[ndarray, ndarray, ndarray]:
+    return array(anchors.frame), array(anchors.d_camera), array(anchors.depth)

@@ -2,13 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 
@@ -42,6 +46,18 @@ class Rig:
     def frames(self) -> int:
         """Number of frames."""
         return len(self.T_world_camera)
+
+    @cached_property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
+        """For compiled loops: poses of the cameras, their inverses, those of the cameras in their projectors; then
+        parameters and model codes of cameras and projector."""
+        poses = self.T_world_camera, inverse(self.T_world_camera), inverse(self.T_camera_projector)
+        camera, projector = self.camera, self.projector
+        T_world_camera, T_camera_world, T_projector_camera, cameras, light = (
+            np.ascontiguousarray(part.numpy()) for part in (*poses, camera.params, projector.params)
+        )
+        codes = MODELS[camera.model].code, MODELS[projector.model].code
+        return T_world_camera, T_camera_world, T_projector_camera, cameras, codes[0], light, codes[1]
 
     @property
     def T_world_projector(self) -> Float[Tensor, "frames 4 4"]:

@@ -6,11 +6,14 @@ most frames already fit, a frame that does not yet fit keeps a kernel wide enoug
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.residuals import Residuals
+from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
+from sl_nerfstudio.bundle_adjustment.loops.medians import medians_by_frame
+from sl_nerfstudio.bundle_adjustment.residuals import Residuals, array
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 
@@ -49,12 +52,11 @@ class Kernel:
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
     """Median of the cross residuals that involve each frame; infinite if there are none."""
-    size, out = r.cross.norm(dim=-1), torch.full((frames,), float("inf"), dtype=torch.float64)
-    for k in range(frames):
-        mine = r.cross_valid & (pair == k).any(0)
-        if mine.any():
-            out[k] = size[mine].median()
-    return out
+    groups = [Groups.of(array(one), frames) for one in pair]
+    out = np.empty(frames)
+    parts = [part for group in groups for part in (group.first, group.entries)]
+    medians_by_frame(frames, *parts, array(r.cross.norm(dim=-1)), array(r.cross_valid), out)
+    return torch.from_numpy(out)
 
 
 def narrowed(

@@ -93,24 +93,19 @@ def linearise_with_intrinsics(
     move = anchors.depth[:, None, None] * turn
     own_point = -linear.own[..., :3]
     own_uv = linear.residuals.own + anchors.uv_projector
-    own = torch.cat([linear.own, own_point @ move, by_intrinsics(rig.projector, own_uv)], -1)
 
     p_j = transform(
         inverse(rig.T_world_camera)[j], transform(rig.T_world_camera[i], anchors.depth[:, None] * anchors.d_camera)[a]
     )
     uv_camera = project(rig.camera[j], p_j)[0]
-    seen = maps.look_up(j, uv_camera)
+    seen = maps.look_up(j, uv_camera, observations.memory)
     move_world = (rig.T_world_camera[i, :3, :3] @ move)[a]
     by_camera = linear.cross[..., :3] @ move_world - seen.jacobian @ by_intrinsics(rig.camera[j], uv_camera)
     by_projector = by_intrinsics(rig.projector, linear.residuals.cross + seen.uv_projector)
-    columns = linear.unknowns + torch.arange(UNKNOWNS)
     return replace(
         linear,
-        own=own,
-        own_columns=torch.cat([linear.own_columns, columns.expand(len(i), UNKNOWNS)], 1),
+        own=torch.cat([linear.own, own_point @ move, by_intrinsics(rig.projector, own_uv)], -1),
         cross=torch.cat([linear.cross, by_camera, by_projector], -1),
-        cross_columns=torch.cat([linear.cross_columns, columns.expand(len(j), UNKNOWNS)], 1),
-        unknowns=linear.unknowns + UNKNOWNS,
     )
 
 

@@ -68,6 +68,8 @@ class RelocalisationSettings:
     """Most rounds of searching; frames that were found help to find the others."""
     anchors_per_frame: int = 200
     """Decoded pixels of each frame that are used."""
+    frames_per_anchor: int = 16
+    """Most other frames in which each of them is looked up."""
     most_residuals: int = 6000
     """Most residuals between one frame and all others that are used."""
     starts: int = 12

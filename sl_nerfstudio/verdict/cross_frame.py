@@ -85,11 +85,13 @@ def _variance_by_poses(
     linear: Linearisation, anchors: Anchors, rows: Observations, sigma: Float[Tensor, "frames 12"]
 ) -> Float[Tensor, "rows"]:
     """Variance of each cross residual, both coordinates together, from the stated sigma of the poses, px^2."""
-    variance = sigma.reshape(len(sigma), 2, 6).transpose(0, 1).flatten() ** 2  # delta of all frames, rho of all frames
+    variance = sigma**2
     length2 = (linear.own_depth**2).sum(-1).clamp_min(1e-300)
     depth = (linear.own_depth[:, :, None] * linear.own).sum(1) / length2[:, None]  # by the projector's pose
-    through_depth = (depth**2 * variance[linear.own_columns]).sum(-1)[rows.anchor] * (linear.cross_depth**2).sum(-1)
-    return (linear.cross**2 * variance[linear.cross_columns][:, None, :]).sum((1, 2)) + through_depth
+    through_depth = (depth**2 * variance[anchors.frame, 6:]).sum(-1)[rows.anchor] * (linear.cross_depth**2).sum(-1)
+    source, viewer = rows.pairs(anchors)
+    of_poses = torch.cat([variance[source, :6], variance[viewer]], 1)
+    return (linear.cross**2 * of_poses[:, None, :]).sum((1, 2)) + through_depth
 
 
 def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:

@@ -7,7 +7,10 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
+from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
+from sl_nerfstudio.bundle_adjustment.residuals import Linearisation
 from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.unknowns import by_kind, matrix_by_kind
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, pose, transform
@@ -110,7 +113,7 @@ class ExactMaps(CoordinateMaps):
         m = CoordinateMaps.of(images_of(rig, size))
         return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.settings, m.max_roughness, rig)
 
-    def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
+    def look_up(self, frame: Tensor, uv_camera: Tensor, memory: object = None) -> MapSample:
         uv, part = seen(self.rig, frame, uv_camera)
         valid = uv.isfinite().all(-1) & (uv_camera > 0).all(-1) & (uv_camera < int(self.widths[0])).all(-1)
         columns = []
@@ -132,3 +135,24 @@ def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03
     x = x / x.reshape(2, -1, 2, 3).pow(2).sum(-1).mean(1).sqrt().repeat_interleave(3, -1)[:, None]
     size = torch.tensor([shift] * 3 + [radians(degrees)] * 3, dtype=torch.float64)
     return rig.moved(x[0] * size, x[1] * size * relative)
+
+
+def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:
+    """The decoded coordinates of pixels inside the images."""
+    pixel = uv.long()
+    return maps.values[maps.offsets[frame] + pixel[:, 1] * maps.widths[frame] + pixel[:, 0]].double()
+
+
+def dense(equations: NormalEquations) -> tuple[Tensor, Tensor]:
+    """Matrix and gradient by delta of all frames, then rho of all frames."""
+    size, frames = equations.g.numel(), len(equations.g)
+    return matrix_by_kind(equations.H.reshape(size, size), frames), by_kind(equations.g)
+
+
+def columns_of(linear: Linearisation) -> tuple[Tensor, Tensor]:
+    """Which of these unknowns own and cross residuals depend on; those common to all frames come last."""
+    n, six = linear.frames, torch.arange(6)
+    i, j = linear.cross_frames[..., None]
+    last = 12 * n + torch.arange(linear.common)
+    own = torch.cat([6 * (n + linear.own_frame[:, None]) + six, last.expand(len(linear.own), -1)], 1)
+    return own, torch.cat([6 * i + six, 6 * j + six, 6 * (n + j) + six, last.expand(len(i), -1)], 1)

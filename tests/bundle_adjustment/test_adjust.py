@@ -11,9 +11,10 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.free_parameters import constrained, free_parameters
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_covariance, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.unknowns import by_kind, matrix_by_kind
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
@@ -119,7 +120,7 @@ class SpoiltMaps(ExactMaps):
 
     wrong: Tensor  # bool (frames, h, w)
 
-    def look_up(self, frame: Tensor, uv_camera: Tensor) -> MapSample:
+    def look_up(self, frame: Tensor, uv_camera: Tensor, memory: object = None) -> MapSample:
         found = super().look_up(frame, uv_camera)
         pixel = uv_camera.long().clamp(0, SIZE - 1)
         offset = self.wrong[frame, pixel[:, 1], pixel[:, 0]][:, None] * found.uv_projector.new_tensor([70.0, -45.0])
@@ -174,10 +175,17 @@ def test_the_covariance_is_one(known_rig):
 )
 def test_free_directions_of_each_mode(mode, columns):
     rig = rig_of(3, SIZE)
-    B = free_parameters(mode, rig)
-    assert B.shape == (36, columns)
-    x = B @ torch.randn(columns, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    delta, rho = x.reshape(2, 3, 6)
+    free = free_parameters(mode, rig)
+    assert free.count == columns
+    B = free.steps(torch.eye(columns, dtype=torch.float64)).flatten(0, 1)
+    generator = torch.Generator().manual_seed(0)
+    A, y = torch.randn(36, 36, dtype=torch.float64, generator=generator), torch.randn(36, generator=generator).double()
+    assert torch.allclose(free.matrix((A + A.T).reshape(3, 12, 3, 12)), B.T @ (A + A.T) @ B, rtol=0, atol=1e-12)
+    assert torch.allclose(free.vector(y.reshape(3, 12)), B.T @ y, rtol=0, atol=1e-12)
+    x = torch.randn(columns, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    step = free.step(x)
+    assert torch.allclose(step.flatten(), B @ x, rtol=0, atol=1e-12)
+    delta, rho = step[:, :6], step[:, 6:]
     if columns:
         assert torch.linalg.matrix_rank(B) == columns and (delta != 0).all()
     if mode == "rigid-rig":
@@ -205,6 +213,7 @@ def test_prior_equations_are_derivatives_of_the_weighted_difference():
         return sum(float((p.pow(2).sum(-1) / s**2).sum()) / 2 for p, s in zip(parts, sigmas, strict=True))
 
     H, g = prior_equations(prior, true, rig)
+    g = by_kind(g)
     step, expected = 1e-5, torch.zeros_like(g)
     for k in range(len(g)):
         x = torch.zeros(12 * n, dtype=torch.float64)
@@ -212,9 +221,11 @@ def test_prior_equations_are_derivatives_of_the_weighted_difference():
         plus, minus = (rig.moved(*(s * x).reshape(2, n, 6)) for s in (1, -1))
         expected[k] = (half_cost(plus) - half_cost(minus)) / (2 * step)
     assert (g - expected).abs().max() < 5e-3 * expected.abs().max()
-    assert torch.allclose(H, H.T) and torch.linalg.eigvalsh(H).min() > 0
+    assert torch.allclose(H, H.transpose(1, 2)) and torch.linalg.eigvalsh(H).min() > 0
     term = PriorTerm(prior, true, 3.0)
     assert term.energy(rig) == pytest.approx(6 * half_cost(rig), rel=1e-12)
-    assert torch.equal(term.equations(rig)[0], 3 * H) and torch.equal(term.equations(rig)[1], 3 * g)
+    assert torch.equal(term.equations(rig)[0], 3 * H) and torch.equal(by_kind(term.equations(rig)[1]), 3 * g)
+    inverse_H = prior_covariance(prior, rig)
+    assert torch.allclose(inverse_H, torch.linalg.inv(matrix_by_kind(torch.block_diag(*H), n)), rtol=0, atol=1e-12)
     at_start = prior_equations(prior, true, true)[1]
     assert at_start.abs().max() < 1e-12 * float(H.abs().max())

@@ -84,7 +84,6 @@ def test_outside_the_image_nothing_is_valid(uv):
     maps, frame = CoordinateMaps.of(plane_images()), torch.tensor([0])
     at = torch.tensor([uv], dtype=torch.float64)
     assert not maps.look_up(frame, at).valid.any()
-    assert maps.decoded_at(frame, at).isnan().all()
 
 
 def test_discontinuous_undecoded_and_narrow_windows_are_invalid():
@@ -114,30 +113,24 @@ def test_pixels_on_a_conic_determine_no_slope():
     assert not maps.look_up(torch.tensor([0]), torch.tensor([[20.0, 4.0]], dtype=torch.float64)).valid[0]
 
 
-def test_the_pixel_under_a_position():
-    images = plane_images()
-    images[1][3, 4] = NAN
-    maps = CoordinateMaps.of(images)
-    at = torch.tensor([[0.0, 0.0], [16.999, 24.999], [4.2, 3.9], [5.0, 3.9]], dtype=torch.float64)
-    found = maps.decoded_at(torch.ones(4, dtype=torch.long), at)
-    assert torch.equal(found[0], images[1][0, 0].double()) and torch.equal(found[1], images[1][24, 16].double())
-    assert found[2].isnan().all() and torch.equal(found[3], images[1][3, 5].double())
-
-
 def test_drawn_pixels_are_decoded_spread_out_and_the_same_for_one_seed():
     images = plane_images()
     images[0][:, :10] = NAN
     maps = CoordinateMaps.of(images)
-    uv = maps.draw(0, 40, torch.Generator().manual_seed(3))
-    assert torch.equal(uv, maps.draw(0, 40, torch.Generator().manual_seed(3)))
+    both = maps.draw(torch.arange(2), 40, torch.Generator().manual_seed(3))
+    again = maps.draw(torch.tensor([1, 0]), 40, torch.Generator().manual_seed(3))
+    uv = both.uv_camera[both.frame == 0]
+    assert torch.equal(uv, again.uv_camera[again.frame == 0])
+    assert not torch.equal(uv, maps.draw(torch.tensor([0]), 40, torch.Generator().manual_seed(4)).uv_camera)
+    assert len(both.frame) == 80 and both.uv_camera[both.frame == 1].amax() > 17  # the second frame is higher than wide
     assert len(uv) == 40 and len(torch.unique(uv, dim=0)) == 40
     assert torch.equal(uv.frac(), torch.full_like(uv, 0.5)) and (uv[:, 0] > 10).all()
     squares = torch.unique((uv / 3).long(), dim=0)  # 400 decoded pixels for 40: one of each 3 x 3
     assert len(squares) == 40
-    few = maps.draw(0, 1000, torch.Generator())
-    assert len(few) == 400
+    few = maps.draw(torch.tensor([0]), 1000, torch.Generator())
+    assert len(few.frame) == 400
     images[0][:] = NAN
-    assert maps.__class__.of(images).draw(0, 40, torch.Generator()).shape == (0, 2)
+    assert maps.__class__.of(images).draw(torch.tensor([0]), 40, torch.Generator()).uv_camera.shape == (0, 2)
 
 
 def test_maps_that_are_noisy_everywhere_are_used_and_their_discontinuities_still_found():

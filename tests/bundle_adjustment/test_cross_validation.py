@@ -9,7 +9,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.cross_validation import HeldOutPixels, cross_validate, mean_and_error
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 
-from .analytic import ExactMaps, disturbed, rig_of
+from .analytic import ExactMaps, decoded_at, disturbed, rig_of
 
 FRAMES, SIZE, NOISE = 4, 60, 1.0
 WIDTH = 4 * NOISE
@@ -28,11 +28,11 @@ def maps(true) -> CoordinateMaps:
 @pytest.fixture(scope="module")
 def held_out(maps) -> HeldOutPixels:
     generator = torch.Generator().manual_seed(0)
-    uv = [maps.draw(k, 80, generator) for k in range(FRAMES)]
-    frame = torch.arange(FRAMES).repeat_interleave(torch.tensor([len(u) for u in uv]))
-    pixel = torch.cat(uv).long() // 8
+    drawn = maps.draw(torch.arange(FRAMES), 160, generator)
+    frame, uv = drawn.frame, drawn.uv_camera
+    pixel = uv.long() // 8
     block = 64 * frame + 8 * pixel[:, 1] + pixel[:, 0]
-    return HeldOutPixels(frame, torch.cat(uv), maps.decoded_at(frame, torch.cat(uv)), block)
+    return HeldOutPixels(frame, uv, decoded_at(maps, frame, uv), block)
 
 
 @pytest.mark.parametrize("kind", ["frames", "projectors"])

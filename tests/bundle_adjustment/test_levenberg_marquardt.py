@@ -14,8 +14,9 @@ from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.settings import StepSettings
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind, matrix_by_kind
 
-from .analytic import ExactMaps, disturbed, rig_of
+from .analytic import ExactMaps, dense, disturbed, rig_of
 
 FRAMES, SIZE = 4, 80
 SETTINGS = StepSettings()
@@ -80,16 +81,17 @@ def test_an_undamped_step_solves_the_normal_equations(scene):
     kernel = Kernel(torch.full((FRAMES,), 1e3, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
     linear, prior = linearise(rig, anchors, rows, maps), prior_of(1.0, rig)
     settings = replace(SETTINGS, damping=0.0, least_depth=0.0, most_depth=10.0)
-    B = free_parameters("free", rig)
-    found = lm_step(LMState(rig, anchors, 0.0), linear, rows, maps, kernel, prior, B, settings)
+    free = free_parameters("free", rig)
+    found = lm_step(LMState(rig, anchors, 0.0), linear, rows, maps, kernel, prior, free, settings)
     equations = normal_equations(linear, rows, *kernel.weights(linear.residuals))
-    H, g = prior.equations(rig)
-    x = -torch.linalg.solve(equations.H + H, equations.g + g)
+    H, g = dense(equations)
+    H_prior, g_prior = prior.equations(rig)
+    x = -torch.linalg.solve(H + matrix_by_kind(torch.block_diag(*H_prior), FRAMES), g + by_kind(g_prior))
     wanted = rig.moved(*x.reshape(2, FRAMES, 6))
     assert 1e-5 < found.size < 0.05
     assert torch.allclose(found.rig.T_world_camera, wanted.T_world_camera, atol=1e-9)
     assert torch.allclose(found.rig.T_camera_projector, wanted.T_camera_projector, atol=1e-9)
-    assert torch.allclose(found.anchors.depth, anchors.depth + equations.depth_step(x), atol=1e-9)
+    assert torch.allclose(found.anchors.depth, anchors.depth + equations.depth_step(by_frame(x)), atol=1e-9)
 
 
 def test_with_nothing_free_nothing_moves(scene):

@@ -56,8 +56,6 @@ def test_columns_are_central_differences_of_the_residuals(projector):
     ok = linear.residuals.cross_valid
     assert ok.sum() > 100 and wide.unknowns == linear.unknowns + 6
     assert torch.equal(wide.own[..., :6], linear.own) and torch.equal(wide.cross[..., :18], linear.cross)
-    assert (wide.own_columns[:, 6:] == linear.unknowns + torch.arange(6)).all()
-    assert (wide.cross_columns[:, 18:] == linear.unknowns + torch.arange(6)).all()
     step = 1e-6
     for k in (*CAMERA, *PROJECTOR):
         plus, minus = (residuals_of(*with_change(rig, anchors, k, s * step), rows, maps) for s in (1, -1))
@@ -79,7 +77,7 @@ def adjusted(
         true, camera=changed(true.camera, camera_change), projector=changed(true.projector, projector_change)
     )
     parts = (torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.03, 0.02, 0.05, 0.02))
-    settings = AdjustmentSettings(anchors_per_frame=60, frames_per_anchor=3, max_iterations=14)
+    settings = AdjustmentSettings(anchors_per_frame=120, frames_per_anchor=3, max_iterations=14)
     return adjust(stated, ExactMaps.around(true, SIZE), PosePrior(*parts, sigma, refined), "free", settings)
 
 

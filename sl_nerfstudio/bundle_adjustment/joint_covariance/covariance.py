@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_covariance
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -40,18 +40,25 @@ class JointCovariance:
         cross = np.cross(np.eye(3), t).T  # cross @ w = w x t
         frame = np.block([[s * R, -cross @ R], [np.zeros((3, 3)), R]])
         relative = np.diag([s] * 3 + [1.0] * 3)
-        J = np.zeros_like(self.matrix)
-        for k in range(self.frames):
-            delta, rho = (slice(first, first + 6) for first in (6 * k, 6 * (self.frames + k)))
-            J[delta, delta], J[rho, rho] = frame, relative
-        J[-UNKNOWNS:, -UNKNOWNS:] = np.eye(UNKNOWNS)
-        return JointCovariance(J @ self.matrix @ J.T)
+        once = _rows_mapped(self.matrix, frame, relative)
+        return JointCovariance(_rows_mapped(once.T, frame, relative))
+
+
+def _rows_mapped(
+    matrix: Float64[ndarray, "joint k"], frame: Float64[ndarray, "6 6"], relative: Float64[ndarray, "6 6"]
+) -> Float64[ndarray, "joint k"]:
+    """Every frame's rows under one linear map of its delta and one of its rho."""
+    half = (len(matrix) - UNKNOWNS) // 2
+    out = matrix.copy()
+    for first, J in ((0, frame), (half, relative)):
+        part = slice(first, first + half)
+        out[part] = (J @ matrix[part].reshape(-1, 6, matrix.shape[1])).reshape(half, -1)
+    return out
 
 
 def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint joint"]:
     """The covariance before any residual is computed."""
-    H, _ = prior_equations(prior, start, start)
-    return torch.block_diag(torch.linalg.inv(H), (prior.intrinsics_sigma**2).diag())
+    return torch.block_diag(prior_covariance(prior, start), (prior.intrinsics_sigma**2).diag())
 
 
 def packed(joint: Float[Tensor, "joint joint"]) -> Float[Tensor, "entries"]:

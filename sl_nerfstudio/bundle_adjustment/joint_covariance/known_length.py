@@ -13,6 +13,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 
 def with_known_length(
@@ -23,12 +24,15 @@ def with_known_length(
     growth[: len(log_length)] = gauge_directions(rig)[:, 6]
     known = torch.zeros_like(growth)
     known[: len(log_length)] = log_length
-    P = torch.eye(len(joint), dtype=torch.float64) - torch.outer(growth, known) / (known @ growth)
-    return P @ joint @ P.T
+    known = known / (known @ growth)
+    once = joint - torch.outer(growth, known @ joint)
+    return once - torch.outer(once @ known, growth)
 
 
 def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
     """That of the scale which agrees best with the starting poses (`gauge.agreeing_scale`)."""
     H, _ = prior_equations(prior, rig, rig)
-    G = gauge_directions(rig)
-    return torch.linalg.solve(G.T @ H @ G, G.T @ H)[6]
+    G = by_frame(gauge_directions(rig))
+    by_step = H @ G
+    information = (G.transpose(1, 2) @ by_step).sum(0)
+    return torch.linalg.solve(information, by_kind(by_step).T)[6]
