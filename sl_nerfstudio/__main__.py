@@ -22,6 +22,7 @@ _EXTRAS = {
     "show": "patterns on a display (sl-pattern --show, sl-capture)",
     "phone": "photographs of phones (.heic)",
     "video": "captures from a video",
+    "cuda": "the field's own kernels on NVIDIA GPUs",
 }
 _GROUPS = {"nerfstudio.method_configs": "methods", "nerfstudio.dataparser_configs": "dataparsers"}
 _AGREE = 1e-4  # scene units; the backends differ by rounding, some 1e-7
@@ -133,6 +134,9 @@ def backends() -> str:
         small.backend = "torch"
         if torch.cuda.is_available():
             values["torch on cuda"] = field.to("cuda").sdf(points.to("cuda")).cpu()
+            if field.obstacle("warp") is None:
+                small.backend = "warp"
+                values["warp on cuda"] = field.sdf(points.to("cuda")).cpu()
     worst = {name: float((value - values["torch on cpu"]).abs().max()) for name, value in values.items()}
     wrong = [name for name, difference in worst.items() if not difference < _AGREE]
     if wrong:

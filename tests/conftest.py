@@ -10,7 +10,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from jaxtyping import install_import_hook
 
-install_import_hook("sl_nerfstudio", "beartype.beartype")
+import tests.type_checks  # noqa: F401  (the next line finds it by its name)
+
+install_import_hook("sl_nerfstudio", "tests.type_checks.checked")
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sl_nerfstudio.field.backend import FieldBackend, FieldState
+from sl_nerfstudio.field.backend import FieldBackend, FieldState, MergedBackend
 from sl_nerfstudio.field.table_gradient import TableGradient, Wanted, wanted
 
 
@@ -39,15 +39,15 @@ def _target(ctx: Any) -> _Target:
 
 
 def _keep(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, tensors: tuple[Tensor, ...]) -> FieldState:
-    p, level_weights, table, *mlp = tensors
+    p, places, level_weights, table, *mlp = tensors
     ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
-    ctx.save_for_backward(p, level_weights.clone(), table, *mlp)  # torch checks that none changes before backward()
-    return FieldState(table, level_weights, tuple(mlp))
+    ctx.save_for_backward(p, places, level_weights.clone(), table, *mlp)  # torch checks that none changes meanwhile
+    return FieldState(table, level_weights, tuple(mlp), places)
 
 
 def _kept(ctx: Any) -> tuple[Tensor, FieldState]:
-    p, level_weights, table, *mlp = ctx.saved_tensors
-    return p, FieldState(table, level_weights, tuple(mlp))
+    p, places, level_weights, table, *mlp = ctx.saved_tensors
+    return p, FieldState(table, level_weights, tuple(mlp), places)
 
 
 class _Value(torch.autograd.Function):
@@ -63,7 +63,7 @@ class _Value(torch.autograd.Function):
         result = ctx.backend.pull_back(
             state, p, grad_outputs[0], ctx.needs_input_grad[2], to.parameters, to.table, to.marks
         )
-        return (None, None, result.points, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
+        return (None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
 
 
 class _ValueAndGradient(torch.autograd.Function):
@@ -83,11 +83,44 @@ class _ValueAndGradient(torch.autograd.Function):
         mlp: tuple[Tensor | None, ...] = (None,) * len(state.mlp)
         if to.parameters:
             mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to.table, to.marks)
-        return (None, None, None, None, to.returned, *mlp)
+        return (None, None, None, None, None, to.returned, *mlp)
+
+
+class _Merged(torch.autograd.Function):
+    """Values at points, and values with gradients at others, by a backend that evaluates them together."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        p, q, places, level_weights, table, *mlp = tensors
+        ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
+        state = FieldState(table, level_weights, tuple(mlp), places)
+        f, gradient, ctx.kept = backend.evaluate_all(state, _together(p, q), len(p))
+        ctx.save_for_backward(p, places, level_weights, table, *mlp)
+        return f[: len(p)], f[len(p) :], gradient
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        p, state = _kept(ctx)
+        to = _target(ctx)
+        g = _together(grad_outputs[0], grad_outputs[1])
+        wanted_points = ctx.needs_input_grad[2]
+        points = len(p) if wanted_points else 0
+        result = ctx.backend.pull_back_all(
+            state, ctx.kept, g, grad_outputs[2].contiguous(), points, to.parameters, to.table, to.marks
+        )
+        dp = result.points if wanted_points else None
+        return (None, None, dp, None, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
+
+
+def _together(a: Tensor, b: Tensor) -> Tensor:
+    return torch.cat([a, b]) if len(a) and len(b) else (a if len(a) else b).contiguous()
 
 
 def value(
-    backend: FieldBackend,
+    backend: FieldBackend | MergedBackend,
     buffer: TableGradient | None,
     state: FieldState,
     p: Float[Tensor, "n 3"],
@@ -96,20 +129,38 @@ def value(
 
     If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
+    if isinstance(backend, MergedBackend):
+        return _apply(_Merged, backend, buffer, state, p, p[:0])[0]
     return _apply(_Value, backend, buffer, state, p)
 
 
 def value_and_gradient(
-    backend: FieldBackend,
+    backend: FieldBackend | MergedBackend,
     buffer: TableGradient | None,
     state: FieldState,
     p: Float[Tensor, "n 3"],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
+    if isinstance(backend, MergedBackend):
+        return _apply(_Merged, backend, buffer, state, p.detach()[:0], p.detach())[1:]
     return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
 
 
-def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
+def values_and_gradients(
+    backend: FieldBackend | MergedBackend,
+    buffer: TableGradient | None,
+    state: FieldState,
+    p: Float[Tensor, "n 3"],
+    q: Float[Tensor, "k 3"],
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "k"], Float[Tensor, "k 3"]]:
+    """`value` at `p`, and `value_and_gradient` at `q`: together if the backend can, which saves launches on a GPU."""
+    if isinstance(backend, MergedBackend):
+        return _apply(_Merged, backend, buffer, state, p, q.detach())
+    return value(backend, buffer, state, p), *value_and_gradient(backend, buffer, state, q)
+
+
+def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: FieldState, *points: Tensor) -> Any:
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
-    with torch.autocast(p.device.type, enabled=False):
-        return function.apply(backend, buffer, p.to(state.table.dtype), state.level_weights, state.table, *state.mlp)
+    same = [p.to(state.table.dtype) for p in points]
+    with torch.autocast(points[0].device.type, enabled=False):
+        return function.apply(backend, buffer, *same, state.places, state.level_weights, state.table, *state.mlp)

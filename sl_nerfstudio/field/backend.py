@@ -5,15 +5,16 @@ An implementation evaluates the field inside and outside its box and pulls gradi
 """
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
 from sl_nerfstudio.field.hash_grid import GridLayout
 
-BackendName = Literal["auto", "torch", "numba"]
+BackendName = Literal["auto", "torch", "numba", "warp"]
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class FieldState:
     level_weights: Float[Tensor, "levels"]
     mlp: tuple[Tensor, ...]
     """Weight and bias of each layer, input to output."""
+    places: Int32[Tensor, "levels 3"]
+    """Where the levels are in the table, see `HashGrid`."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,42 @@ class FieldBackend(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Kept:
+    """What a `MergedBackend` keeps between an evaluation and its pull-back."""
+
+
+@runtime_checkable
+class MergedBackend(Protocol):
+    """An implementation that evaluates all points together: values of all, gradients of those from `first` on.
+
+    Below, n is the number of points and k = n - first.
+    """
+
+    def evaluate_all(
+        self, state: FieldState, p: Float[Tensor, "n 3"], first: int
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Kept]:
+        """Values, gradients of the points from `first` on, and what the pull-back needs."""
+        ...
+
+    def pull_back_all(
+        self,
+        state: FieldState,
+        kept: Kept,
+        g: Float[Tensor, "n"],
+        v: Float[Tensor, "k 3"],
+        points: int,
+        parameters: bool,
+        table_gradient: Float[Tensor, "rows f"] | None,
+        marks: UInt8[Tensor, "marks"] | None,
+    ) -> Pulled:
+        """Gradients of `sum g f + v . grad f`: by the first `points` points, none of which may have gradients.
+
+        On request also by the parameters; the table's as in `FieldBackend`.
+        """
+        ...
+
+
 def numba_cannot(layout: GridLayout, table: Tensor) -> str | None:
     """Why the compiled kernels cannot serve a field, or None if they can."""
     if table.device.type != "cpu":
@@ -82,3 +121,18 @@ def numba_cannot(layout: GridLayout, table: Tensor) -> str | None:
     if layout.features != 8:
         return f"the numba backend needs 8 features per level, the field has {layout.features}"
     return None
+
+
+def warp_cannot(layout: GridLayout, table: Tensor) -> str | None:
+    """Why the kernels for GPUs cannot serve a field, or None if they can; only imports Warp if all else fits."""
+    if table.dtype != torch.float32:
+        return f"the warp backend computes in float32, the field is {table.dtype}"
+    if layout.features != 8:
+        return f"the warp backend needs 8 features per level, the field has {layout.features}"
+    if table.device.type not in ("cpu", "cuda"):
+        return f"the warp backend runs on CUDA and on the CPU, the field is on {table.device}"
+    if find_spec("warp") is None:
+        return "the warp backend needs the package warp-lang: pip install 'sl-nerfstudio[cuda]'"
+    from sl_nerfstudio.device_kernels import obstacle
+
+    return obstacle(table.device)

@@ -69,15 +69,23 @@ class GridLayout:
 
 
 class HashGrid(nn.Module):
-    """The table of a feature grid and the weights that fade its levels in."""
+    """The table of a feature grid and the weights that fade its levels in.
+
+    `places` tells kernels for GPUs where the levels are: of each its resolution, its first row, and the bits that a
+    hash keeps (0 if the level is not hashed).
+    """
 
     level_weights: Tensor
+    places: Tensor
 
     def __init__(self, layout: GridLayout):
         super().__init__()
         self.layout = layout
         self.table = nn.Parameter(torch.empty(layout.rows, layout.features).uniform_(-1e-4, 1e-4))
         self.register_buffer("level_weights", torch.ones(layout.levels))
+        kept = [size - 1 if hashed else 0 for size, hashed in zip(layout.sizes, layout.hashed, strict=True)]
+        places = torch.tensor([layout.resolutions, layout.offsets, kept], dtype=torch.int32).T.contiguous()
+        self.register_buffer("places", places, persistent=False)
 
     def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
         """Fade levels: 0 switches a level off, 1 is its full strength.

@@ -2,12 +2,14 @@
 
 A batch of points touches a fraction of the table. As in Müller et al. (Instant Neural Graphics Primitives, 2022), rows
 whose gradient is exactly zero are skipped: moments and bias correction count a row's own steps. On the CPU the skipped
-rows are not even read, and a step clears the gradient, so that the next backward pass does not have to.
+rows are not even read. There and in the kernel for GPUs a step clears the gradient, so that the next backward pass does
+not have to. The learning rate may be a tensor, which a CUDA graph of the step reads each time.
 """
 
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -25,9 +27,10 @@ class RowAdam(Optimizer):
     """Adam that skips the rows (first dimension) of a parameter whose gradient is exactly zero."""
 
     def __init__(
-        self, params: Any, lr: float = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-15
+        self, params: Any, lr: float | Tensor = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-15
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+        self._uploaded: dict[Any, Tensor] = {}
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
@@ -53,17 +56,29 @@ class RowAdam(Optimizer):
         states = {key: _unpacked(state) for key, state in state_dict["state"].items()}
         super().load_state_dict({**state_dict, "state": states})
 
-    def _step(self, parameter: nn.Parameter, lr: float, beta1: float, beta2: float, eps: float) -> None:
+    def _step(self, parameter: nn.Parameter, lr: float | Tensor, beta1: float, beta2: float, eps: float) -> None:
         state = self.state[parameter]
         if not state:
             state["moments"] = parameter.new_zeros(len(parameter), 2, *parameter.shape[1:])  # mean, mean square
             state["steps"] = torch.zeros(len(parameter), device=parameter.device)
-        corrections = _corrections(beta1, beta2)
         buffer = TableGradient.known(parameter)
-        if buffer is not None and buffer.holds(parameter.grad):
-            _step_marked(parameter, buffer, state, corrections, lr, beta1, beta2, eps)
+        if buffer is not None and not buffer.holds(parameter.grad):
+            buffer = None
+        if _device_kernel_can(parameter):
+            _step_device(parameter, state, lr, beta1, beta2, eps)
+            if buffer is not None:
+                buffer.note_zero()
+        elif buffer is not None and parameter.device.type == "cpu":
+            _step_marked(parameter, buffer, state, _corrections(beta1, beta2), lr, beta1, beta2, eps)
         else:
-            _step_any(parameter, state, torch.from_numpy(corrections), lr, beta1, beta2, eps)
+            _step_any(parameter, state, self._corrections_on(parameter.device, beta1, beta2), lr, beta1, beta2, eps)
+
+    def _corrections_on(self, device: torch.device, beta1: float, beta2: float) -> Tensor:
+        """`_corrections` on a device: uploaded once."""
+        key = (device, beta1, beta2)
+        if key not in self._uploaded:
+            self._uploaded[key] = torch.from_numpy(_corrections(beta1, beta2)).to(device)
+        return self._uploaded[key]
 
 
 def _packed(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -100,7 +115,7 @@ def _step_marked(
     buffer: TableGradient,
     state: dict[str, Tensor],
     corrections: np.ndarray,
-    lr: float,
+    lr: float | Tensor,
     beta1: float,
     beta2: float,
     eps: float,
@@ -117,11 +132,42 @@ def _step_marked(
     increment_version(parameter)
 
 
+def _device_kernel_can(parameter: Tensor) -> bool:
+    """Whether a table is on a GPU for which there is a kernel."""
+    row = (parameter.dtype, *parameter.shape[1:])
+    if parameter.device.type != "cuda" or row != (torch.float32, 8) or find_spec("warp") is None:
+        return False
+    from sl_nerfstudio.device_kernels import obstacle
+
+    return obstacle(parameter.device) is None
+
+
+def _step_device(
+    parameter: nn.Parameter,
+    state: dict[str, Tensor],
+    lr: float | Tensor,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """The step as one kernel; clears the gradient."""
+    from sl_nerfstudio.device_kernels import launch
+    from sl_nerfstudio.field.warp_kernels.adam import row_adam
+
+    assert parameter.grad is not None
+    rate = lr.reshape(1) if isinstance(lr, Tensor) else torch.full((1,), lr, device=parameter.device)
+    most = float(len(_corrections(beta1, beta2)) - 1)
+    tensors = (parameter, parameter.grad, state["moments"], state["steps"], rate)
+    logarithms = [math.log(beta) if beta > 0 else -math.inf for beta in (beta1, beta2)]
+    launch(row_adam, len(parameter), *tensors, *logarithms, most, eps)
+    increment_version([parameter, parameter.grad])
+
+
 def _step_any(
     parameter: nn.Parameter,
     state: dict[str, Tensor],
     corrections: Tensor,
-    lr: float,
+    lr: float | Tensor,
     beta1: float,
     beta2: float,
     eps: float,

@@ -7,6 +7,7 @@ box: `f(p) = f(q) + |p - q|` with `q` the nearest point of the box.
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -14,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.field.autograd import value, value_and_gradient
-from sl_nerfstudio.field.backend import BackendName, FieldBackend, FieldState, numba_cannot
+from sl_nerfstudio.field.autograd import value, value_and_gradient, values_and_gradients
+from sl_nerfstudio.field.backend import BackendName, FieldBackend, FieldState, MergedBackend, numba_cannot, warp_cannot
 from sl_nerfstudio.field.hash_grid import GridLayout, HashGrid
 from sl_nerfstudio.field.table_gradient import TableGradient
 from sl_nerfstudio.field.torch_backend import TorchField, knee
@@ -46,7 +47,8 @@ class FieldConfig:
     sphere_radius: float = 0.5
     """Radius, in scene units, of the sphere the field starts from."""
     backend: BackendName = "auto"
-    """numba: compiled for this CPU; torch: any device and precision; auto: numba wherever it works."""
+    """numba: compiled for this CPU; warp: kernels for GPUs, which need the extra [cuda]; torch: any device and
+    precision; auto: numba on the CPU and warp on GPUs, wherever they work."""
 
 
 class SDFField(nn.Module):
@@ -68,7 +70,7 @@ class SDFField(nn.Module):
         widths = [3 + self.encoding.layout.width] + [config.hidden] * config.hidden_layers + [1]
         self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         self._torch = TorchField(self.encoding.layout, config.knee)
-        self._numba: FieldBackend | None = None
+        self._compiled: dict[str, FieldBackend | MergedBackend] = {}
         self._start_as_sphere(config.sphere_radius)
 
     def _start_as_sphere(self, radius: float) -> None:
@@ -130,18 +132,37 @@ class SDFField(nn.Module):
 
     def _state(self) -> FieldState:
         mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
-        return FieldState(self.encoding.table, self.encoding.level_weights, mlp)
+        encoding = self.encoding
+        return FieldState(encoding.table, encoding.level_weights, mlp, encoding.places)
 
-    def _backend(self, state: FieldState) -> FieldBackend:
-        name = self.config.backend
-        obstacle = numba_cannot(self.encoding.layout, state.table)
-        if name == "torch" or (name == "auto" and obstacle is not None):
+    def sdf_and_gradients(
+        self, p: Float[Tensor, "n 3"], q: Float[Tensor, "k 3"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k"], Float[Tensor, "k 3"]]:
+        """`sdf(p)` and `sdf_and_gradient(q)`, which cost the fewest launches together."""
+        state = self._state()
+        return values_and_gradients(self._backend(state), self._buffer(state), state, p, q)
+
+    def obstacle(self, backend: Literal["numba", "warp"]) -> str | None:
+        """Why a compiled backend cannot serve the field where it is, or None if it can."""
+        cannot = numba_cannot if backend == "numba" else warp_cannot
+        return cannot(self.encoding.layout, self.encoding.table)
+
+    def _backend(self, state: FieldState) -> FieldBackend | MergedBackend:
+        name, table = self.config.backend, state.table
+        if name == "auto":
+            name = "numba" if table.device.type == "cpu" else "warp" if table.device.type == "cuda" else "torch"
+        if name == "torch":
+            return self._torch
+        obstacle = self.obstacle(name)
+        if obstacle is not None and self.config.backend == "auto":
             return self._torch
         if obstacle is not None:
             raise UserError(f"{obstacle}; choose the backend auto or torch")
-        if self._numba is None:
-            self._numba = _numba_field(self.encoding.layout, self.config.knee)
-        return self._numba
+        if name not in self._compiled:
+            self._compiled[name] = (_numba_field if name == "numba" else _warp_field)(
+                self.encoding.layout, self.config.knee
+            )
+        return self._compiled[name]
 
     def _buffer(self, state: FieldState) -> TableGradient | None:
         """The table's persistent gradient buffer, if the compiled kernels write to one."""
@@ -153,3 +174,10 @@ def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:
     from sl_nerfstudio.field.numba_backend import NumbaField
 
     return NumbaField(layout, knee)
+
+
+def _warp_field(layout: GridLayout, knee: float) -> MergedBackend:
+    """The backend for GPUs; Warp is imported only when it is needed."""
+    from sl_nerfstudio.field.warp_backend import WarpField
+
+    return WarpField(layout, knee)

@@ -39,21 +39,23 @@ def wanted(parameter: Tensor) -> Wanted:
 class TableGradient:
     """Gradient buffer of a table, reused from step to step (a new one of 44 MB costs 20 ms in page faults).
 
-    Rows that are not zero are marked, so that clearing and the optimiser need not read the others. Kernels do not
-    increase torch's version counter. If the counter has changed, something else wrote to the buffer, and every row
-    counts as marked.
+    Rows that are not zero are marked, so that clearing and the optimiser need not read the others; on a GPU there are
+    no marks, because reading all rows costs less. Kernels do not increase torch's version counter. If the counter has
+    changed, something else wrote to the buffer, and every row counts as marked.
     """
 
     def __init__(self, table: Tensor):
         self.buffer = torch.zeros_like(table, memory_format=torch.contiguous_format)
-        self.marks = torch.zeros(-(-len(table) // 8) * 8, dtype=torch.uint8)
+        marks = -(-len(table) // 8) * 8 if table.device.type == "cpu" else 0
+        self.marks = torch.zeros(marks, dtype=torch.uint8, device=table.device)
         self._version = self.buffer._version
+        self._is_zero = True
 
     @staticmethod
     def known(table: Tensor) -> "TableGradient | None":
         """The buffer of a table, if there is one."""
         known = getattr(table, "_sl_gradient", None)
-        return known if isinstance(known, TableGradient) and known.buffer.shape == table.shape else None
+        return known if isinstance(known, TableGradient) and known._fits(table) else None
 
     @staticmethod
     def of(table: nn.Parameter) -> "TableGradient":
@@ -71,7 +73,15 @@ class TableGradient:
         elif not self.holds(table.grad):
             return table.grad
         self.trusted_marks()
+        self._is_zero = False
         return self.buffer
+
+    def note_zero(self) -> None:
+        """To be called by an optimiser that has set the whole buffer to zero."""
+        self._is_zero, self._version = True, self.buffer._version
+
+    def _fits(self, table: Tensor) -> bool:
+        return self.buffer.shape == table.shape and self.buffer.device == table.device
 
     def holds(self, gradient: Tensor | None) -> bool:
         """Whether a gradient is this buffer."""
@@ -92,6 +102,11 @@ class TableGradient:
 
     def clear(self) -> None:
         """Set the buffer to zero."""
+        if self.buffer.device.type != "cpu":
+            if not self._is_zero or self.buffer._version != self._version:
+                self.buffer.zero_()
+                self.note_zero()
+            return
         marks, gradient = self.trusted_marks().numpy(), self.buffer.numpy().reshape(-1)
 
         def work(start: int, stop: int) -> None:

@@ -13,6 +13,7 @@ from sl_nerfstudio.field.torch_backend import knee
 from tests.field.fields import make_field, plain_sdf, points_around, relative
 
 CASES = [("torch", torch.float64, 1e-12), ("torch", torch.float32, 1e-5), ("numba", torch.float32, 1e-5)]
+CASES += [("warp", torch.float32, 1e-5)]
 OPTIONS = [{}, {"smooth": True}, {"hidden_layers": 1, "hidden": 40}, {"hidden_layers": 3}]
 WEIGHTS = torch.tensor([1.0, 0.5, 0.0, 0.25])
 
@@ -90,7 +91,7 @@ def test_starts_as_a_sphere() -> None:
     assert float(direction[p.norm(dim=-1) > 0.2].min()) > 0.9
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
 def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
     field = make_field(backend)
     on_face = torch.tensor([[1.0, 0.3, -0.2], [0.1, -1.0, 0.7], [1.0, 1.0, -1.0]])
@@ -102,7 +103,7 @@ def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
     torch.testing.assert_close(slope, torch.ones(3), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
 def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> None:
     field = make_field(backend)
     p = points_around(200).float()
@@ -267,7 +268,7 @@ def test_auto_uses_the_compiled_kernels_on_a_cpu() -> None:
     assert torch.equal(make_field("auto").sdf(p), make_field("numba").sdf(p))
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
 def test_mixed_precision_does_not_affect_the_field(backend: str) -> None:
     field, p = make_field(backend), points_around(50).float()
     exact = field.sdf(p)

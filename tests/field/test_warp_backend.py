@@ -1,0 +1,141 @@
+"""The kernels for GPUs, run on the CPU: against the plain field; besides, few launches and no waits."""
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import warp
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sl_nerfstudio.device_kernels import launches, obstacle
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.field import backend as backend_module
+from sl_nerfstudio.field.row_adam import _corrections, _step_any, _step_device
+from tests.field.fields import make_field, points_around, relative
+
+
+def gradients_of(field: Any, p: Tensor, q: Tensor) -> tuple[list[Tensor], list[Any]]:
+    """Values, and gradients by points and parameters, of a loss on values at `p` and values and gradients at `q`."""
+    p = p.to(field.encoding.table.dtype).requires_grad_()
+    f, f_q, n = field.sdf_and_gradients(p, q.to(p.dtype))
+    loss = f.square().sum() + (3 * f_q + (n.norm(dim=-1) - 1).square()).sum() + (n[:, 0] * f_q).sum()
+    loss.backward()
+    return [f.detach(), f_q.detach(), n.detach()], [p.grad, *(x.grad.clone() for x in field.parameters())]
+
+
+@pytest.mark.parametrize("counts", [(300, 200), (0, 50), (50, 0), (1, 1), (0, 0)])
+def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(counts: tuple[int, int]) -> None:
+    p, q = points_around(counts[0]), points_around(counts[1], seed=2)
+    plain, ours = make_field("torch", torch.float64), make_field("warp")
+    for got, wanted in zip(gradients_of(ours, p, q), gradients_of(plain, p, q), strict=True):
+        for a, b in zip(got, wanted, strict=True):
+            assert a.shape == b.shape
+            assert b.numel() == 0 or float((a - b).abs().max()) <= 1e-5 * max(float(b.abs().max()), 1.0)
+
+
+def test_backward_accumulates_and_autograd_grad_leaves_grad_alone() -> None:
+    field, plain, p = make_field("warp"), make_field("torch"), points_around(100).float()
+    for _ in range(2):
+        field.sdf(p).sum().backward()
+        plain.sdf(p).sum().backward()
+    for ours, theirs in zip(field.parameters(), plain.parameters(), strict=True):
+        assert relative(ours.grad, theirs.grad) < 1e-5
+    field.zero_grad()
+    results = [torch.autograd.grad(f.sdf(p).sum(), list(f.parameters())) for f in (field, plain)]
+    for ours, theirs in zip(*results, strict=True):
+        assert relative(ours, theirs) < 1e-5
+    assert all(x.grad is None for x in field.parameters())
+
+
+def test_the_step_of_the_table_is_the_plain_one_and_clears_the_gradient() -> None:
+    torch.manual_seed(0)
+    ours, plain = nn.Parameter(torch.randn(500, 8)), nn.Parameter(torch.empty(500, 8))
+    plain.data.copy_(ours.data)
+    rate = torch.tensor(0.02)
+    states = [{"moments": torch.zeros(500, 2, 8), "steps": torch.zeros(500)} for _ in range(2)]
+    for step in range(12):
+        gradient = torch.randn(500, 8) * (torch.rand(500, 1) < 0.6)
+        ours.grad, plain.grad = gradient.clone(), gradient.clone()
+        lr: float | Tensor = rate if step % 2 else 0.02  # a tensor is read by the kernel, not when it is queued
+        _step_device(ours, states[0], lr, 0.9, 0.99, 1e-8)
+        with torch.no_grad():
+            _step_any(plain, states[1], torch.from_numpy(_corrections(0.9, 0.99)), 0.02, 0.9, 0.99, 1e-8)
+        assert not bool(ours.grad.any())
+    assert relative(ours, plain) < 1e-6
+    assert torch.equal(states[0]["steps"], states[1]["steps"])
+
+
+def test_long_runs_correct_the_moments_as_exactly_as_the_plain_step() -> None:
+    """1 - beta^t in single precision, from the first step to the last that differs from 1."""
+    for t in (1.0, 2.0, 30.0, 3000.0, 16000.0):
+        ours, plain = nn.Parameter(torch.zeros(1, 8)), nn.Parameter(torch.zeros(1, 8))
+        states = [{"moments": torch.rand(1, 2, 8), "steps": torch.full((1,), t - 1)}]
+        states.append({name: x.clone() for name, x in states[0].items()})
+        ours.grad, plain.grad = torch.ones(1, 8), torch.ones(1, 8)
+        _step_device(ours, states[0], 1.0, 0.9, 0.999, 1e-8)
+        with torch.no_grad():
+            _step_any(plain, states[1], torch.from_numpy(_corrections(0.9, 0.999)), 1.0, 0.9, 0.999, 1e-8)
+        torch.testing.assert_close(ours, plain, rtol=2e-6, atol=0)
+
+
+class Operations(TorchDispatchMode):
+    """Names of torch's operations other than views and allocations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func._schema.name.split("::")[-1]
+        if not (func.is_view or name.startswith(("empty", "new_empty", "detach", "_unsafe_view"))):
+            self.names.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_step_takes_few_launches_and_reads_no_value_of_the_device() -> None:
+    field, q = make_field("warp"), points_around(300).float()
+    p = points_around(1000, seed=2).float().requires_grad_()
+    field.sdf(q).sum().backward()  # makes the buffer of the table's gradient
+    field.zero_grad()
+    with Operations() as operations, launches() as kernels:
+        f, f_q, n = field.sdf_and_gradients(p, q)
+        forward, steps = len(kernels), len(operations.names)
+        loss = [torch.ones_like(x) for x in (f, f_q, n)]
+        torch.autograd.backward((f, f_q, n), loss)
+    names = [re.sub("_[0-9a-f]{8}$", "", name) for name in kernels]
+    assert names[:forward] == ["pack_first", "encode", "activate", "activate", "through", "through", "to_points"]
+    back = ["encode_along", "through", "through", "adjoint", "adjoint", "unpack_first", "scatter", "to_points"]
+    assert names[forward:] == back
+    products = {"cat", "mm", "addmv", "addmv_", "addmm_", "sum", "ones_like"}
+    assert set(operations.names) <= products  # nothing whose size depends on values, nothing read by the host
+    assert (len(kernels), len(operations.names) - operations.names.count("ones_like"), steps) == (15, 19, 6)
+
+
+def test_the_kernels_compile_for_gpus(tmp_path: Path) -> None:
+    for name in ("grid", "layers", "adam"):
+        module = sys.modules[f"sl_nerfstudio.field.warp_kernels.{name}"]
+        files = warp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+        assert [path.suffix for path in files] == [".ptx"] and files[0].stat().st_size > 10_000
+
+
+def test_what_the_backend_cannot_do_is_said_when_it_is_chosen_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    p = points_around(10)
+    with pytest.raises(
+        UserError, match="needs 8 features per level, the field has 4; choose the backend auto or torch"
+    ):
+        make_field("warp", features=4).sdf(p.float())
+    with pytest.raises(UserError, match=r"computes in float32, the field is torch\.float64"):
+        make_field("warp", torch.float64).sdf(p)
+    monkeypatch.setattr(backend_module, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"needs the package warp-lang: pip install 'sl-nerfstudio\[cuda\]'; choose"):
+        make_field("warp").sdf(p.float())
+
+
+def test_a_driver_that_warp_cannot_use_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warp, "is_cuda_available", lambda: False)
+    assert re.search("no driver for cuda .*R580 or newer.*[+]cu12", obstacle(torch.device("cuda")) or "")
+    assert obstacle(torch.device("cpu")) is None
