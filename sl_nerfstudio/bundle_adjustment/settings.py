@@ -1,4 +1,7 @@
-"""Settings of the bundle adjustment. The defaults suit object-sized scans; `benchmarks.settings_sweep` varies them."""
+"""Settings of the bundle adjustment; `benchmarks.sensitivity.settings_sweep` varies them.
+
+The defaults suit object-sized scans.
+"""
 
 from dataclasses import dataclass, field
 

@@ -1,6 +1,6 @@
 """How far off the starting poses may be for the bundle adjustment to converge.
 
-    python -m benchmarks.basin [--scene cone-and-cylinder] [--frames 22] [--seeds 1 2 3] [--output FILE]
+    python -m benchmarks.sensitivity.basin [--scene cone-and-cylinder] [--frames 22] [--seeds 1 2 3] [--output FILE]
 
 For every seed, one noisy scan is made. Its starting poses are replaced by ones with growing registration errors (and
 sl-synth's default calibration errors), and adjusted as `ns-train sl-neus` does before its first step. `over_1_deg`

@@ -1,6 +1,6 @@
 """Scale and position of a scan under each rule for the gauge, and as the bundle adjustment leaves them.
 
-    python -m benchmarks.gauge [--scenes cone-and-cylinder head frog] [--seeds 1 2 3] [--output FILE]
+    python -m benchmarks.sensitivity.gauge [--scenes cone-and-cylinder head frog] [--seeds 1 2 3] [--output FILE]
 
 The residuals do not change under a similarity of the whole scene, so only prior knowledge can fix it. Compared are the
 result as the last step leaves it, and the result aligned with the starting poses at the scale of one known baseline,

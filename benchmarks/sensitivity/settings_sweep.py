@@ -1,6 +1,6 @@
 """Decisive settings of the stages that find poses, each over a range around its default.
 
-    python -m benchmarks.settings_sweep [--settings registration.pair.tolerance_sigmas ...] [--frames 14]
+    python -m benchmarks.sensitivity.settings_sweep [--settings registration.pair.tolerance_sigmas ...] [--frames 14]
 
 Six scans of sl-synth with twice its default noise, wrong and missing coordinates (200 x 200 pixels); their
 coordinates are taken as decoded, so no network is needed. One setting at a time differs from its default. The table,
