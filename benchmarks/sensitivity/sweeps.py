@@ -1,6 +1,6 @@
 """What the error depends on: decoding quality, number of frames, image size, time.
 
-    python -m benchmarks.sensitivity.sweeps [--sweeps noise missing wrong frames resolution time] [--scene cone-and-cylinder]
+    python -m benchmarks.sensitivity.sweeps [--sweeps noise missing wrong frames resolution time] [--scene SCENE]
 
 Whole runs with the commands a user types, on scans from sl-synth with its default noise, except for what the sweep
 changes. Prints a table and writes benchmarks/results/sweeps.json, from which `python -m benchmarks.plots` draws the
