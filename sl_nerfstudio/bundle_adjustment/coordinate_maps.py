@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 from sl_nerfstudio.bundle_adjustment.loops.drawing import draw_pixels
 from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory, look_up_windows
+from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
-from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, NormalEquations, normal_equations
 from sl_nerfstudio.bundle_adjustment.loops.normal_equations import block_sums
+from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, NormalEquations, normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, array, pixels_of_rows
 from sl_nerfstudio.bundle_adjustment.rig import Rig
@@ -80,9 +80,7 @@ def pose_covariance(
     equations.H[each, :, each] += prior_H[0]
     equations.H_common.diagonal().add_(prior_H[1])
     change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
-    g = torch.cat(
-        [(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change]
-    )
+    g = torch.cat([(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change])
     G = _gauge(e.rig, len(g))
     inverse_H = _expanded_inverse(free, equations)
     C = _without_gauge(inverse_H, G)
@@ -213,8 +211,6 @@ def _gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns 7"]:
     return G
 
 
-def _without_gauge(
-    x: Float[Tensor, "unknowns c"], G: Float[Tensor, "unknowns 7"]
-) -> Float[Tensor, "unknowns c"]:
+def _without_gauge(x: Float[Tensor, "unknowns c"], G: Float[Tensor, "unknowns 7"]) -> Float[Tensor, "unknowns c"]:
     """What remains of steps (in columns) without motion and growth of the whole scene."""
     return x - G @ (torch.linalg.solve(G.T @ G, G.T) @ x)

@@ -68,9 +68,7 @@ def lm_step(
     return LMState(rig, anchors, damping)
 
 
-def _damped_solution(
-    H: Float[Tensor, "k k"], g: Float[Tensor, "k"], damping: float
-) -> Float[Tensor, "k"] | None:
+def _damped_solution(H: Float[Tensor, "k k"], g: Float[Tensor, "k"], damping: float) -> Float[Tensor, "k"] | None:
     """Solution of the damped equations; None if they are not positive definite, which rounding can cause."""
     damped = H.clone()
     damped.diagonal().mul_(1 + damping)

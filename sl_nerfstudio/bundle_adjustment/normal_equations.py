@@ -91,7 +91,9 @@ def normal_equations(
     )  # fmt: skip
     mirror(m, H)
     H_common, g_common = _of_common(own, cross, depths)
-    return NormalEquations(*(torch.from_numpy(part) for part in (H.reshape(m, 12, m, 12), g, border, H_common, g_common)), depths)
+    return NormalEquations(
+        *(torch.from_numpy(part) for part in (H.reshape(m, 12, m, 12), g, border, H_common, g_common)), depths
+    )
 
 
 def _couplings(

@@ -50,7 +50,8 @@ class Rig:
     @cached_property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
         """For compiled loops: poses of the cameras, their inverses, those of the cameras in their projectors; then
-        parameters and model codes of cameras and projector."""
+        parameters and model codes of cameras and projector.
+        """
         poses = self.T_world_camera, inverse(self.T_world_camera), inverse(self.T_camera_projector)
         camera, projector = self.camera, self.projector
         T_world_camera, T_camera_world, T_projector_camera, cameras, light = (

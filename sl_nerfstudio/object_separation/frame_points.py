@@ -14,6 +14,7 @@ from sl_nerfstudio.geometry.epipolar import epipolar_residual
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.triangulation import triangulate
 
+LEAST_COSINE = 0.05  # between a ray and a plane's normal: a ray in the plane would have no noise across it
 _LEAST_NOISE_PX = 0.01  # rounding of stored coordinates and poses
 _SAME_PLACE = 3.0  # spacings: how far apart points of two frames on the same surface may be
 _SAME_NORMAL = 0.9  # cosine
@@ -63,7 +64,7 @@ class FramePoints:
 
     def sigma_along(self, normal: Float[ndarray, "3"] | Float[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
         """1 sigma of each point's place along a direction."""
-        return self.sigma * np.abs((self.ray * normal).sum(-1)).clip(0.05)
+        return self.sigma * np.abs((self.ray * normal).sum(-1)).clip(LEAST_COSINE)
 
 
 def points_of(frame: DecodedFrame) -> FramePoints:

@@ -9,9 +9,9 @@ from numpy import ndarray
 
 from sl_nerfstudio.object_separation.frame_points import FramePoints
 from sl_nerfstudio.object_separation.plane import Plane, fit_plane
+from sl_nerfstudio.object_separation.plane_growth import FEWEST, grown_planes
 from sl_nerfstudio.object_separation.settings import SeparationSettings
 
-_GROWTH = (0.2, 0.5, np.inf)  # of the radius: a plane is fitted near its seed first, and then to more and more points
 _SCORED = 6000  # points on which hypotheses are compared
 
 
@@ -76,31 +76,22 @@ def _largest(pool: PointPool, radius: float, rng: np.random.Generator, settings:
     if len(pool) < settings.neighbours:
         return None
     some = pool.chosen(rng.choice(len(pool), min(_SCORED, len(pool)), replace=False))
-    best, most = None, 0
-    for seed in rng.integers(0, len(some), settings.hypotheses):
-        plane = _grown(some, int(seed), radius, settings)
-        count = 0 if plane is None else int(some.on(plane, settings).sum())
-        if plane is not None and count > most:
-            best, most = plane, count
+    seeds = rng.integers(0, len(some), settings.hypotheses)
+    planes, counts = grown_planes(
+        some.points, some.normal, seeds, radius, settings.search_sigmas, settings.normal_cosine
+    )
+    most = int(counts.argmax())
+    if counts[most] == 0:
+        return None
+    best = Plane(planes[most, :3], float(planes[most, 3]))
     for _ in range(3):
-        if best is not None:
-            best = _refitted(pool, pool.on(best, settings), best)
+        best = _refitted(pool, pool.on(best, settings), best)
     return best
-
-
-def _grown(pool: PointPool, seed: int, radius: float, settings: SeparationSettings) -> Plane | None:
-    """The plane through a point along its normal, fitted to more and more of the points around it."""
-    p, normal = pool.points.p_world, pool.normal[seed]
-    distance = np.linalg.norm(p - p[seed], axis=1)
-    plane = Plane(normal, float(normal @ p[seed]))
-    for reach in _GROWTH:
-        plane = _refitted(pool, (distance < reach * radius) & pool.on(plane, settings), plane)
-    return plane
 
 
 def _refitted(pool: PointPool, on: Bool[ndarray, "n"], plane: Plane) -> Plane:
     """The plane fitted to some points; unchanged if they are too few."""
-    if on.sum() < 6:
+    if on.sum() < FEWEST:
         return plane
     points = pool.points.chosen(on)
     found = fit_plane(points.p_world, 1 / points.sigma_along(plane.normal) ** 2)

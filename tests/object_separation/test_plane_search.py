@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.object_separation.frame_points import FramePoints, normals_of
+from sl_nerfstudio.object_separation.plane import Plane, fit_plane
+from sl_nerfstudio.object_separation.plane_growth import grown_planes
 from sl_nerfstudio.object_separation.plane_search import PointPool, find_planes
 from sl_nerfstudio.object_separation.settings import SEPARATION_DEFAULTS
 
@@ -47,3 +49,22 @@ def test_a_plane_of_one_frame_only_and_a_ball_are_no_planes():
     pool = _pool(np.concatenate([_slab(rng, 1500, 0.0), _ball(rng, 500)]), _ball(rng, 2000))
     assert find_planes(pool, 80.0, rng, SEPARATION_DEFAULTS) == []
     assert find_planes(_pool(_ball(rng, 3000), _ball(rng, 3000)), 80.0, rng, SEPARATION_DEFAULTS) == []
+
+
+def test_grown_planes_are_those_of_the_fit_step_by_step():
+    """The compiled loop against the definition: three fits, each to the points of the plane before it."""
+    rng, s = np.random.default_rng(2), SEPARATION_DEFAULTS
+    pool = _pool(*[np.concatenate([_slab(rng, 300, 0.0), _ball(rng, 200), rng.uniform(-80, 80, (50, 3))])] * 2)
+    p, radius = pool.points.p_world, 80.0
+    seeds = rng.integers(0, len(pool), 40)
+    planes, counts = grown_planes(pool.points, pool.normal, seeds, radius, s.search_sigmas, s.normal_cosine)
+    for seed, found, count in zip(seeds, planes, counts, strict=True):
+        plane = Plane(pool.normal[seed], float(pool.normal[seed] @ p[seed]))
+        for reach in (0.2 * radius, 0.5 * radius, np.inf):
+            on = pool.on(plane, s) & (np.linalg.norm(p - p[seed], axis=1) < reach)
+            if on.sum() >= 6:
+                fitted = fit_plane(p[on], 1 / pool.points.chosen(on).sigma_along(plane.normal) ** 2)
+                plane = fitted if fitted.normal @ plane.normal > 0 else fitted.flipped()
+        assert found == pytest.approx([*plane.normal, plane.offset], abs=1e-9)
+        assert count == pool.on(plane, s).sum()
+    assert len(set(counts.tolist())) > 5
