@@ -66,11 +66,12 @@ def cross_validate(
     width = max(s.width_noises * noise_px, s.least_width_px)
     generator = torch.Generator().manual_seed(settings.seed)
     sides = [(rig, _anchors(rig, held_out)) for rig in (before, after)]
-    pairs = []
+    keys = []
     for rig, anchors in sides:
         seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator)
-        pairs.append(torch.stack([seen.anchor, seen.frame]))
-    rows = Observations(*torch.unique(torch.cat(pairs, 1), dim=1))
+        keys.append(seen.anchor * rig.frames + seen.frame)
+    key = torch.unique(torch.cat(keys))
+    rows = Observations(key // before.frames, key % before.frames)
     block = torch.cat([held_out.block, held_out.block[rows.anchor]])
     losses = [_robust_squares(rig, anchors, rows, maps, width) for rig, anchors in sides]
     difference, error = mean_and_error(losses[1] - losses[0], block)

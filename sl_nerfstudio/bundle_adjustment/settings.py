@@ -59,6 +59,13 @@ class StepSettings:
     """Largest factor by which one step may change an anchor's depth."""
     converged: float = 1e-4
     """Largest component of a step, in scene units or radian, below which the poses have converged."""
+    factorised_frames: int = 300
+    """Most frames whose whole normal matrix is factorised (it takes 1152 bytes for each pair of frames); beyond, steps
+    are found by conjugate gradients."""
+    iterative_steps: int = 150
+    """Most conjugate gradient steps for one step of the adjustment."""
+    iterative_tolerance: float = 1e-3
+    """Residual of the equations, relative to the first one, at which those end."""
     settled: float = 0.98
     """Share of its last width above which a kernel counts as no longer narrowing."""
 

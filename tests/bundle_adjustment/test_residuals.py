@@ -143,9 +143,7 @@ def test_normal_equations_are_those_of_the_dense_system(scene):
     scale = schur.abs().max()
     found_H, found_g = dense(equations)
     assert torch.allclose(found_H / scale, schur / scale, rtol=0, atol=1e-10)
-    assert torch.allclose(
-        found_g, g[: 12 * n] - V.T @ (g[12 * n :] / D), rtol=1e-8, atol=1e-6 * float(g.abs().max())
-    )
+    assert torch.allclose(found_g, g[: 12 * n] - V.T @ (g[12 * n :] / D), rtol=1e-8, atol=1e-6 * float(g.abs().max()))
     step = torch.randn(12 * n, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     expected = -(g[12 * n :] + V @ step) / D
     assert torch.allclose(equations.depth_step(by_frame(step)), expected, rtol=1e-8, atol=1e-9)
