@@ -83,7 +83,8 @@ def _add_to_gradient(g, w, J, first, n, r, x0):
 def frame_sums(first, last, chosen, groups, anchor, own, cross, couplings, H, g, border):
     """Blocks on the diagonal `H[s]`, gradients `g[s]` and columns by common unknowns of some of the chosen frames.
 
-    `groups` are the anchors of each frame, its rows as seeing frame, and the rows of each anchor. Depths are eliminated.
+    `groups` are the anchors of each frame, its rows as seeing frame, and the rows of each anchor. Depths are
+    eliminated.
     """
     anchor_first, anchor_entries, seen_first, seen_entries, row_first, row_entries = groups
     r_own, J_own, _, w_own = own
