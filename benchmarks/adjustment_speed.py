@@ -2,9 +2,9 @@
 
     python -m benchmarks.adjustment_speed [--frames 22 60 150] [--resolution 400] [--threads N] [--output FILE]
 
-Scans of sl-synth with its usual noise and starting poses, each adjusted in a separate process as `ns-train sl-neus` does
-before its first step. Machine code is compiled by a first adjustment of two frames that does not count. Speed must not
-cost accuracy: errors of poses, and errors over their stated sigma (about 1), are part of each row.
+Scans of sl-synth with its usual noise and starting poses, each adjusted in a separate process as `ns-train sl-neus`
+does before its first step. Machine code is compiled by a first adjustment of two frames that does not count. Speed must
+not cost accuracy: errors of poses, and errors over their stated sigma (about 1), are part of each row.
 """
 
 import argparse

@@ -16,7 +16,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import Evidence, gauge_free, pose_covariance
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters, RefinePoses, free_parameters
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
 from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import Observations, linearise, residuals_of
@@ -87,13 +87,15 @@ class _Problem:
     prior: PosePrior
     settings: AdjustmentSettings
     generator: torch.Generator
+    partners: Bool[Tensor, "frames frames"]
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor."""
         s = self.settings
         return observe(
-            state.rig, state.anchors, self.maps, s.frames_per_anchor, _NO_GATE, s.least_cosine, self.generator
-        )
+            state.rig, state.anchors, self.maps, s.frames_per_anchor, _NO_GATE, s.least_cosine, self.generator,
+            self.partners,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -158,9 +160,11 @@ def adjust(
     others do not move.
     """
     generator = torch.Generator().manual_seed(settings.seed)
-    per_frame = max(1, min(settings.anchors_per_frame, settings.max_anchors // start.frames))
+    per_frame = min(settings.anchors_per_frame, settings.max_anchors // start.frames)
+    per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
     anchors = place_anchors(start, maps, per_frame, generator)
-    problem = _Problem(start, maps, prior, settings, generator)
+    together = partners(start, anchors, maps, settings.partners, settings.least_cosine, generator)
+    problem = _Problem(start, maps, prior, settings, generator, together)
     state = LMState(start, anchors, settings.steps.damping)
     rows = problem.observe(state)
     r = residuals_of(start, anchors, rows, maps)

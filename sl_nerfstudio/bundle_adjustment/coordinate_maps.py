@@ -70,7 +70,7 @@ class CoordinateMaps:
         return len(self.offsets)
 
     def draw(self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator) -> "DrawnPixels":
-        """Up to `count` random decoded pixel centres of each of some frames, one of each occupied square of a lattice."""
+        """Up to `count` random decoded pixel centres of some frames each, at most one in each square of a lattice."""
         pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
         draw_pixels(len(frames), frames.numpy(), *self.arrays, seed_from(generator), pixels, counts)
         frame = torch.repeat_interleave(frames, torch.from_numpy(counts))

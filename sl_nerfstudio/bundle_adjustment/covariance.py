@@ -76,13 +76,11 @@ def pose_covariance(
     prior_H = noise**2 * poses_H, noise**2 * weight
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
-    each = torch.arange(n)
-    equations.H[each, :, each] += prior_H[0]
     equations.H_common.diagonal().add_(prior_H[1])
     change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
     g = torch.cat([(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change])
     G = _gauge(e.rig, len(g))
-    inverse_H = _expanded_inverse(free, equations)
+    inverse_H = _expanded_inverse(free, equations, prior_H[0])
     C = _without_gauge(inverse_H, G)
     formal = _without_gauge(C.T, G)
     squares, blocks = _spread(e, equations.depths, weights, C)
@@ -99,11 +97,13 @@ def pose_covariance(
     return PoseCovariance(matrix_by_kind(formal, n), calibration)
 
 
-def _expanded_inverse(free: FreeParameters, equations: NormalEquations) -> Float[Tensor, "unknowns unknowns"]:
+def _expanded_inverse(
+    free: FreeParameters, equations: NormalEquations, prior: Float[Tensor, "frames 12 12"]
+) -> Float[Tensor, "unknowns unknowns"]:
     """The inverse of the normal matrix of the free parameters and the intrinsics, as increments of all frames."""
     count, common = free.count, UNKNOWNS
     H = torch.zeros(count + common, count + common, dtype=torch.float64)
-    H[:count, :count] = free.matrix(equations.H)
+    H[:count, :count] = free.matrix(equations.matrix(prior))
     H[:count, count:] = free.vector(equations.border)
     H[count:, :count] = H[:count, count:].T
     H[count:, count:] = equations.H_common

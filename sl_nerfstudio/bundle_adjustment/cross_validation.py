@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.observations import observe
+from sl_nerfstudio.bundle_adjustment.observations import observe, partners
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
@@ -66,11 +66,13 @@ def cross_validate(
     width = max(s.width_noises * noise_px, s.least_width_px)
     generator = torch.Generator().manual_seed(settings.seed)
     sides = [(rig, _anchors(rig, held_out)) for rig in (before, after)]
-    pairs = []
+    together = partners(after, sides[1][1], maps, settings.partners, settings.least_cosine, generator)
+    keys = []
     for rig, anchors in sides:
-        seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator)
-        pairs.append(torch.stack([seen.anchor, seen.frame]))
-    rows = Observations(*torch.unique(torch.cat(pairs, 1), dim=1))
+        seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator, together)
+        keys.append(seen.anchor * rig.frames + seen.frame)
+    key = torch.unique(torch.cat(keys))
+    rows = Observations(key // before.frames, key % before.frames)
     block = torch.cat([held_out.block, held_out.block[rows.anchor]])
     losses = [_robust_squares(rig, anchors, rows, maps, width) for rig, anchors in sides]
     difference, error = mean_and_error(losses[1] - losses[0], block)

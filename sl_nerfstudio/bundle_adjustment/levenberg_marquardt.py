@@ -2,11 +2,8 @@
 
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.damped_solution import damped_solver
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PriorTerm
@@ -45,13 +42,11 @@ def lm_step(
         return LMState(rig, anchors, state.damping)
     equations = normal_equations(linear, rows, *kernel.weights(r), free.frames)
     H_prior, g_prior = (part[free.frames] for part in prior.equations(rig))
-    each = torch.arange(len(H_prior))
-    equations.H[each, :, each] += H_prior
-    H, g = free.matrix(equations.H), free.vector(equations.g + g_prior)
+    solve = damped_solver(equations, (H_prior, g_prior), free, settings)
     energy = prior.energy(rig)
     damping = state.damping
     for _ in range(settings.tries):
-        x = _damped_solution(H, g, damping)
+        x = solve(damping)
         if x is None:
             damping = damping * settings.tighten
             continue
@@ -66,11 +61,3 @@ def lm_step(
             return LMState(moved, anchors.at(depth), damping, float(step.abs().max()))
         damping = damping * settings.tighten
     return LMState(rig, anchors, damping)
-
-
-def _damped_solution(H: Float[Tensor, "k k"], g: Float[Tensor, "k"], damping: float) -> Float[Tensor, "k"] | None:
-    """Solution of the damped equations; None if they are not positive definite, which rounding can cause."""
-    damped = H.clone()
-    damped.diagonal().mul_(1 + damping)
-    factor, failed = torch.linalg.cholesky_ex(damped)
-    return None if bool(failed) else torch.cholesky_solve(-g[:, None], factor)[:, 0]

@@ -1,7 +1,7 @@
 """Weighted normal equations of the bundle adjustment; the depths of the anchors are eliminated (Schur complement).
 
-Two frames are coupled where one sees an anchor of the other, or both see the same one: time and memory for the sums
-grow with the number of residuals, only the matrix itself with the square of the number of frames.
+Two frames are coupled where one sees an anchor of the other, or both see the same one. Time and memory grow with the
+number of residuals; only the whole matrix, which many frames do without, grows with the square of their number.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,15 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
-from sl_nerfstudio.bundle_adjustment.loops.normal_equations import depth_couplings, depth_steps, frame_sums, mirror
+from sl_nerfstudio.bundle_adjustment.loops.normal_equations import (
+    depth_couplings,
+    depth_steps,
+    frame_products,
+    frame_sums,
+    mirror,
+    pair_sums,
+    row_products,
+)
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Observations, array
 
 Sums = tuple[ndarray, ndarray, ndarray, ndarray]
@@ -38,30 +46,63 @@ class DepthCouplings:
         """For compiled loops."""
         return self.by_own, self.by_row, self.by_common, self.H, self.g
 
+    def step(
+        self, step: Float64[ndarray, "frames 12"], common: Float64[ndarray, "common"], g: Float64[ndarray, "anchors"]
+    ) -> Float64[ndarray, "anchors"]:
+        """Changes of the depths that follow from a step of the other unknowns, with `g` as the depths' gradient."""
+        out, (by_own, by_row, by_common, H, _) = np.empty(len(self.H)), self.arrays
+        couplings = by_own, by_row, by_common, H, g
+        depth_steps(
+            len(out), (self.rows.first, self.rows.entries), self.frame, self.viewer, couplings, step, common, out
+        )
+        return out
+
 
 @dataclass(frozen=True)
 class NormalEquations:
     """Gauss-Newton equations of all unknowns except the depths, which are eliminated.
 
-    Unknowns of a frame are delta, then rho; some unknowns may be common to all frames.
+    Unknowns of a frame are delta, then rho; some unknowns may be common to all frames. What couples different frames is
+    not stored: `matrix` sums it, `times` multiplies with it.
     """
 
-    H: Float[Tensor, "m 12 m 12"]  # of the chosen frames, in order
+    chosen: Int[ndarray, "m"]  # the frames whose equations these are, in order
+    H: Float[Tensor, "m 12 12"]  # blocks on the diagonal of the normal matrix
     g: Float[Tensor, "m 12"]
     border: Float[Tensor, "m 12 common"]
     H_common: Float[Tensor, "common common"]
     g_common: Float[Tensor, "common"]
+    rows: tuple[ndarray, ndarray, ndarray]  # anchor of each row, its frame, the frame that sees it
+    groups: tuple[ndarray, ...]  # anchors and rows of each frame, rows of each anchor
+    own: Sums
+    cross: Sums
     depths: DepthCouplings
 
-    def depth_step(
-        self, step: Float[Tensor, "frames 12"], common: Float[Tensor, "common"] | None = None
-    ) -> Float[Tensor, "anchors"]:
-        """Change of the depths that follows from a step of the other unknowns."""
-        d = self.depths
-        out = np.empty(len(d.H))
-        both = array(step), np.zeros(0) if common is None else array(common)
-        depth_steps(len(out), (d.rows.first, d.rows.entries), d.frame, d.viewer, d.arrays, *both, out)
+    def matrix(self, prior: Float[Tensor, "m 12 12"]) -> Float[Tensor, "m 12 m 12"]:
+        """The whole normal matrix, with information about each frame alone added."""
+        m, frames = len(self.chosen), len(self.groups[0]) - 1
+        slot = np.full(frames, -1)
+        slot[self.chosen] = np.arange(m)
+        H = np.zeros((12 * m, 12 * m))
+        pair_sums(m, self.chosen, slot, self.groups, self.rows, self.cross, self.depths.arrays, H)
+        mirror(m, H)
+        out = torch.from_numpy(H).reshape(m, 12, m, 12)
+        each = torch.arange(m)
+        out[each, :, each] = self.H + prior
+        return out
+
+    def times(self, step: Float[Tensor, "frames 12"]) -> Float[Tensor, "frames 12"]:
+        """The normal matrix of all frames times a step."""
+        x, (anchor, source, viewer), d = array(step), self.rows, self.depths
+        by_rows, out = np.empty((len(anchor), 2)), np.empty(x.shape)
+        row_products(len(anchor), source, viewer, self.cross, x, by_rows)
+        change = d.step(x, np.zeros(0), np.zeros(len(d.g)))
+        frame_products(len(x), self.groups, anchor, self.own, self.cross, d.arrays, x, by_rows, change, out)
         return torch.from_numpy(out)
+
+    def depth_step(self, step: Float[Tensor, "frames 12"]) -> Float[Tensor, "anchors"]:
+        """Change of the depths that follows from a step of the poses."""
+        return torch.from_numpy(self.depths.step(array(step), np.zeros(0), self.depths.g))
 
 
 def normal_equations(
@@ -73,27 +114,23 @@ def normal_equations(
 ) -> NormalEquations:
     """Weighted normal equations with the Schur complement of the depths; of all frames, or of some that are chosen."""
     frames, common = linear.frames, linear.common
-    r, weights = linear.residuals, (own_weight, cross_weight)
-    own: Sums = (array(r.own), array(linear.own), array(linear.own_depth), array(weights[0]))
-    cross: Sums = (array(r.cross), array(linear.cross), array(linear.cross_depth), array(weights[1]))
+    r = linear.residuals
+    own: Sums = (array(r.own), array(linear.own), array(linear.own_depth), array(own_weight))
+    cross: Sums = (array(r.cross), array(linear.cross), array(linear.cross_depth), array(cross_weight))
     anchor, frame = array(observations.anchor), array(linear.own_frame)
     source, viewer = (array(part) for part in linear.cross_frames)
     depths = _couplings(own, cross, Groups.of(anchor, len(frame)), frame, viewer, common)
     frame_of = np.arange(frames) if chosen is None else array(chosen)
-    slot = np.full(frames, -1)
-    slot[frame_of] = np.arange(len(frame_of))
+    grouped = Groups.of(frame, frames), Groups.of(viewer, frames), depths.rows
+    groups = tuple(part for group in grouped for part in (group.first, group.entries))
     m = len(frame_of)
-    H, g, border = np.zeros((12 * m, 12 * m)), np.zeros((m, 12)), np.zeros((m, 12, common))
-    groups = [Groups.of(frame, frames), Groups.of(viewer, frames), depths.rows]
-    frame_sums(
-        m, frame_of, slot, tuple(part for group in groups for part in (group.first, group.entries)),
-        (anchor, source, viewer), own, cross, depths.arrays, H, g, border,
-    )  # fmt: skip
-    mirror(m, H)
+    H, g, border = np.zeros((m, 12, 12)), np.zeros((m, 12)), np.zeros((m, 12, common))
+    frame_sums(m, frame_of, groups, anchor, own, cross, depths.arrays, H, g, border)
     H_common, g_common = _of_common(own, cross, depths)
     return NormalEquations(
-        *(torch.from_numpy(part) for part in (H.reshape(m, 12, m, 12), g, border, H_common, g_common)), depths
-    )
+        frame_of, torch.from_numpy(H), torch.from_numpy(g), torch.from_numpy(border), torch.from_numpy(H_common),
+        torch.from_numpy(g_common), (anchor, source, viewer), groups, own, cross, depths,
+    )  # fmt: skip
 
 
 def _couplings(

@@ -13,7 +13,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, of_one_frame
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import involving, observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, rough_weight
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
@@ -40,7 +40,7 @@ class _Problem:
         return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
-        """See _rows_of_all."""
+        """Anchors in other frames that may see them; with `around`, only of or in one frame."""
         return _rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
 
 
@@ -53,8 +53,12 @@ def _rows_of_all(
     around: int | None = None,
 ) -> Observations:
     """Every anchor in other frames that may see it."""
-    most = settings.relocalisation.frames_per_anchor
-    return observe(rig, anchors, maps, most, float("inf"), settings.least_cosine, generator, around)
+    most, cosine = settings.relocalisation.frames_per_anchor, settings.least_cosine
+    if around is None:
+        allowed = partners(rig, anchors, maps, settings.partners, cosine, generator)
+    else:
+        allowed = involving(around, rig.frames)
+    return observe(rig, anchors, maps, most, float("inf"), cosine, generator, allowed)
 
 
 def support_of(

@@ -49,8 +49,9 @@ class Rig:
 
     @cached_property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
-        """For compiled loops: poses of the cameras, their inverses, those of the cameras in their projectors; then
-        parameters and model codes of cameras and projector.
+        """For compiled loops: poses first, then parameters and model codes of cameras and projector.
+
+        The poses are those of the cameras, their inverses, and those of the cameras in the axes of their projectors.
         """
         poses = self.T_world_camera, inverse(self.T_world_camera), inverse(self.T_camera_projector)
         camera, projector = self.camera, self.projector

@@ -59,6 +59,12 @@ class StepSettings:
     """Largest factor by which one step may change an anchor's depth."""
     converged: float = 1e-4
     """Largest component of a step, in scene units or radian, below which the poses have converged."""
+    factorised_frames: int = 100
+    """Most frames whose whole normal matrix is factorised; beyond, steps are found by conjugate gradients."""
+    iterative_steps: int = 150
+    """Most conjugate gradient steps for one step of the adjustment."""
+    iterative_tolerance: float = 1e-2
+    """Residual of the equations, relative to the first one, at which those end."""
     settled: float = 0.98
     """Share of its last width above which a kernel counts as no longer narrowing."""
 
@@ -134,6 +140,11 @@ class AdjustmentSettings:
     """Decoded pixels of each frame that are looked up in other frames."""
     max_anchors: int = 12000
     """The same over all frames, at most: time grows with this number, accuracy with its square root."""
+    least_anchors_per_frame: int = 60
+    """The same of each frame, at least, however many frames there are."""
+    partners: int = 64
+    """Other frames in which those of one frame may be looked up, about; chosen at random from those that see the same
+    surface. So the time grows with the number of frames, not with its square."""
     frames_per_anchor: int = 8
     """Most other frames in which each of them is looked up."""
     max_iterations: int = 40

@@ -30,6 +30,7 @@ from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan, measured_length
+from sl_nerfstudio.threads import one_library_thread
 
 _STEP = 1e-5  # scene units and radian, of central differences
 _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable
@@ -201,6 +202,7 @@ def known_length(
     return out
 
 
+@one_library_thread()
 def maps_and_held_out(
     scan: Scan, samples: PixelSamples, settings: AdjustmentSettings
 ) -> tuple[CoordinateMaps, HeldOutPixels]:

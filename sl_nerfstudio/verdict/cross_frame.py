@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, linearise
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import project, unproject
@@ -37,9 +37,11 @@ def cross_frame_agreement(
     """
     s = settings or CrossFrameSettings()
     generator = torch.Generator().manual_seed(0)
-    per_frame = max(1, min(s.pixels_per_frame, s.most_pixels // rig.frames))
+    per_frame = max(s.least_pixels_per_frame, min(s.pixels_per_frame, s.most_pixels // rig.frames))
     anchors = place_anchors(rig, maps, per_frame, generator)
-    rows = observe(rig, anchors, maps, rig.frames, float("inf"), s.least_cosine, generator)
+    most = rig.frames if rig.frames <= s.compared_frames else s.partners
+    together = partners(rig, anchors, maps, most, s.least_cosine, generator)
+    rows = observe(rig, anchors, maps, rig.frames, float("inf"), s.least_cosine, generator, together)
     linear = linearise(rig, anchors, rows, maps)
     noise = frame_noise(linear, anchors, rig.frames)
     usual = float(noise.nanmedian())

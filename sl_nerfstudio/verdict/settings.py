@@ -11,6 +11,12 @@ class CrossFrameSettings:
     """Decoded pixels of each frame that are looked up in the others."""
     most_pixels: int = 12000
     """The same over all frames, at most."""
+    least_pixels_per_frame: int = 60
+    """The same of each frame, at least, however many frames there are."""
+    partners: int = 32
+    """Other frames that a frame is compared with, about, where there are more than `compared_frames`."""
+    compared_frames: int = 150
+    """Most frames of which each is compared with every other."""
     least_cosine: float = 0.2
     """Cosine between surface normal and ray below which a device counts as not seeing a point."""
     sigmas: float = 4.0

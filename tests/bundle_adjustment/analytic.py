@@ -146,7 +146,8 @@ def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:
 def dense(equations: NormalEquations) -> tuple[Tensor, Tensor]:
     """Matrix and gradient by delta of all frames, then rho of all frames."""
     size, frames = equations.g.numel(), len(equations.g)
-    return matrix_by_kind(equations.H.reshape(size, size), frames), by_kind(equations.g)
+    H = equations.matrix(torch.zeros_like(equations.H)).reshape(size, size)
+    return matrix_by_kind(H, frames), by_kind(equations.g)
 
 
 def columns_of(linear: Linearisation) -> tuple[Tensor, Tensor]:

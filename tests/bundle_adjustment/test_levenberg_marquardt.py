@@ -6,6 +6,7 @@ from math import radians
 import pytest
 import torch
 
+from sl_nerfstudio.bundle_adjustment.damped_solution import damped_solver
 from sl_nerfstudio.bundle_adjustment.free_parameters import free_parameters
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
@@ -100,3 +101,15 @@ def test_with_nothing_free_nothing_moves(scene):
     state, linear = LMState(rig, anchors, 0.1), linearise(rig, anchors, rows, maps)
     found = lm_step(state, linear, rows, maps, kernel, prior_of(1.0, rig), free_parameters("off", rig), SETTINGS)
     assert found == LMState(rig, anchors, 0.1)
+
+
+@pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig", "static-projector"])
+def test_conjugate_gradients_end_where_factorisation_does(scene, mode):
+    _, maps, rig, anchors, rows = scene
+    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    linear, prior = linearise(rig, anchors, rows, maps), prior_of(1e-2, rig)
+    equations, free = normal_equations(linear, rows, *kernel.weights(linear.residuals)), free_parameters(mode, rig)
+    iterative = replace(SETTINGS, factorised_frames=0, iterative_tolerance=1e-9)
+    exact, found = (damped_solver(equations, prior.equations(rig), free, s)(1e-4) for s in (SETTINGS, iterative))
+    assert exact is not None and found is not None
+    assert (found - exact).norm() < 1e-6 * exact.norm()

@@ -6,7 +6,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.residuals import linearise
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 from .analytic import ExactMaps, columns_of, dense, disturbed, rig_of
 
@@ -52,3 +52,20 @@ def test_eliminated_depths_change_no_step(seed):
     x = torch.randn(n, generator=generator, dtype=torch.float64)
     wanted = -torch.linalg.solve(H[depths, depths], g[depths] + H[depths, poses] @ x)
     assert torch.allclose(found.depth_step(by_frame(x)), wanted, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(by_kind(found.times(by_frame(x))), found_H @ x, rtol=0, atol=1e-12 * size * float(x.norm()))
+
+
+def test_some_frames_have_their_part_of_the_equations():
+    true = rig_of(FRAMES, SIZE)
+    maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(3)
+    rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
+    anchors = place_anchors(rig, maps, 25, generator)
+    rows = observe(rig, anchors, maps, 2, float("inf"), 0.1, generator)
+    linear, ones = linearise(rig, anchors, rows, maps), torch.ones(len(anchors.frame), dtype=torch.float64)
+    weights = ones, linear.residuals.cross_valid.double()
+    some = torch.tensor([2, 0])
+    part, whole = normal_equations(linear, rows, *weights, some), normal_equations(linear, rows, *weights)
+    none = torch.zeros(FRAMES, 12, 12, dtype=torch.float64)
+    H = whole.matrix(none)[some][:, :, some]
+    assert torch.allclose(part.matrix(none[:2]), H, rtol=0, atol=1e-12 * float(H.abs().max()))
+    assert torch.equal(part.g, whole.g[some])

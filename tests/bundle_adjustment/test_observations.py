@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import involving, observe, partners, place_anchors
 from sl_nerfstudio.geometry.se3 import rotate, transform
 
 from .analytic import ExactMaps, cast, rig_of
@@ -84,7 +84,24 @@ def test_around_one_frame_selects_all_observations_that_involve_it(scene):
     rig, maps, anchors = scene
     generator = torch.Generator().manual_seed(1)
     rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator)
-    around = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator, around=2)
+    around = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator, involving(2, FRAMES))
     mine = (anchors.frame[rows.anchor] == 2) | (rows.frame == 2)
     wanted = set(zip(rows.anchor[mine].tolist(), rows.frame[mine].tolist(), strict=True))
     assert set(zip(around.anchor.tolist(), around.frame.tolist(), strict=True)) == wanted
+
+
+def test_partners_see_the_same_surface_and_are_few(scene):
+    rig, maps, anchors = scene
+    every = partners(rig, anchors, maps, FRAMES - 1, 0.1, torch.Generator().manual_seed(0))
+    assert torch.equal(every, ~torch.eye(FRAMES, dtype=torch.bool))
+    few = partners(rig, anchors, maps, 2, 0.1, torch.Generator().manual_seed(0))
+    assert torch.equal(few, few.T) and not few.diagonal().any()
+    assert (few.sum(1) >= 1).all() and few.sum() < every.sum()
+    rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(1))
+    seen = torch.zeros(FRAMES, FRAMES, dtype=torch.bool)
+    seen[rows.pairs(anchors)[0], rows.frame] = True
+    assert (few <= (seen | seen.T)).all()
+    allowed = observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(1), few)
+    assert few[allowed.pairs(anchors)[0], allowed.frame].all()
+    kept = few[rows.pairs(anchors)[0], rows.frame]
+    assert torch.equal(allowed.anchor, rows.anchor[kept]) and torch.equal(allowed.frame, rows.frame[kept])

@@ -64,8 +64,9 @@ def _subtract(H, x0, y0, scale, v, u):
 
 
 @compiled
-def _subtract_common(border, g, scale, v, u, u_g):
-    """The same for the columns of common unknowns and for the gradient."""
+def _subtract_depth(H, g, border, scale, v, u, u_g):
+    """What the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
+    _subtract(H, 0, 0, scale, v, v)
     for x in range(12):
         g[x] -= scale * v[x] * u_g
         for y in range(len(u)):
@@ -78,59 +79,77 @@ def _add_to_gradient(g, w, J, first, n, r, x0):
         g[x0 + x] += w * (J[0, first + x] * r[0] + J[1, first + x] * r[1])
 
 
-@compiled
-def _own_side(s, t):
-    """Whether s, rather than t, sums the block that couples both: about half of its partners for each."""
-    return t >= 0 and (s == t or (s < t) == ((s + t) % 2 == 1))
-
-
 @compiled_range
-def frame_sums(first, last, chosen, slot, groups, rows, own, cross, couplings, H, g, border):
-    """What some of the chosen frames add to H, to the gradient and to `border` (by common unknowns).
+def frame_sums(first, last, chosen, groups, anchor, own, cross, couplings, H, g, border):
+    """Blocks on the diagonal `H[s]`, gradients `g[s]` and columns by common unknowns of some of the chosen frames.
 
-    `H[12 s + x, 12 t + y]` couples unknown x of chosen frame s with y of t; only one of the blocks (s, t) and (t, s) is
-    written (see `mirror`). `slot` gives the number of a frame among the chosen, or -1. `groups` are the anchors of each
-    frame, its rows as seeing frame, and the rows of each anchor; `rows` the anchor and the two frames of each row.
-    Depths are eliminated.
+    `groups` are the anchors of each frame, its rows as seeing frame, and the rows of each anchor. Depths are
+    eliminated.
     """
     anchor_first, anchor_entries, seen_first, seen_entries, row_first, row_entries = groups
-    anchor, source, viewer = rows
     r_own, J_own, _, w_own = own
     r_cross, J_cross, _, w_cross = cross
     by_own, by_row, by_common, H_depth, g_depth = couplings
     common = border.shape[2]
     for s in range(first, last):
-        f, at = chosen[s], 12 * s
+        f = chosen[s]
         for e in range(anchor_first[f], anchor_first[f + 1]):
             a = anchor_entries[e]
-            scale, v = 1 / H_depth[a], by_own[a]
-            _add(H, at + 6, at + 6, w_own[a], J_own[a], 0, J_own[a], 0, 6)
+            _add(H[s], 6, 6, w_own[a], J_own[a], 0, J_own[a], 0, 6)
             _add(border[s], 6, 0, w_own[a], J_own[a], 0, J_own[a], 6, common)
             _add_to_gradient(g[s], w_own[a], J_own[a], 0, 6, r_own[a], 6)
-            _subtract(H, at, at, scale, v, v)
-            _subtract_common(border[s], g[s], scale, v, by_common[a], g_depth[a])
+            _subtract_depth(H[s], g[s], border[s], 1 / H_depth[a], by_own[a], by_common[a], g_depth[a])
             for k in range(row_first[a], row_first[a + 1]):
                 n = row_entries[k]
                 if w_cross[n] > 0:
                     J = J_cross[n]
-                    _add(H, at, at, w_cross[n], J, 0, J, 0, 6)
+                    _add(H[s], 0, 0, w_cross[n], J, 0, J, 0, 6)
                     _add(border[s], 0, 0, w_cross[n], J, 0, J, 18, common)
                     _add_to_gradient(g[s], w_cross[n], J, 0, 6, r_cross[n], 0)
-                    t = slot[viewer[n]]
-                    if _own_side(s, t):
-                        _add(H, at, 12 * t, w_cross[n], J, 0, J, 6, 12)
-                        _subtract(H, at, 12 * t, scale, v, by_row[n])
+        for e in range(seen_first[f], seen_first[f + 1]):
+            n = seen_entries[e]
+            if w_cross[n] > 0:
+                a, J = anchor[n], J_cross[n]
+                for half in (0, 6):
+                    _add(H[s], half, 0, w_cross[n], J, 6 + half, J, 6, 12)
+                    _add(border[s], half, 0, w_cross[n], J, 6 + half, J, 18, common)
+                _add_to_gradient(g[s], w_cross[n], J, 6, 12, r_cross[n], 0)
+                _subtract_depth(H[s], g[s], border[s], 1 / H_depth[a], by_row[n], by_common[a], g_depth[a])
+
+
+@compiled
+def _own_side(s, t):
+    """Whether s, rather than t, sums the block that couples both: about half of its partners for each."""
+    return t >= 0 and s != t and (s < t) == ((s + t) % 2 == 1)
+
+
+@compiled_range
+def pair_sums(first, last, chosen, slot, groups, rows, cross, couplings, H):
+    """Blocks that couple some of the chosen frames with others: `H[12 s + x, 12 t + y]` for unknowns x of s and y of t.
+
+    Of the blocks (s, t) and (t, s) only one is written (see `mirror`). `slot` gives the number of a frame among the
+    chosen, or -1; `rows` the anchor and the two frames of each row.
+    """
+    anchor_first, anchor_entries, seen_first, seen_entries, row_first, row_entries = groups
+    anchor, source, viewer = rows
+    _, J_cross, _, w_cross = cross
+    by_own, by_row, _, H_depth, _ = couplings
+    for s in range(first, last):
+        f, at = chosen[s], 12 * s
+        for e in range(anchor_first[f], anchor_first[f + 1]):
+            a = anchor_entries[e]
+            for k in range(row_first[a], row_first[a + 1]):
+                n = row_entries[k]
+                t = slot[viewer[n]]
+                if w_cross[n] > 0 and _own_side(s, t):
+                    _add(H, at, 12 * t, w_cross[n], J_cross[n], 0, J_cross[n], 6, 12)
+                    _subtract(H, at, 12 * t, 1 / H_depth[a], by_own[a], by_row[n])
         for e in range(seen_first[f], seen_first[f + 1]):
             n = seen_entries[e]
             if not w_cross[n] > 0:
                 continue
             a, J, v = anchor[n], J_cross[n], by_row[n]
             scale, t = 1 / H_depth[a], slot[source[n]]
-            for half in (0, 6):
-                _add(H, at + half, at, w_cross[n], J, 6 + half, J, 6, 12)
-                _add(border[s], half, 0, w_cross[n], J, 6 + half, J, 18, common)
-            _add_to_gradient(g[s], w_cross[n], J, 6, 12, r_cross[n], 0)
-            _subtract_common(border[s], g[s], scale, v, by_common[a], g_depth[a])
             if _own_side(s, t):
                 for half in (0, 6):
                     _add(H, at + half, 12 * t, w_cross[n], J, 6 + half, J, 0, 6)
@@ -144,13 +163,67 @@ def frame_sums(first, last, chosen, slot, groups, rows, own, cross, couplings, H
 
 @compiled_range
 def mirror(first, last, H):
-    """The blocks that `frame_sums` left out, of some frames."""
+    """The blocks that `pair_sums` left out, of some frames."""
     for s in range(first, last):
         for t in range(H.shape[0] // 12):
-            if not _own_side(s, t):
+            if s != t and not _own_side(s, t):
                 for x in range(12):
                     for y in range(12):
                         H[12 * s + x, 12 * t + y] = H[12 * t + y, 12 * s + x]
+
+
+@compiled_range
+def row_products(first, last, source, viewer, cross, step, out):
+    """Weighted changes of cross residuals by a step [frames, 12], without that of the depths."""
+    _, J, _, w = cross
+    for n in range(first, last):
+        i, j = source[n], viewer[n]
+        for c in range(2):
+            total = 0.0
+            if w[n] > 0:
+                for x in range(6):
+                    total += J[n, c, x] * step[i, x]
+                for x in range(12):
+                    total += J[n, c, 6 + x] * step[j, x]
+            out[n, c] = w[n] * total
+
+
+@compiled_range
+def frame_products(first, last, groups, anchor, own, cross, couplings, step, by_rows, depth_step, out):
+    """The normal matrix times a step, for some frames.
+
+    `by_rows` are the `row_products` and `depth_step` the changes of the depths that follow.
+    """
+    anchor_first, anchor_entries, seen_first, seen_entries, row_first, row_entries = groups
+    _, J_own, _, w_own = own
+    _, J_cross, _, w_cross = cross
+    by_own, by_row, _, _, _ = couplings
+    for f in range(first, last):
+        y = out[f]
+        for x in range(12):
+            y[x] = 0.0
+        for e in range(anchor_first[f], anchor_first[f + 1]):
+            a = anchor_entries[e]
+            for x in range(12):
+                y[x] += by_own[a, x] * depth_step[a]
+            for c in range(2):
+                total = 0.0
+                for x in range(6):
+                    total += J_own[a, c, x] * step[f, 6 + x]
+                for x in range(6):
+                    y[6 + x] += w_own[a] * total * J_own[a, c, x]
+            for k in range(row_first[a], row_first[a + 1]):
+                n = row_entries[k]
+                if w_cross[n] > 0:
+                    for c in range(2):
+                        for x in range(6):
+                            y[x] += by_rows[n, c] * J_cross[n, c, x]
+        for e in range(seen_first[f], seen_first[f + 1]):
+            n = seen_entries[e]
+            if w_cross[n] > 0:
+                for x in range(12):
+                    y[x] += by_row[n, x] * depth_step[anchor[n]]
+                    y[x] += by_rows[n, 0] * J_cross[n, 0, 6 + x] + by_rows[n, 1] * J_cross[n, 1, 6 + x]
 
 
 @compiled_range
