@@ -112,7 +112,9 @@ class SLTrainer(Trainer):
     def train_iteration(self, step: int) -> Any:
         """One step; nerfstudio writes the losses to its log, and torch warns of those that have a gradient."""
         loss, terms, metrics = super().train_iteration(step)
-        return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
+        loss, terms = loss.detach(), {name: term.detach() for name, term in terms.items()}
+        self._model.remember(loss, terms, metrics)
+        return loss, terms, metrics
 
     def eval_iteration(self, step: int) -> None:
         """Evaluate if it is due, as the last part of each step; a signal that came during the step counts now."""
