@@ -56,6 +56,7 @@ class Training:
     def step(self) -> Any:
         """The next step, as nerfstudio's loop does it; returns loss, terms and metrics."""
         step, self.done = self.done, self.done + 1
+        self.trainer.step = step
         self.pipeline.train()
         for callback in self.trainer.callbacks:
             if TrainingCallbackLocation.BEFORE_TRAIN_ITERATION in callback.where_to_run:

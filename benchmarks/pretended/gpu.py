@@ -53,6 +53,7 @@ class PretendedGpu(TorchDispatchMode):
             (torch.cuda, "mem_get_info", lambda *_: (8 << 30, 8 << 30)),
             (torch.cuda, "is_current_stream_capturing", lambda: False),
             (torch, "Generator", _Generator),
+            (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
             (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
         ]
         for owner, name, stand_in in replaced:
@@ -138,6 +139,8 @@ class _Functions(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Make, move and read tensors as on a GPU."""
         kwargs = dict(kwargs or {})
+        if isinstance(func, torch._ops.OpOverload):  # called by another mode, below the functions of torch
+            return func(*args, **kwargs)
         name = getattr(func, "__name__", "")
         if name in ("to", "cuda", "cpu") and args and isinstance(args[0], Tensor):
             return self._moved(func, name, args, kwargs)
@@ -200,6 +203,17 @@ class _Functions(TorchFunctionMode):
         self._gpu.wait("a copy to the host")
         self._gpu.seen.launches["copy to the host"] += 1
         return _Copy.apply(x, False)  # pyright: ignore
+
+
+def _grouped(group: Callable[..., Any]) -> Callable[..., Any]:
+    """torch's optimisers ask its compiled part on which devices tensors are."""
+
+    def grouped(tensors: Any, with_indices: bool) -> Any:
+        there = any(isinstance(x, DeviceTensor) for x in tensors[0])
+        found = group(tensors, with_indices)
+        return {(CUDA if there else device, dtype): value for (device, dtype), value in found.items()}
+
+    return grouped
 
 
 class _Generator(torch.Generator):

@@ -5,7 +5,44 @@ from typing import Any
 import torch
 
 _NO_LAUNCH = set(
-    ["alias", "as_strided", "detach", "diagonal", "empty", "empty_like", "empty_strided", "expand", "is_same_size", "lift_fresh", "narrow", "new_empty", "new_empty_strided", "permute", "result_type", "select", "set_", "slice", "split", "split_with_sizes", "squeeze", "sym_numel", "sym_size", "sym_stride", "t", "transpose", "unbind", "unfold", "unsqueeze", "view", "_reshape_alias", "_unsafe_view"]
+    [
+        "alias",
+        "as_strided",
+        "detach",
+        "diagonal",
+        "empty",
+        "empty_like",
+        "empty_strided",
+        "expand",
+        "is_same_size",
+        "lift_fresh",
+        "narrow",
+        "new_empty",
+        "new_empty_strided",
+        "permute",
+        "result_type",
+        "select",
+        "set_",
+        "slice",
+        "split",
+        "split_with_sizes",
+        "squeeze",
+        "squeeze_",
+        "t_",
+        "transpose_",
+        "unsqueeze_",
+        "sym_numel",
+        "sym_size",
+        "sym_stride",
+        "t",
+        "transpose",
+        "unbind",
+        "unfold",
+        "unsqueeze",
+        "view",
+        "_reshape_alias",
+        "_unsafe_view",
+    ]
 )
 
 _READ, _COUNTED = "a value read by the host", "a result as long as its values say"
@@ -16,7 +53,19 @@ _WAITS = {
 }
 
 _TAKE_SCALARS = set(
-    ["copy_", "fill_", "index_put_", "index_put", "_index_put_impl_", "masked_fill_", "masked_fill", "where", "lerp", "lerp_", "_foreach_add_"]
+    [
+        "copy_",
+        "fill_",
+        "index_put_",
+        "index_put",
+        "_index_put_impl_",
+        "masked_fill_",
+        "masked_fill",
+        "where",
+        "lerp",
+        "lerp_",
+        "_foreach_add_",
+    ]
 )
 _INDEXED = {"index", "index_put_", "index_put", "_index_put_impl_", "_unsafe_index"}
 

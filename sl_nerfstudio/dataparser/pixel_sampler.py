@@ -29,11 +29,15 @@ class SLPixelSampler:
         """Change the number of pixels of a batch."""
         self.num_rays_per_batch = num_rays_per_batch
 
-    def sample(self, step: int) -> PixelBatch:
-        """Pixels for a step."""
+    def begin(self, step: int) -> None:
+        """Seed the draws of a step, unless that was done."""
         if step != self._step:
             self._step = step
             self.generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+
+    def sample(self, step: int) -> PixelBatch:
+        """Pixels for a step."""
+        self.begin(step)
         return self.samples.at(self._draw())
 
     def _draw(self) -> Int[Tensor, "n"]:

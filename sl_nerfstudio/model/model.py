@@ -216,6 +216,11 @@ class SLModel(Model):
         self.anneal(max(step, 0))  # -1: the poses are adjusted, no step has been taken
         self._cache_is_old = True
 
+    @property
+    def operations_of_step(self) -> tuple[Any, ...]:
+        """Equal for steps that do the same operations: all that changes otherwise is in tensors."""
+        return self._renders(self._step), self.field.encoding.active
+
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
 
