@@ -24,6 +24,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 
 Batch = dict[str, Tensor]
+_BYTES_PER_PIXEL = 23  # of the table, with the index of pixels that are not held out
 
 
 @dataclass
@@ -37,8 +38,9 @@ class SLDataManagerConfig(VanillaDataManagerConfig):
     """Pixels in a training step."""
     eval_num_rays_per_batch: int = 1024
     """Held-out pixels in an evaluation during training."""
-    images_on_gpu: bool = False
-    """Keep the table of all pixels on the GPU (19 bytes per pixel) instead of copying each batch there."""
+    images_on_gpu: bool = True
+    """Keep the table of all pixels on the GPU (23 bytes per pixel) if half of its free memory is enough; otherwise, or
+    if off, each batch is copied there, for which every step waits."""
 
     # nerfstudio's own settings for choosing images and pixels, which have no meaning here.
     masks_on_gpu: tyro.conf.Suppress[bool] = False
@@ -89,11 +91,16 @@ class SLDataManager(VanillaDataManager[SLDataset]):
 
     def setup_train(self) -> None:
         """Prepare the drawing of training batches."""
-        self._samples = self.samples.to(self.device) if self.config.images_on_gpu else self.samples
+        self._samples = self.samples.to(self.device) if self._table_on_gpu() else self.samples
         self.train_pixel_sampler = SLPixelSampler(self._samples, self.config.train_num_rays_per_batch, held_out=False)
         loaded = self.dataparser.loaded
         poses = torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.poses.T_world_camera)).float()
         self.scene_rays = SceneRays(loaded.scan, poses.to(self.device))
+
+    def _table_on_gpu(self) -> bool:
+        if not self.config.images_on_gpu or torch.device(self.device).type != "cuda":
+            return False
+        return _BYTES_PER_PIXEL * len(self.samples) < 0.5 * torch.cuda.mem_get_info(self.device)[0]
 
     def setup_eval(self) -> None:
         """Prepare the drawing of evaluation batches and whole frames."""

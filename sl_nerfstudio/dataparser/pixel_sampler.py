@@ -1,6 +1,8 @@
 """Random pixels for a step of training or evaluation."""
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
 
@@ -19,7 +21,7 @@ class SLPixelSampler:
         self.samples = samples
         self.num_rays_per_batch = num_rays_per_batch
         self.held_out = held_out
-        self._generator = torch.Generator(samples.device)
+        self.generator = torch.Generator(samples.device)
         self._seed = torch.initial_seed() + int(held_out)
         self._step: int | None = None
 
@@ -27,10 +29,18 @@ class SLPixelSampler:
         """Change the number of pixels of a batch."""
         self.num_rays_per_batch = num_rays_per_batch
 
-    def sample(self, step: int) -> PixelBatch:
-        """Pixels for a step."""
+    def begin(self, step: int) -> None:
+        """Seed the draws of a step, unless that was done."""
         if step != self._step:
             self._step = step
-            self._generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
-        index = self.samples.draw(self.num_rays_per_batch, self._generator, self.held_out)
-        return self.samples.at(index)
+            self.generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+
+    def sample(self, step: int) -> PixelBatch:
+        """Pixels for a step."""
+        self.begin(step)
+        return self.samples.at(self._draw())
+
+    def _draw(self) -> Int[Tensor, "n"]:
+        if self.samples.device.type == "cpu" or self.held_out:
+            return self.samples.draw(self.num_rays_per_batch, self.generator, self.held_out)
+        return self.samples.draw_without_waiting(self.num_rays_per_batch, self.generator)

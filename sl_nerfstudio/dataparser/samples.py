@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -81,6 +82,15 @@ class PixelSamples:
             if len(again) == 0:
                 return index
             index[again] = self._randint(len(self), len(again), generator)
+
+    @cached_property
+    def training(self) -> Int[Tensor, "n_training"]:
+        """Indices of all pixels that are not held out; 4 bytes per pixel."""
+        return (~self.held_out).nonzero()[:, 0].to(torch.int32)
+
+    def draw_without_waiting(self, count: int, generator: torch.Generator | None = None) -> Int[Tensor, "n"]:
+        """Like `draw` for training, but in a fixed number of operations, so that the host need not wait for a GPU."""
+        return self.training[self._randint(len(self.training), count, generator)].long()
 
     def held_out_of(self, frame: int) -> Int[Tensor, "n"]:
         """Indices of one frame's held-out pixels."""

@@ -38,22 +38,29 @@ def _target(ctx: Any) -> _Target:
     return _Target(True, fresh, None, fresh)
 
 
-def _keep(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, tensors: tuple[Tensor, ...]) -> FieldState:
+Active = tuple[int, ...]  # numbers of the levels that are switched on
+
+
+def _keep(
+    ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, tensors: tuple[Tensor, ...]
+) -> FieldState:
     p, places, level_weights, table, *mlp = tensors
-    ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
+    ctx.backend, ctx.buffer, ctx.parameters, ctx.active = backend, buffer, (table, *mlp), active
     ctx.save_for_backward(p, places, level_weights.clone(), table, *mlp)  # torch checks that none changes meanwhile
-    return FieldState(table, level_weights, tuple(mlp), places)
+    return FieldState(table, level_weights, tuple(mlp), places, active)
 
 
 def _kept(ctx: Any) -> tuple[Tensor, FieldState]:
     p, places, level_weights, table, *mlp = ctx.saved_tensors
-    return p, FieldState(table, level_weights, tuple(mlp), places)
+    return p, FieldState(table, level_weights, tuple(mlp), places, ctx.active)
 
 
 class _Value(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, backend: FieldBackend, buffer: TableGradient | None, *tensors: Tensor) -> Tensor:
-        return backend.evaluate(_keep(ctx, backend, buffer, tensors), tensors[0], False)[0]
+    def forward(
+        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
+    ) -> Tensor:
+        return backend.evaluate(_keep(ctx, backend, buffer, active, tensors), tensors[0], False)[0]
 
     @staticmethod
     @once_differentiable
@@ -61,17 +68,17 @@ class _Value(torch.autograd.Function):
         p, state = _kept(ctx)
         to = _target(ctx)
         result = ctx.backend.pull_back(
-            state, p, grad_outputs[0], ctx.needs_input_grad[2], to.parameters, to.table, to.marks
+            state, p, grad_outputs[0], ctx.needs_input_grad[3], to.parameters, to.table, to.marks
         )
-        return (None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
+        return (None, None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
 
 
 class _ValueAndGradient(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, *tensors: Tensor
+        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
     ) -> tuple[Tensor, Tensor]:
-        f, n = backend.evaluate(_keep(ctx, backend, buffer, tensors), tensors[0], True)
+        f, n = backend.evaluate(_keep(ctx, backend, buffer, active, tensors), tensors[0], True)
         assert n is not None
         return f, n
 
@@ -83,7 +90,7 @@ class _ValueAndGradient(torch.autograd.Function):
         mlp: tuple[Tensor | None, ...] = (None,) * len(state.mlp)
         if to.parameters:
             mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to.table, to.marks)
-        return (None, None, None, None, None, to.returned, *mlp)
+        return (None, None, None, None, None, None, to.returned, *mlp)
 
 
 class _Merged(torch.autograd.Function):
@@ -91,11 +98,11 @@ class _Merged(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, *tensors: Tensor
+        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         p, q, places, level_weights, table, *mlp = tensors
-        ctx.backend, ctx.buffer, ctx.parameters = backend, buffer, (table, *mlp)
-        state = FieldState(table, level_weights, tuple(mlp), places)
+        ctx.backend, ctx.buffer, ctx.parameters, ctx.active = backend, buffer, (table, *mlp), active
+        state = FieldState(table, level_weights, tuple(mlp), places, active)
         f, gradient, ctx.kept = backend.evaluate_all(state, _together(p, q), len(p))
         ctx.save_for_backward(p, places, level_weights, table, *mlp)
         return f[: len(p)], f[len(p) :], gradient
@@ -106,13 +113,13 @@ class _Merged(torch.autograd.Function):
         p, state = _kept(ctx)
         to = _target(ctx)
         g = _together(grad_outputs[0], grad_outputs[1])
-        wanted_points = ctx.needs_input_grad[2]
+        wanted_points = ctx.needs_input_grad[3]
         points = len(p) if wanted_points else 0
         result = ctx.backend.pull_back_all(
             state, ctx.kept, g, grad_outputs[2].contiguous(), points, to.parameters, to.table, to.marks
         )
         dp = result.points if wanted_points else None
-        return (None, None, dp, None, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
+        return (None, None, None, dp, None, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
 
 
 def _together(a: Tensor, b: Tensor) -> Tensor:
@@ -163,4 +170,4 @@ def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: Fie
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     same = [p.to(state.table.dtype) for p in points]
     with torch.autocast(points[0].device.type, enabled=False):
-        return function.apply(backend, buffer, *same, state.places, state.level_weights, state.table, *state.mlp)
+        return function.apply(backend, buffer, state.active, *same, state.places, state.level_weights, state.table, *state.mlp)

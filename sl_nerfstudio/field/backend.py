@@ -27,6 +27,8 @@ class FieldState:
     """Weight and bias of each layer, input to output."""
     places: Int32[Tensor, "levels 3"]
     """Where the levels are in the table, see `HashGrid`."""
+    active: tuple[int, ...]
+    """Levels whose weight is not 0; known to the host, which need not wait for a GPU."""
 
 
 @dataclass(frozen=True)

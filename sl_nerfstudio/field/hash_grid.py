@@ -86,6 +86,13 @@ class HashGrid(nn.Module):
         kept = [size - 1 if hashed else 0 for size, hashed in zip(layout.sizes, layout.hashed, strict=True)]
         places = torch.tensor([layout.resolutions, layout.offsets, kept], dtype=torch.int32).T.contiguous()
         self.register_buffer("places", places, persistent=False)
+        self._weights = (1.0,) * layout.levels
+        self.register_load_state_dict_post_hook(_read_weights)
+
+    @property
+    def active(self) -> tuple[int, ...]:
+        """Levels that are switched on; known to the host, which need not wait for a GPU."""
+        return tuple(level for level, weight in enumerate(self._weights) if weight != 0)
 
     def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
         """Fade levels: 0 switches a level off, 1 is its full strength.
@@ -95,4 +102,13 @@ class HashGrid(nn.Module):
         """
         if weights.shape != self.level_weights.shape:
             raise ValueError(f"expected {self.layout.levels} level weights, got {tuple(weights.shape)}")
-        self.level_weights.copy_(weights)
+        values = tuple(weights.tolist())
+        for level, (value, before) in enumerate(zip(values, self._weights, strict=True)):
+            if value != before:
+                self.level_weights[level].fill_(value)
+        self._weights = values
+
+
+def _read_weights(grid: HashGrid, _: object) -> None:
+    """After a checkpoint was loaded."""
+    grid._weights = tuple(grid.level_weights.tolist())

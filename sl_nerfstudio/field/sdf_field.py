@@ -133,7 +133,7 @@ class SDFField(nn.Module):
     def _state(self) -> FieldState:
         mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
         encoding = self.encoding
-        return FieldState(encoding.table, encoding.level_weights, mlp, encoding.places)
+        return FieldState(encoding.table, encoding.level_weights, mlp, encoding.places, encoding.active)
 
     def sdf_and_gradients(
         self, p: Float[Tensor, "n 3"], q: Float[Tensor, "k 3"]

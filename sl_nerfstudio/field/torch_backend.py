@@ -41,9 +41,6 @@ class TorchField:
         self.layout = layout
         self.knee = knee
 
-    def _levels(self, state: FieldState) -> list[int]:
-        return [int(level) for level in state.level_weights.nonzero()[:, 0].tolist()]
-
     def _encode(
         self, state: FieldState, p: Float[Tensor, "n 3"], jacobian: bool
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d 3"] | None]:
@@ -53,7 +50,7 @@ class TorchField:
         e = [q] + [p.new_zeros(len(p), self.layout.features)] * self.layout.levels
         diagonal = torch.diag_embed(inside)
         jac = [diagonal] + [p.new_zeros(len(p), self.layout.features, 3)] * self.layout.levels
-        for level in self._levels(state):
+        for level in state.active:
             cell, weight, slope = corner_weights(self.layout, level, q)
             rows = state.table.detach()[corner_rows(self.layout, level, cell)] * state.level_weights[level]
             e[1 + level] = torch.einsum("ncf,nc->nf", rows, weight)
@@ -156,7 +153,7 @@ class TorchField:
         """Add adjoints `d` of the MLP's input to the table's gradient; `slopes` multiply the weights' derivatives."""
         q = p.clamp(-1, 1)
         features = self.layout.features
-        for level in self._levels(state):
+        for level in state.active:
             cell, weight, slope = corner_weights(self.layout, level, q)
             columns = slice(3 + level * features, 3 + (level + 1) * features)
             values = weight[..., None] * d[:, None, columns]

@@ -12,10 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sl_nerfstudio.geometry.constants import constant
+
 # Below these angles, Taylor series replace quotients that would lose digits, and even more in their derivatives.
 # Each row holds the coefficients of one power of t^2.
 _SERIES_BELOW = 0.3
 _SERIES = [[(-1) ** k / factorial(2 * k + first) for first in (1, 2, 3)] for k in range(6)]
+_EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _LOG_SERIES_BELOW = 0.3
 _LOG_SERIES = [[1 / 12], [1 / 720], [1 / 30240], [1 / 1209600], [1 / 47900160], [691 / 1307674368000]]
 
@@ -44,9 +47,9 @@ def _so3_coefficients(theta2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _polynomials(x: Tensor, coefficients: Sequence[Sequence[float]]) -> Tensor:
     """The sums over k of coefficients[k][j] x^k in the last dimension j, by Horner's scheme."""
-    rows = x.new_tensor(coefficients)
-    out = rows[-1].expand(*x.shape, -1)
-    for row in rows[:-1].flip(0):
+    *others, last = (constant(tuple(row), x.dtype, x.device) for row in coefficients)
+    out = last.expand(*x.shape, -1)
+    for row in reversed(others):
         out = out * x[..., None] + row
     return out
 
@@ -55,7 +58,7 @@ def exp_so3(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation by |w| radian about w (Rodrigues)."""
     a, b, _ = _so3_coefficients((w * w).sum(-1))
     W = hat(w)
-    eye = torch.eye(3, dtype=w.dtype, device=w.device)
+    eye = constant(_EYE, w.dtype, w.device)
     return eye + a[..., None, None] * W + b[..., None, None] * (W @ W)
 
 
@@ -124,7 +127,7 @@ def exp_se3(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     a, b, c = _so3_coefficients((w * w).sum(-1))
     W = hat(w)
     W2 = W @ W
-    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    eye = constant(_EYE, xi.dtype, xi.device)
     R = eye + a[..., None, None] * W + b[..., None, None] * W2
     V = eye + b[..., None, None] * W + c[..., None, None] * W2
     return pose(R, (V @ v[..., None]).squeeze(-1))
@@ -140,7 +143,7 @@ def log_se3(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     safe = theta2.where(~small, torch.ones_like(theta2))
     coefficient = torch.where(small, _polynomials(x, _LOG_SERIES)[..., 0], (1 - a / (2 * b)) / safe)
     W = hat(w)
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
+    eye = constant(_EYE, T.dtype, T.device)
     V_inverse = eye - 0.5 * W + coefficient[..., None, None] * (W @ W)
     return torch.cat([(V_inverse @ T[..., :3, 3:]).squeeze(-1), w], -1)
 
@@ -148,7 +151,7 @@ def log_se3(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
 def pose(R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
     """The 4x4 matrix with rotation `R` and translation `t`."""
     top = torch.cat([R, t[..., None]], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    bottom = constant((0.0, 0.0, 0.0, 1.0), top.dtype, top.device).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], -2)
 
 

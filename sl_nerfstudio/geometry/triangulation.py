@@ -38,7 +38,7 @@ def closest_approach(
     # Cross products, because 1 - cos^2 of the angle would lose all digits of float32 at small baselines.
     normal = torch.linalg.cross(d1, d2)
     sin2 = (normal * normal).sum(-1)
-    scaled = normal / sin2.where(sin2 > _PARALLEL, sin2.new_tensor(float("nan")))[..., None]
+    scaled = normal / torch.where(sin2 > _PARALLEL, sin2, torch.nan)[..., None]
     return (torch.linalg.cross(between, d2) * scaled).sum(-1), (torch.linalg.cross(between, d1) * scaled).sum(-1)
 
 

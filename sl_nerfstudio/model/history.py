@@ -1,6 +1,6 @@
 """Convergence curves that are saved in the checkpoint."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -18,33 +18,43 @@ class History(nn.Module):
         super().__init__()
         self.names = tuple(names)
         self.register_buffer("table", torch.full((_ROWS, len(names) + 1), float("nan"), dtype=torch.float64))
-        self.register_buffer("state", torch.tensor([0, 5]))  # rows used, steps between rows
-
-    @property
-    def every(self) -> int:
+        self._used = 0  # rows
+        self.every = 5
         """Steps between two entries."""
-        return int(self.state[1])
+        self.register_buffer("state", torch.tensor([self._used, self.every]))  # the same two, for the checkpoint
+        self.register_load_state_dict_post_hook(_read_state)
 
-    def add(self, step: int, values: dict[str, float]) -> None:
-        """Append one row; missing values are NaN. When the table is full, every other row is removed."""
-        used = int(self.state[0])
-        row = [float(step), *(values.get(name, float("nan")) for name in self.names)]
-        self.table[used] = torch.tensor(row, dtype=torch.float64)
-        used += 1
-        if used == _ROWS:
+    @torch.no_grad()
+    def add(self, step: int, values: Mapping[str, Tensor | float]) -> None:
+        """Append one row; missing values are NaN. When the table is full, every other row is removed.
+
+        Values on a GPU stay there, so that the host need not wait for them.
+        """
+        row = self.table[self._used]
+        row[0].fill_(step)
+        for place, name in zip(row[1:], self.names, strict=True):
+            value = values.get(name, float("nan"))
+            place.copy_(value) if isinstance(value, Tensor) else place.fill_(value)
+        self._used += 1
+        if self._used == _ROWS:
             kept = self.table[::2].clone()
             self.table.fill_(float("nan"))
             self.table[: len(kept)] = kept
-            used = len(kept)
-            self.state[1] *= 2
-        self.state[0] = used
+            self._used = len(kept)
+            self.every *= 2
+        self.state[0].fill_(self._used)
+        self.state[1].fill_(self.every)
 
     def latest(self, name: str) -> float:
         """The value of the last row, NaN if there is none."""
-        used = int(self.state[0])
-        return float(self.table[used - 1, 1 + self.names.index(name)]) if used else float("nan")
+        return float(self.table[self._used - 1, 1 + self.names.index(name)]) if self._used else float("nan")
 
     def curves(self) -> dict[str, list[float]]:
         """Columns by name, `step` first."""
-        rows = self.table[: int(self.state[0])].cpu()
+        rows = self.table[: self._used].cpu()
         return {name: rows[:, i].tolist() for i, name in enumerate(("step", *self.names))}
+
+
+def _read_state(history: History, _: object) -> None:
+    """After a checkpoint was loaded."""
+    history._used, history.every = history.state.tolist()

@@ -25,7 +25,7 @@ from sl_nerfstudio.model.history import History
 from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
 from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
 from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, picture_outputs, ray_outputs
-from sl_nerfstudio.model.pose_parameters import make_pose_parameters
+from sl_nerfstudio.model.pose_parameters import FrameTransforms, make_pose_parameters
 from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
 from sl_nerfstudio.model.settings import SLModelSettings
 from sl_nerfstudio.rendering.direct_losses import (
@@ -37,7 +37,7 @@ from sl_nerfstudio.rendering.direct_losses import (
 )
 from sl_nerfstudio.rendering.losses import coordinate_loss, pattern_loss
 from sl_nerfstudio.rendering.renderer import Renderer
-from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at
+from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at, surface_width_at
 from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.scan import Scan
 
@@ -49,6 +49,8 @@ class SLModel(Model):
 
     config: SLModelSettings
     step_now: Tensor
+    kappa_now: Tensor
+    surface_width_now: Tensor
     noise_px: Tensor
     px_per_length: Tensor
     projector_params: Tensor
@@ -83,6 +85,11 @@ class SLModel(Model):
         self.register_buffer("px_per_length", torch.tensor(float("nan")))
         change = torch.tensor(self.scan.intrinsics_change.values, dtype=torch.float64)
         self.register_buffer("intrinsics_change", change)
+        # read by every step, on its device: the host sets them and need not wait
+        self.register_buffer("kappa_now", torch.zeros((), dtype=torch.float64), persistent=False)  # per scene unit
+        self.register_buffer("surface_width_now", torch.zeros((), dtype=torch.float64), persistent=False)
+        self._set_scalars(0)
+        self.register_load_state_dict_post_hook(_read_step)
         self.history_table = History(("loss", "coordinate_px", "pattern_cosine", "eikonal", "surface"))
         self.viewed_frame = 0
 
@@ -187,54 +194,60 @@ class SLModel(Model):
 
     def anneal(self, step: int) -> None:
         """Set sharpness and level of detail for a step; called before each step, and when a checkpoint is loaded."""
-        self.step_now.fill_(step)
         c = self.config
+        self.step_now.fill_(step)
+        self._set_scalars(step)
         self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
         uses_cache = self.training and c.sampling.strategy == "surface" and self._renders(step)
-        if uses_cache and (not self.cache.filled or step % _REFRESH_EVERY == 0):
+        if uses_cache and (not self.cache.is_filled or step % _REFRESH_EVERY == 0):
             self.cache.refresh(self.field)
         if self.training:  # training continues with the saved cache, so that a resumed run equals an uninterrupted one
             self._cache_is_old = False
+
+    def _set_scalars(self, step: int) -> None:
+        """What steps read on their device, and what the host knows of it."""
+        c = self.config
+        self._step = step
+        self.kappa_now.fill_(kappa_at(c.annealing, step, c.schedule_iterations))
+        self.surface_width_now.fill_(surface_width_at(step, c.schedule_iterations))
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: sets the levels to those of the checkpoint's step."""
         self.anneal(max(step, 0))  # -1: the poses are adjusted, no step has been taken
         self._cache_is_old = True
 
+    @property
+    def operations_of_step(self) -> tuple[Any, ...]:
+        """Equal for steps that do the same operations: all that changes otherwise is in tensors."""
+        return self._renders(self._step), self.field.encoding.active
+
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
 
     @property
-    def kappa(self) -> float:
-        """Current sharpness, per scene unit."""
-        return kappa_at(self.config.annealing, int(self.step_now), self.config.schedule_iterations)
-
-    @property
     def renderer(self) -> Renderer:
         """The field lit by the projector, at its current sharpness; outside training with an up-to-date cached grid."""
-        if not self.training and (self._cache_is_old or not self.cache.filled):
+        if not self.training and (self._cache_is_old or not self.cache.is_filled):
             self.cache.refresh(self.field)
             self._cache_is_old = False
-        return Renderer(self.field, self.cache, self.projector, self.pattern, self.config.sampling, self.kappa)
+        return Renderer(self.field, self.cache, self.projector, self.pattern, self.config.sampling, self.kappa_now)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Rendered outputs of rays; in training, those that the losses need."""
         if not self.training:
             return self._eval_outputs(ray_bundle)
         views = ray_bundle.metadata["sl_view"][:, 0]
-        T_camera, T_projector = self.device_poses()
-        origins, directions = self._corrected(ray_bundle, views, T_camera)
-        T_projector_scene = inverse(T_projector).float()[views]
-        outputs: dict[str, Any] = {
-            "origins": origins,
-            "directions": directions,
-            "T_scene_projector": T_projector.float()[views],
-        }
-        if self._renders(int(self.step_now)):
+        now = self.device_poses.transforms()
+        origins, directions = _corrected(ray_bundle, views, now)
+        outputs: dict[str, Any] = {"origins": origins, "directions": directions}
+        if self.config.losses.direct:
+            outputs["T_scene_projector"] = now.T_scene_projector[views]
+        if self._renders(self._step):
             s = self.config.sampling
             n = min(s.render_rays, len(origins))
+            T_projector_scene = now.T_projector_scene[views[:n]]
             outputs["rendered"] = self.renderer.render(
-                origins[:n], directions[:n], T_projector_scene[:n], s.samples, jitter=True
+                origins[:n], directions[:n], T_projector_scene, s.samples, jitter=True
             )
         return outputs
 
@@ -265,13 +278,8 @@ class SLModel(Model):
         views = metadata["sl_view"][:, 0].long()
         if "sl_refined" in metadata:
             return bundle.origins, bundle.directions, views
-        return *self._corrected(bundle, views, self.poses_scene()[0]), views
-
-    def _corrected(self, bundle: RayBundle, views: Tensor, T_camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Move rays from the starting pose, at which they were made, to the current one."""
-        correction = (T_camera @ inverse(self.device_poses.start_camera)).float()[views]
-        directions = rotate(correction, bundle.directions)
-        return T_camera[:, :3, 3].float()[views], directions / directions.norm(dim=-1, keepdim=True)
+        with torch.no_grad():
+            return *_corrected(bundle, views, self.device_poses.transforms()), views
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Tensor] | None = None
@@ -292,10 +300,7 @@ class SLModel(Model):
             error = coordinate_loss(rendered.coordinates, batch["coords"][:n], counts)
             losses["coordinates"] = self._per_pixel * error
             losses["pattern"] = w.pattern * pattern_loss(rendered.pattern, batch["pattern"][:n, 0])
-        losses |= self._field_losses(outputs, batch)
-        if int(self.step_now) % self.history_table.every == 0:
-            self._remember(outputs, batch, losses)
-        return losses
+        return losses | self._field_losses(outputs, batch)
 
     def _field_losses(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The terms that need no rendering."""
@@ -305,23 +310,24 @@ class SLModel(Model):
             return field_losses(self.field, points, c.losses)
         rays = MeasuredRays(outputs["origins"], outputs["directions"], outputs["T_scene_projector"], batch["coords"])
         noise = DecodingNoise(self.noise_px, self.px_per_length)
-        progress = min(int(self.step_now) / max(c.schedule_iterations, 1), 1.0)
-        decoded = rays.chosen(batch["decoded"][:, 0])
-        return direct_losses(self.field, decoded, self.projector, noise, points, c.losses, progress)
+        if points.device.type == "cpu":  # fewer rays take less time; a GPU would have to tell the host how many
+            rays = rays.chosen(batch["decoded"][:, 0])
+        return direct_losses(self.field, rays, self.projector, noise, points, c.losses, self.surface_width_now)
 
     @property
     def _per_pixel(self) -> Tensor | float:
         w = self.config.losses
         return w.coordinates / self.px_per_length if w.coordinates_per_pixel is None else w.coordinates_per_pixel
 
-    @torch.no_grad()
-    def _remember(self, outputs: dict[str, Any], batch: dict[str, Tensor], losses: dict[str, Tensor]) -> None:
-        values = {"loss": float(torch.stack([v.detach() for v in losses.values()]).sum())}
-        values["eikonal"] = float(losses["eikonal"]) / max(self.config.losses.eikonal, 1e-12)
-        if "surface" in losses:
-            values["surface"] = float(losses["surface"]) / max(self.config.losses.surface, 1e-12)
-        values |= {k: float(v) for k, v in fit_metrics(outputs, batch).items()}
-        self.history_table.add(int(self.step_now), values)
+    def remember(self, loss: Tensor, terms: dict[str, Tensor], metrics: dict[str, Tensor]) -> None:
+        """After each step: put its figures into the history, if it is their turn."""
+        if self._step % self.history_table.every:
+            return
+        w = self.config.losses
+        values = {"loss": loss, "eikonal": terms["eikonal"] / max(w.eikonal, 1e-12), **metrics}
+        if "surface" in terms:
+            values["surface"] = terms["surface"] / max(w.surface, 1e-12)
+        self.history_table.add(self._step, values)
 
     # ---- evaluation
 
@@ -338,3 +344,14 @@ class SLModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Rendered and captured images side by side, for one whole frame."""
         return image_metrics_and_images(outputs, batch)
+
+
+def _read_step(model: SLModel, _: object) -> None:
+    """After a checkpoint was loaded."""
+    model._set_scalars(int(model.step_now))
+
+
+def _corrected(bundle: RayBundle, views: Tensor, now: FrameTransforms) -> tuple[Tensor, Tensor]:
+    """Move rays from the starting pose, at which they were made, to the current one."""
+    directions = rotate(now.correction[views], bundle.directions)
+    return now.camera_centre[views], directions / directions.norm(dim=-1, keepdim=True)

@@ -5,8 +5,9 @@ load; these return Python floats. The whole schedule is saved in the checkpoint,
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import OptimizerConfig
@@ -27,6 +28,20 @@ class FusedAdamOptimizerConfig(OptimizerConfig):
     """L2 penalty."""
     fused: bool = True
     """Use torch's fused kernel."""
+
+    def setup(self, params: Any) -> torch.optim.Optimizer:
+        """The optimiser; on a GPU one whose steps can be recorded as a CUDA graph."""
+        settings = {name: value for name, value in vars(self).items() if name not in ("_target", "max_norm")}
+        optimizer = self._target(params, **settings)
+        make_recordable([optimizer])
+        return optimizer
+
+
+def make_recordable(optimizers: Iterable[torch.optim.Optimizer]) -> None:
+    """Let torch's optimisers of parameters on a GPU be recorded as a CUDA graph, also if a file says otherwise."""
+    for group in (group for optimizer in optimizers for group in optimizer.param_groups):
+        if "capturable" in group:
+            group["capturable"] = all(x.device.type == "cuda" for x in group["params"])
 
 
 @dataclass

@@ -107,12 +107,19 @@ def fit_metrics(outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, 
     else:
         return {}
     n = len(pattern)
-    error = (coordinates - batch["coords"][:n]).norm(dim=-1)[batch["decoded"][:n, 0]]
-    result = {}
-    if len(error):
-        result["coordinate_px"] = error.median()
-    result["pattern_cosine"] = torch.nn.functional.cosine_similarity(pattern, batch["pattern"][:n, 0], dim=0)
-    return result
+    error = (coordinates - batch["coords"][:n]).norm(dim=-1)
+    return {
+        "coordinate_px": _median(error, batch["decoded"][:n, 0]),
+        "pattern_cosine": torch.nn.functional.cosine_similarity(pattern, batch["pattern"][:n, 0], dim=0),
+    }
+
+
+def _median(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
+    """The lower median of the values that count, NaN if there is none; on a GPU the host need not know how many."""
+    last = torch.where(counts, values, torch.inf).sort().values
+    number = counts.sum()
+    middle = last.gather(0, ((number - 1) // 2).clamp_min(0)[None])[0]
+    return torch.where(number > 0, middle, torch.nan)
 
 
 @torch.no_grad()

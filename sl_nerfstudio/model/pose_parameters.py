@@ -10,6 +10,8 @@ increments to it.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,6 +21,16 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCov
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.model.settings import SLModelSettings
+
+
+@dataclass(frozen=True)
+class FrameTransforms:
+    """What rays need of the current poses, in float32."""
+
+    camera_centre: Float[Tensor, "frames 3"]
+    correction: Float[Tensor, "frames 4 4"]  # from the starting pose of the camera, at which rays are made
+    T_scene_projector: Float[Tensor, "frames 4 4"]
+    T_projector_scene: Float[Tensor, "frames 4 4"]
 
 
 class PoseParameters(nn.Module):
@@ -59,6 +71,8 @@ class PoseParameters(nn.Module):
         self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
+        self._fixed: FrameTransforms | None = None
+        self.register_load_state_dict_post_hook(_forget)
 
     @torch.no_grad()
     def rebase(
@@ -69,6 +83,7 @@ class PoseParameters(nn.Module):
         self.base_projector.copy_(T_scene_projector)
         self.camera_step.zero_()
         self.projector_step.zero_()
+        self._fixed = None
 
     @torch.no_grad()
     def note(
@@ -102,6 +117,24 @@ class PoseParameters(nn.Module):
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""
         raise NotImplementedError
 
+    def transforms(self) -> FrameTransforms:
+        """The current poses as rays need them, differentiable; computed once if no losses move the poses."""
+        if self.camera_step.requires_grad or self.projector_step.requires_grad:
+            return self._transforms()
+        if self._fixed is None:
+            with torch.inference_mode(False), torch.no_grad():
+                self._fixed = self._transforms()
+        return self._fixed
+
+    def _transforms(self) -> FrameTransforms:
+        camera, projector = self()
+        correction = (camera @ inverse(self.start_camera)).float()
+        return FrameTransforms(camera[:, :3, 3].float(), correction, projector.float(), inverse(projector).float())
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        self._fixed = None  # torch moves parameters and buffers to another device
+        return super()._apply(fn, recurse)
+
     def _camera_about_scene(self) -> Float[Tensor, "frames 4 4"]:
         return exp_se3(self.camera_step.double()) @ self.base_camera
 
@@ -110,6 +143,11 @@ class PoseParameters(nn.Module):
 
     def _relative(self) -> Float[Tensor, "frames 4 4"]:
         return exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
+
+
+def _forget(parameters: PoseParameters, _: object) -> None:
+    """After a checkpoint was loaded."""
+    parameters._fixed = None
 
 
 class RigPoseParameters(PoseParameters):

@@ -49,6 +49,10 @@ class SLTrainerConfig(TrainerConfig):
     for a resumed run the length of the run that it resumes."""
     seconds_per_save: float = 60.0
     """A checkpoint is also written when this many seconds, and at least 100 steps, have passed since the last one."""
+    cuda_graph: bool = True
+    """On a GPU, record the operations of a step once and repeat them with one launch; off: launch each by itself."""
+    tf32: bool = False
+    """Let a GPU's matrix products round their factors to 11 bits (TF32), which is faster; docs/gpu.md has the effect."""
     verbose: bool = False
     """Also print all settings and nerfstudio's own messages and table."""
     last_step: tyro.conf.Suppress[int | None] = None

@@ -23,15 +23,16 @@ _BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = 4.0, 0.006, 0.03
 """Closer to the measured surface than this, in sigmas of its depth and within bounds in scene units, no sign is
 required. A wider band would allow a surface that is folded within it and passes through the points inside out."""
 _NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # this share of the points in front is within so many bands of the surface
-_WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
 
 
 @dataclass(frozen=True)
 class DecodingNoise:
     """How well coordinates are decoded, and how pattern pixels relate to lengths."""
 
-    px: float | Tensor  # 1 sigma of the epipolar residual, pattern pixels
-    px_per_length: float | Tensor  # median slope of the coordinate along camera rays, pattern pixels per scene unit
+    px: Float[Tensor, ""] | float  # 1 sigma of the epipolar residual, pattern pixels
+    px_per_length: (
+        Float[Tensor, ""] | float
+    )  # median slope of the coordinate along camera rays, pattern pixels per scene unit
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class MeasuredRays:
     origins: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
     T_scene_projector: Float[Tensor, "n 4 4"]
-    uv_projector: Float[Tensor, "n 2"]
+    uv_projector: Float[Tensor, "n 2"]  # NaN where not decoded: such rays do not count
 
     def chosen(self, index: Bool[Tensor, "n"]) -> "MeasuredRays":
         """Some of the rays."""
@@ -59,7 +60,8 @@ def random_points(count: int, device: torch.device) -> Float[Tensor, "n 3"]:
 
 def field_losses(field: SignedDistance, points: Float[Tensor, "n 3"], weights: LossConfig) -> dict[str, Tensor]:
     """Only the Eikonal term, at some points of the scene."""
-    return {"eikonal": weights.eikonal * eikonal_loss(field.sdf_and_gradient(points)[1])}
+    gradient = field.sdf_and_gradient(points)[1]
+    return {"eikonal": weights.eikonal * eikonal_loss(gradient, torch.ones_like(points[:, 0], dtype=torch.bool))}
 
 
 def direct_losses(
@@ -69,11 +71,12 @@ def direct_losses(
     noise: DecodingNoise,
     eikonal_points: Float[Tensor, "m 3"],
     weights: LossConfig,
-    progress: float,
+    width: Float[Tensor, ""] | float,
 ) -> dict[str, Tensor]:
-    """Surface, free-space and Eikonal terms of decoded rays; `progress` is the share of the run that is over."""
+    """Surface, free-space and Eikonal terms of decoded rays; `width` is that of the surface term's kernel."""
     o, d = rays.origins, rays.directions
-    depth, sigma, weight = _measured(rays, projector, noise)
+    decoded = rays.uv_projector.isfinite().all(-1)
+    depth, sigma, weight = _measured(rays, decoded, projector, noise)
     p = o + depth[:, None] * d
     with torch.no_grad():
         near, _, _ = sphere_interval(o, d)
@@ -86,17 +89,17 @@ def direct_losses(
     if p.requires_grad:  # first order in the poses: the slope is a constant
         at_surface = at_surface + (gradient[:n].detach() * (p - p.detach())).sum(-1)
     signs = field.sdf(torch.cat([o + before[:, None] * d, o + after[:, None] * d]).detach())
-    width = _WIDTH_START * (_WIDTH_END / _WIDTH_START) ** progress
     counts = weight * inside
     return {
         "surface": weights.surface * surface_loss(at_surface, counts, width),
         "free_space": weights.free_space
         * (
-            free_space_loss(signs[:n][inside], (0.3 * gap[inside]).clamp_max(_MOST_BAND))
-            + 0.3 * behind_loss(signs[n:][inside])
+            free_space_loss(signs[:n], (0.3 * gap).clamp_max(_MOST_BAND), inside)
+            + 0.3 * behind_loss(signs[n:], inside)
             + 0.1 * facing_loss(gradient[:n], d.detach(), counts)
         ),
-        "eikonal": weights.eikonal * eikonal_loss(gradient),
+        "eikonal": weights.eikonal
+        * eikonal_loss(gradient, torch.cat([decoded, torch.ones_like(eikonal_points[:, 0], dtype=torch.bool)])),
     }
 
 
@@ -111,11 +114,13 @@ def _either_side(
 
 
 def _measured(
-    rays: MeasuredRays, projector: Intrinsics, noise: DecodingNoise
+    rays: MeasuredRays, decoded: Bool[Tensor, "n"], projector: Intrinsics, noise: DecodingNoise
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Distance along camera rays at which projector rays meet them, its sigma, and a weight: 0 if decoded wrongly."""
     o, d, T_scene_projector = rays.origins, rays.directions, rays.T_scene_projector
-    d_projector = rotate(T_scene_projector, unproject(projector, rays.uv_projector))
+    # a ray without coordinates gets those of the pattern's middle: NaN would spoil the gradients of all
+    uv = torch.where(decoded[:, None], rays.uv_projector, projector.params[2:4])
+    d_projector = rotate(T_scene_projector, unproject(projector, uv))
     o_projector = T_scene_projector[:, :3, 3]
     depth, depth_projector = closest_approach(o, d, o_projector, d_projector)
     with torch.no_grad():
@@ -125,7 +130,7 @@ def _measured(
         offset = (o_projector + depth_projector[:, None] * d_projector) - p
         gap_px = (J * rotate(T, offset)[:, None, :]).sum(-1).norm(dim=-1)
         slope = (J * rotate(T, d)[:, None, :]).sum(-1).norm(dim=-1)  # pixels per length
-        good = (gap_px < _GATE * noise.px) & (depth > 0) & (depth_projector > 0)
+        good = decoded & (gap_px < _GATE * noise.px) & (depth > 0) & (depth_projector > 0)
         weight = good * (slope / noise.px_per_length).clamp(0.1, 2.0)
         sigma = noise.px / slope.clamp_min(1e-9)
     return torch.nan_to_num(depth, nan=1.0), torch.nan_to_num(sigma), torch.nan_to_num(weight)

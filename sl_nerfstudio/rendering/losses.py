@@ -26,12 +26,19 @@ def pattern_loss(rendered: Float[Tensor, "rays"], measured: Float[Tensor, "rays"
     return 1 - torch.nn.functional.cosine_similarity(rendered, measured, dim=0, eps=1e-6)
 
 
-def eikonal_loss(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Mean of (|gradient| - 1)^2: a signed distance has slope one."""
-    return ((gradient.norm(dim=-1) - 1) ** 2).mean()
+def _mean(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean of the values that count; 0 if none does. A GPU need not tell the host how many they are."""
+    return (values * counts).sum() / counts.sum().clamp_min(1)
 
 
-def surface_loss(sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: float) -> Float[Tensor, ""]:
+def eikonal_loss(gradient: Float[Tensor, "n 3"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean of (|gradient| - 1)^2 over the points that count: a signed distance has slope one."""
+    return _mean((gradient.norm(dim=-1) - 1) ** 2, counts)
+
+
+def surface_loss(
+    sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: Float[Tensor, ""] | float
+) -> Float[Tensor, ""]:
     """Robust mean of |f| at points that were measured on the surface.
 
     Charbonnier, modified to `width * (1 - exp(-|f| / width))`: linear for errors well below `width`, insensitive
@@ -40,14 +47,16 @@ def surface_loss(sdf: Float[Tensor, "n"], weight: Float[Tensor, "n"], width: flo
     return (weight * width * (1 - torch.exp(-sdf.abs() / width))).sum() / weight.sum().clamp_min(1e-9)
 
 
-def free_space_loss(sdf: Float[Tensor, "n"], at_least: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+def free_space_loss(
+    sdf: Float[Tensor, "n"], at_least: Float[Tensor, "n"], counts: Bool[Tensor, "n"]
+) -> Float[Tensor, ""]:
     """Mean amount by which the field is below `at_least` at points that a ray passed before it met the surface."""
-    return (at_least - sdf).clamp_min(0).mean()
+    return _mean((at_least - sdf).clamp_min(0), counts)
 
 
-def behind_loss(sdf: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+def behind_loss(sdf: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
     """Mean of the field's positive part just behind the surface."""
-    return sdf.clamp_min(0).mean()
+    return _mean(sdf.clamp_min(0), counts)
 
 
 def facing_loss(

@@ -31,7 +31,7 @@ class Renderer:
     projector: Intrinsics  # batch ()
     pattern: Float[Tensor, "h w"]
     sampling: SamplingConfig
-    kappa: float  # sharpness, per scene unit
+    kappa: Float[Tensor, ""] | float  # sharpness, per scene unit
 
     def render(
         self,
@@ -66,7 +66,7 @@ class Renderer:
         return (f.reshape(t.shape).amin(-1) < self._reach + between) & (far > near)
 
     @property
-    def _reach(self) -> float:
+    def _reach(self) -> Float[Tensor, ""] | float:
         """How far from the surface a sample still counts, with the error of the cached grid."""
         return self.sampling.half_width / self.kappa + self.cache.cell
 

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
+
 
 @dataclass
 class AnnealingConfig:
@@ -39,6 +41,12 @@ def kappa_at(config: AnnealingConfig, step: int, total: int) -> float:
         return min(config.kappa_start + config.kappa_per_step * step, config.kappa_end)
     share = min(step / max(total, 1), 1.0)
     return config.kappa_start * math.exp(share * math.log(config.kappa_end / config.kappa_start))
+
+
+def surface_width_at(step: int, total: int) -> float:
+    """Width of the surface term's kernel at a step, scene units; see `surface_loss`."""
+    share = min(step / max(total, 1), 1.0)
+    return _WIDTH_START * (_WIDTH_END / _WIDTH_START) ** share
 
 
 def level_weights_at(config: AnnealingConfig, levels: int, step: int, total: int) -> Float[Tensor, "levels"]:

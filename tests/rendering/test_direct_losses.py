@@ -15,6 +15,7 @@ from sl_nerfstudio.rendering.direct_losses import (
     field_losses,
     random_points,
 )
+from sl_nerfstudio.rendering.schedule import surface_width_at
 from sl_nerfstudio.rendering.settings import LossConfig
 
 RADIUS = 0.5
@@ -62,7 +63,7 @@ def rays() -> MeasuredRays:
 def losses(field: Sphere, rays: MeasuredRays, step: int = 500) -> dict[str, Tensor]:
     torch.manual_seed(0)
     points = random_points(1024, torch.device("cpu")).double()
-    return direct_losses(field, rays, PROJECTOR, NOISE, points, LossConfig(), step / 1000)
+    return direct_losses(field, rays, PROJECTOR, NOISE, points, LossConfig(), surface_width_at(step, 1000))
 
 
 def kernel(distance: float, step: int) -> float:
@@ -119,8 +120,19 @@ def test_wrong_and_missing_decodings_do_not_count(rays):
     coords, decoded = rays.uv_projector.clone(), torch.ones(len(rays.origins), dtype=torch.bool)
     coords[::3, 1] += 25.0  # across the epipolar lines, which run along x here
     coords[1::5], decoded[1::5] = float("nan"), False
-    spoilt = losses(Sphere(RADIUS + 0.02), replace(rays, uv_projector=coords).chosen(decoded))["surface"]
-    assert float(spoilt) == pytest.approx(kernel(0.02, 500), rel=1e-6)
+    field, spoilt = Sphere(RADIUS + 0.02), replace(rays, uv_projector=coords)
+    for found in (losses(field, spoilt), losses(field, spoilt.chosen(decoded))):  # left in, as on a GPU, or taken out
+        assert float(found["surface"]) == pytest.approx(kernel(0.02, 500), rel=1e-6)
+        assert float(found["eikonal"]) < 1e-9
+
+
+def test_missing_decodings_leave_the_gradient_of_poses_finite(rays):
+    coords = rays.uv_projector.clone()
+    coords[1::5] = float("nan")
+    T = rays.T_scene_projector.clone().requires_grad_()
+    sum(losses(Sphere(0.4), replace(rays, uv_projector=coords, T_scene_projector=T)).values()).backward()
+    assert T.grad is not None and T.grad.isfinite().all()
+    assert T.grad[0].abs().max() > 0 and T.grad[1::5].abs().max() == 0
 
 
 def test_without_direct_terms_only_the_slope_counts():

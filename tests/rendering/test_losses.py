@@ -14,6 +14,7 @@ from sl_nerfstudio.rendering.losses import (
 )
 
 NAN = float("nan")
+ALL = torch.ones(50, dtype=torch.bool)
 
 
 def test_coordinates_count_by_their_l1_distance_where_they_are_known():
@@ -46,9 +47,9 @@ def test_a_dark_batch_gives_no_nan():
 
 def test_slope_one_costs_nothing():
     gradient = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    assert float(eikonal_loss(gradient)) < 1e-12
-    assert float(eikonal_loss(3 * gradient)) == pytest.approx(4, rel=1e-5)
-    assert float(eikonal_loss(0.5 * gradient)) == pytest.approx(0.25, rel=1e-5)
+    assert float(eikonal_loss(gradient, ALL)) < 1e-12
+    assert float(eikonal_loss(3 * gradient, ALL)) == pytest.approx(4, rel=1e-5)
+    assert float(eikonal_loss(0.5 * gradient, ALL)) == pytest.approx(0.25, rel=1e-5)
 
 
 def test_measured_points_attract_the_surface_when_near_and_not_when_far():
@@ -78,9 +79,20 @@ def test_weights_of_measured_points_are_shares():
 
 def test_signs_in_front_of_the_surface_and_behind():
     sdf, least = torch.tensor([0.5, 0.1, -0.2]), torch.tensor([0.2, 0.2, 0.1])
-    assert float(free_space_loss(sdf, least)) == pytest.approx((0 + 0.1 + 0.3) / 3)
-    assert float(behind_loss(sdf)) == pytest.approx(0.6 / 3)
-    assert float(behind_loss(-sdf.abs())) == 0
+    counts = torch.tensor([True, True, True])
+    assert float(free_space_loss(sdf, least, counts)) == pytest.approx((0 + 0.1 + 0.3) / 3)
+    assert float(behind_loss(sdf, counts)) == pytest.approx(0.6 / 3)
+    assert float(behind_loss(-sdf.abs(), counts)) == 0
+
+
+def test_points_that_do_not_count_are_as_if_they_were_not_there():
+    sdf, least = torch.tensor([0.5, 0.1, -0.2]), torch.tensor([0.2, 0.2, 0.1])
+    gradient = torch.tensor([[2.0, 0, 0], [0, 1, 0], [0, 0, 3]])
+    counts = torch.tensor([True, False, True])
+    assert free_space_loss(sdf, least, counts) == free_space_loss(sdf[counts], least[counts], ALL[:2])
+    assert behind_loss(sdf, counts) == behind_loss(sdf[counts], ALL[:2])
+    assert eikonal_loss(gradient, counts) == eikonal_loss(gradient[counts], ALL[:2]) == 2.5
+    assert eikonal_loss(gradient, ~ALL[:3]) == 0
 
 
 def test_a_surface_may_be_grazed_but_not_seen_from_inside():

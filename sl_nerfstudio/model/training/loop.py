@@ -1,24 +1,29 @@
 """nerfstudio's training loop, which may be stopped at any time without losing what was found."""
 
+import functools
 import math
 import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
 
 from sl_nerfstudio.console import paragraph
 from sl_nerfstudio.errors import UserError, last_line
+from sl_nerfstudio.model.optimisers import make_recordable
 from sl_nerfstudio.model.training.checkpoints import SCHEDULE_KEY, checkpoint_name, checkpoints_in, write_checkpoint
 from sl_nerfstudio.model.training.interruption import INTERRUPTION, Interrupted
 from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
 from sl_nerfstudio.model.training.shared_training import greatest, several, share_state, shared_optimizers
+from sl_nerfstudio.model.training.step_graph import CudaRecorder, DeviceRates, NotRecordedError, Recorder, StepGraph
 from sl_nerfstudio.progress import Phase, phase
 from sl_nerfstudio.threads import one_library_thread
 
@@ -30,7 +35,7 @@ _STEPS_PER_AGREEMENT = 10  # of several processes on whether to stop: each agree
 
 
 class SLTrainer(Trainer):
-    """nerfstudio's trainer with seven differences.
+    """nerfstudio's trainer with eight differences.
 
     - Poses are adjusted before the first step, whose time would otherwise include it, and saved.
     - Each phase prints one line, with a bar or the time left while it runs; nerfstudio itself is quiet.
@@ -38,6 +43,7 @@ class SLTrainer(Trainer):
       which then end the process with status 130 or 143.
     - A checkpoint is complete or not there. Files in its folder that are no checkpoints are left alone.
     - A checkpoint that does not fit the model gives a message.
+    - On a GPU, steps are recorded as a CUDA graph.
     - When the schedule has ended, the optimisers forget their moments, two thirds of a checkpoint: what goes on from
       there, at once or later, starts with new ones.
     - Several processes take the same steps, along the mean of their gradients. The main one adjusts the poses; all stop
@@ -46,6 +52,7 @@ class SLTrainer(Trainer):
 
     config: Any
     pipeline: Any
+    recorded: tuple[StepGraph, DeviceRates] | None = None  # if steps are done by a CUDA graph
     _done: int | None = None  # the last step whose results the weights hold
     _saved: tuple[int | None, float] = (None, 0.0)  # the last step that was saved, and when
 
@@ -61,6 +68,9 @@ class SLTrainer(Trainer):
         """Make the pipeline and load the checkpoint; see nerfstudio's Trainer."""
         with self._ending():
             super().setup(test_mode)
+            if torch.device(self.device).type == "cuda":
+                torch.backends.cuda.matmul.allow_tf32 = self.config.tf32
+                self._record_cuda_graph()
         for line in getattr(self.viewer_state, "viewer_info", []):
             print(paragraph("viewer", line), flush=True)
 
@@ -111,8 +121,55 @@ class SLTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """One step; nerfstudio writes the losses to its log, and torch warns of those that have a gradient."""
-        loss, terms, metrics = super().train_iteration(step)
+        loss, terms, metrics = self._recorded_iteration(step) if self.recorded else super().train_iteration(step)
+        loss, terms = loss.detach(), {name: term.detach() for name, term in terms.items()}
+        self._model.remember(loss, terms, metrics)
+        return loss, terms, metrics
+
+    def record_steps(self, recorder: Recorder) -> None:
+        """From now on, do steps by a recording."""
+        rates = DeviceRates(self.optimizers.optimizers.values())
+        self.recorded = StepGraph(recorder, partial(self._operations, rates)), rates
+
+    def _recorded_iteration(self, step: int) -> Any:
+        assert self.recorded is not None
+        graph, rates = self.recorded
+        rates.update()
+        self.pipeline.datamanager.train_pixel_sampler.begin(step)
+        try:
+            result = graph.step(self._model.operations_of_step)
+        except NotRecordedError as error:
+            self.recorded = None
+            print(paragraph("graph", _not_recorded(str(error))), flush=True)
+            return super().train_iteration(step)
+        self.optimizers.scheduler_step_all(step)
+        return result
+
+    def _operations(self, rates: DeviceRates) -> Any:
+        """What nerfstudio's `train_iteration` does on the device, where neither precision is mixed nor steps are skipped."""
+        groups = list(self.optimizers.parameters)
+        self.optimizers.zero_grad_some(groups)
+        _, terms, metrics = self.pipeline.get_train_loss_dict(step=self.step)
+        loss = functools.reduce(torch.add, terms.values())
+        loss.backward()
+        with rates.in_use():
+            self.optimizers.optimizer_scaler_step_some(self.grad_scaler, groups)
         return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
+
+    def _why_not_recorded(self) -> str:
+        """Why steps cannot be recorded as a CUDA graph; "" if they can."""
+        c, data = self.config, self.pipeline.datamanager
+        if torch.device(self.device).type != "cuda":
+            return f"the run is on {self.device}"
+        reasons = {
+            "--cuda-graph False": not c.cuda_graph,
+            "--mixed-precision True": self.use_grad_scaler,
+            "--gradient-accumulation-steps": any(n != 1 for n in self.gradient_accumulation_steps.values()),
+            "--log-gradients True": c.log_gradients,
+            f"{self.world_size} processes": self.world_size > 1,
+            "the table of pixels is not on the GPU": data.train_pixel_sampler.samples.device.type == "cpu",
+        }
+        return ", ".join(reason for reason, holds in reasons.items() if holds)
 
     def eval_iteration(self, step: int) -> None:
         """Evaluate if it is due, as the last part of each step; a signal that came during the step counts now."""
@@ -120,6 +177,8 @@ class SLTrainer(Trainer):
         if step + 1 == self.config.schedule_iterations:
             for optimizer in self.optimizers.optimizers.values():
                 optimizer.state.clear()
+            if self.recorded:
+                self.recorded[0].forget()
         self._done = step
         self._training.update(step + 1, self._start_step + self.config.max_num_iterations, self._fit())
         saved, when = self._saved
@@ -157,6 +216,7 @@ class SLTrainer(Trainer):
     def _load_checkpoint(self) -> None:
         try:
             super()._load_checkpoint()
+            make_recordable(self.optimizers.optimizers.values())
         except (RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
             raise UserError(
                 f"{self.config.load_checkpoint}: does not fit this training "
@@ -208,10 +268,21 @@ class SLTrainer(Trainer):
                 print(f"error: {error}", file=sys.stderr, flush=True)
             raise SystemExit(1) from None
 
+    def _record_cuda_graph(self) -> None:
+        why = self._why_not_recorded()
+        if why:
+            print(paragraph("graph", _not_recorded(why)), flush=True)
+        else:
+            self.record_steps(CudaRecorder([self.pipeline.datamanager.train_pixel_sampler.generator]))
+
     def _leave_folder(self) -> None:
         leave = getattr(self.config, "leave_folder", None)
         if leave is not None:
             leave()
+
+
+def _not_recorded(why: str) -> str:
+    return f"Steps are not recorded as a CUDA graph, which would be faster: {why}."
 
 
 def _shown_phase(name: str) -> AbstractContextManager[Phase]:

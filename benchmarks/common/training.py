@@ -1,0 +1,64 @@
+"""A training of one of our methods, taken step by step: nerfstudio's trainer and callbacks, without its loop."""
+
+import copy
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.model.pipeline import SLPipeline
+from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.model.training.loop import SLTrainer
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.model.model import SLModel
+
+METHODS = {"sl-neus": sl_neus.config, "sl-neus-paper": sl_neus_paper.config}
+
+
+def settings(method: str, scan: Path, output: Path, device: str, steps: int) -> SLTrainerConfig:
+    """A run of a method, to be changed before it is begun."""
+    config = cast(SLTrainerConfig, copy.deepcopy(METHODS[method]))
+    config.data, config.output_dir, config.timestamp, config.max_num_iterations = scan, output, "run", steps
+    config.pipeline.datamanager.data = scan
+    config.machine.device_type = cast(Any, device)
+    return config
+
+
+class Training:
+    """A run that was begun; poses stay at their starting values until the losses move them."""
+
+    def __init__(self, config: SLTrainerConfig, adjust: bool = False) -> None:
+        """`adjust`: refine the poses first, if the method does."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            config.prepare()
+            self.trainer = SLTrainer(config)
+            self.trainer.setup()
+        samples = self.pipeline.datamanager.samples
+        if adjust:
+            self.model.adjust_poses(samples)
+        self.model.measure_noise(samples)
+        self.done = 0
+
+    @property
+    def pipeline(self) -> SLPipeline:
+        """Data and model."""
+        return cast(SLPipeline, self.trainer.pipeline)
+
+    @property
+    def model(self) -> "SLModel":
+        """The model that is trained."""
+        return cast("SLModel", self.pipeline.model)
+
+    def step(self) -> Any:
+        """The next step, as nerfstudio's loop does it; returns loss, terms and metrics."""
+        step, self.done = self.done, self.done + 1
+        self.trainer.step = step
+        self.pipeline.train()
+        for callback in self.trainer.callbacks:
+            if TrainingCallbackLocation.BEFORE_TRAIN_ITERATION in callback.where_to_run:
+                callback.run_callback(step)
+        return self.trainer.train_iteration(step)

@@ -1,0 +1,249 @@
+"""The pretended GPU: computes on the CPU, checks devices as CUDA does, and writes down what a GPU would do."""
+
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map
+
+from benchmarks.pretended.operations import indexes, launches, name_of, takes_scalars_of_the_cpu, wait_of
+from benchmarks.pretended.tensor import CUDA, DeviceTensor, on_cpu, on_gpu
+
+_OWN = "sl_nerfstudio"
+
+
+class MixedDevicesError(RuntimeError):
+    """An operation got tensors of two devices, which CUDA refuses."""
+
+
+@dataclass
+class Seen:
+    """What a GPU would have done."""
+
+    launches: Counter[str] = field(default_factory=Counter)
+    """Operations that launch a kernel or a copy, by name."""
+    waits: Counter[str] = field(default_factory=Counter)
+    """Why and where the host waited for the device, or copied from pageable memory."""
+
+
+class PretendedGpu(TorchDispatchMode):
+    """Use as a context. `seen` counts from the start or from the last `counting()`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen = Seen()
+        self._functions = _Functions(self)
+        self._pulls_back = False  # from a tensor on the GPU
+        self.calls_factory = False
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "PretendedGpu":
+        """Torch says that there is a GPU."""
+        replaced: list[tuple[Any, str, Any]] = [
+            (torch.cuda, "is_available", lambda: True),
+            (torch.cuda, "device_count", lambda: 1),
+            (torch.cuda, "mem_get_info", lambda *_: (8 << 30, 8 << 30)),
+            (torch.cuda, "is_current_stream_capturing", lambda: False),
+            (torch, "Generator", _Generator),
+            (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
+            (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
+        ]
+        for owner, name, stand_in in replaced:
+            self._stack.enter_context(mock.patch.object(owner, name, stand_in))
+        self._stack.enter_context(torch.autograd.set_multithreading_enabled(False))
+        super().__enter__()
+        self._functions.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._functions.__exit__(*error)
+        super().__exit__(*error)
+        self._stack.close()
+
+    @contextmanager
+    def counting(self) -> Iterator[Seen]:
+        """Count only what happens inside."""
+        before, self.seen = self.seen, Seen()
+        try:
+            yield self.seen
+        finally:
+            self.seen = before
+
+    def _backward(self, run_engine: Callable[..., Any]) -> Callable[..., Any]:
+        """torch's engine, which switches the mode of functions off, and calls functions of ours."""
+
+        def run(outputs: Any, *args: Any, **kwargs: Any) -> Any:
+            before, self._pulls_back = self._pulls_back, isinstance(outputs[0], DeviceTensor)
+            with self._functions:
+                try:
+                    return run_engine(outputs, *args, **kwargs)
+                finally:
+                    self._pulls_back = before
+
+        return run
+
+    def wait(self, why: str) -> None:
+        """Note that the host waits for the device."""
+        self.seen.waits[f"{why}: {_place()}"] += 1
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Compute with the values on the CPU."""
+        kwargs = kwargs or {}
+        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        there = sum(isinstance(x, DeviceTensor) for x in tensors)
+        out = func(*tree_map(on_cpu, args), **tree_map(on_cpu, kwargs))
+        if there == 0:
+            engine_made = self._pulls_back and name_of(func) == "zeros" and not self.calls_factory
+            return on_gpu(out) if engine_made else out  # a gradient that is not there
+        self._check(func, args, tensors)
+        if launches(func):
+            self.seen.launches[name_of(func)] += 1
+        why = wait_of(func, args)
+        if why is not None:
+            self.wait(why)
+        if name_of(func) == "copy_" and not isinstance(args[0], DeviceTensor):
+            return args[0]
+        return return_and_correct_aliasing(func, args, kwargs, tree_map(on_gpu, out))
+
+    def _check(self, func: Any, args: Any, tensors: list[Tensor]) -> None:
+        others = [x for x in tensors if not isinstance(x, DeviceTensor)]
+        if not others:
+            return
+        if name_of(func) == "copy_":
+            self.wait("a copy between host and device")
+            return
+        if indexes(func) and isinstance(args[0], DeviceTensor):
+            mine = {id(x) for x in args[1] if x is not None}
+            if any(id(x) in mine for x in others):
+                self.wait("indices copied to the device")
+            others = [x for x in others if id(x) not in mine]
+        if others and not (takes_scalars_of_the_cpu(func) and all(x.dim() == 0 for x in others)):
+            raise MixedDevicesError(f"{func}: {[f'{x.device} {tuple(x.shape)}' for x in tensors]}")
+
+
+class _Functions(TorchFunctionMode):
+    """Torch's functions with a device as an argument: they never reach CUDA."""
+
+    def __init__(self, gpu: PretendedGpu) -> None:
+        super().__init__()
+        self._gpu = gpu
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Make, move and read tensors as on a GPU."""
+        kwargs = dict(kwargs or {})
+        if isinstance(func, torch._ops.OpOverload):  # called by another mode, below the functions of torch
+            return func(*args, **kwargs)
+        name = getattr(func, "__name__", "")
+        if name in ("to", "cuda", "cpu") and args and isinstance(args[0], Tensor):
+            return self._moved(func, name, args, kwargs)
+        if name in ("tolist", "new_tensor") and isinstance(args[0], DeviceTensor):
+            return self._read_or_uploaded(func, name, args, kwargs)
+        device = kwargs.get("device")
+        if device is None:
+            return func(*args, **kwargs)
+        kwargs["device"] = torch.device("cpu")
+        self._gpu.calls_factory = True
+        try:
+            return self._made(func, name, torch.device(device).type == CUDA.type, args, kwargs)
+        finally:
+            self._gpu.calls_factory = False
+
+    def _made(self, func: Callable[..., Any], name: str, wanted_there: bool, args: Any, kwargs: Any) -> Any:
+        if name in ("tensor", "as_tensor"):
+            made = func(*(on_cpu(x) if name == "as_tensor" else x for x in args), **kwargs)
+            return self._upload(made) if wanted_there else made
+        made = func(*args, **kwargs)
+        if not wanted_there:
+            return self._read(made) if isinstance(made, DeviceTensor) else made
+        if not isinstance(made, DeviceTensor):
+            self._gpu.seen.launches[name] += name not in ("empty", "empty_strided")
+        return _with_gradient(on_gpu(made), made)
+
+    def _moved(self, func: Callable[..., Any], name: str, args: Any, kwargs: Any) -> Any:
+        x, rest = args[0], list(args[1:])
+        device, dtype = ({"cuda": CUDA, "cpu": torch.device("cpu")}.get(name)), kwargs.pop("dtype", None)
+        kwargs.pop("non_blocking", None)
+        copy = kwargs.pop("copy", False)
+        device = kwargs.pop("device", device)
+        for part in rest if name == "to" else []:
+            if isinstance(part, str | torch.device | int) and not isinstance(part, bool):
+                device = part
+            elif isinstance(part, torch.dtype):
+                dtype = part
+            elif isinstance(part, Tensor):
+                device, dtype = part.device, part.dtype
+        there = isinstance(x, DeviceTensor) if device is None else torch.device(device).type == CUDA.type
+        if dtype is not None or copy:
+            x = func(x, *([dtype] if dtype is not None else []), **({"copy": True} if copy else {}))
+        if there == isinstance(x, DeviceTensor):
+            return x
+        return self._upload(x) if there else self._read(x)
+
+    def _read_or_uploaded(self, func: Callable[..., Any], name: str, args: Any, kwargs: Any) -> Any:
+        if name == "tolist":
+            self._gpu.wait("values read by the host")
+            return args[0].values.tolist()
+        kwargs.pop("device", None)
+        return self._upload(args[0].values.new_tensor(*args[1:], **kwargs))
+
+    def _upload(self, x: Tensor) -> Tensor:
+        self._gpu.wait("a copy to the device")
+        self._gpu.seen.launches["copy to the device"] += 1
+        return _Copy.apply(x, True)  # pyright: ignore
+
+    def _read(self, x: Tensor) -> Tensor:
+        self._gpu.wait("a copy to the host")
+        self._gpu.seen.launches["copy to the host"] += 1
+        return _Copy.apply(x, False)  # pyright: ignore
+
+
+def _grouped(group: Callable[..., Any]) -> Callable[..., Any]:
+    """torch's optimisers ask its compiled part on which devices tensors are."""
+
+    def grouped(tensors: Any, with_indices: bool) -> Any:
+        there = any(isinstance(x, DeviceTensor) for x in tensors[0])
+        found = group(tensors, with_indices)
+        return {(CUDA if there else device, dtype): value for (device, dtype), value in found.items()}
+
+    return grouped
+
+
+class _Generator(torch.Generator):
+    """A generator of the CPU, wherever it was asked for."""
+
+    def __new__(cls, *_: Any) -> "_Generator":
+        return super().__new__(cls)
+
+
+class _Copy(torch.autograd.Function):
+    """A copy between the devices, differentiable."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, there: bool) -> Tensor:
+        ctx.there = there
+        return DeviceTensor(x.detach().clone()) if there else x.values.clone()  # pyright: ignore
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        g = grad_outputs[0]
+        return (g.values if ctx.there else DeviceTensor(g)), None  # pyright: ignore
+
+
+def _with_gradient(made: Tensor, like: Tensor) -> Tensor:
+    return made.requires_grad_() if like.requires_grad and not made.requires_grad else made
+
+
+def _place() -> str:
+    """The innermost lines of this package, of nerfstudio, or of torch, that asked for it."""
+    frames = [f for f in traceback.extract_stack() if "/pretended/" not in f.filename]
+    own = [f for f in frames if f"/{_OWN}/" in f.filename or "/nerfstudio/" in f.filename]
+    at = (own or frames)[-1]
+    return f"{'/'.join(at.filename.split('/')[-2:])}:{at.lineno} {at.line}"

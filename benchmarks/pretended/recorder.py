@@ -1,0 +1,72 @@
+"""A recording of operations on the pretended GPU, repeated as a CUDA graph repeats its own."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from benchmarks.pretended.gpu import PretendedGpu
+from benchmarks.pretended.operations import launches
+from benchmarks.pretended.tensor import on_cpu
+
+T = TypeVar("T")
+
+
+class PretendedRecorder:
+    """A `Recorder`: operations are repeated with the tensors and numbers that they had, into the same memory.
+
+    Python code does not run again, so a number that it would have computed anew stays what it was.
+    """
+
+    def __init__(self, gpu: PretendedGpu) -> None:
+        self._gpu = gpu
+        self.recordings = 0
+        self.replays = 0
+
+    def warm_up(self, work: Callable[[], T]) -> T:
+        """Do the work."""
+        return work()
+
+    def record(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
+        """Raises RuntimeError if the host waits. Unlike CUDA it does the work; the first repetition is left out."""
+        tape = _Tape()
+        with self._gpu.counting() as seen, tape:
+            result = work()
+        if seen.waits:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {next(iter(seen.waits))}")
+        self.recordings += 1
+        done = iter([True])
+
+        def replay() -> None:
+            self.replays += 1
+            if not next(done, False):
+                tape.repeat()
+
+        return replay, result
+
+
+class _Tape(TorchDispatchMode):
+    """All operations that change memory, with what they got and what they gave."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._operations: list[tuple[Any, Any, Any, Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Do it, and note it."""
+        out = func(*args, **(kwargs or {}))
+        if launches(func):
+            self._operations.append((func, args, kwargs or {}, out))
+        return out
+
+    @torch.no_grad()
+    def repeat(self) -> None:
+        """Do all of them again, into the same memory."""
+        for func, args, kwargs, out in self._operations:
+            again = func(*args, **kwargs)
+            for old, new in zip(tree_leaves(out), tree_leaves(again), strict=True):
+                if isinstance(old, Tensor) and old is not new:
+                    on_cpu(old).view(new.shape).copy_(on_cpu(new))  # its shape may have been changed in place
