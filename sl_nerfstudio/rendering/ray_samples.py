@@ -37,7 +37,7 @@ def first_crossing(
     directions: Float[Tensor, "rays 3"],
     near: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
-    count: int = 64,
+    count: int,
 ) -> tuple[Float[Tensor, "rays"], Bool[Tensor, "rays"]]:
     """Distance at which a ray first passes from outside to inside, by linear interpolation, and whether it does."""
     t = uniform_samples(near, far, count, jitter=False)

@@ -10,10 +10,12 @@ from torch import Tensor
 from sl_nerfstudio.field.cached_grid import CachedGrid
 from sl_nerfstudio.field.signed_distance import SignedDistance
 from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.rendering.compiled_rendering import compiled_serves, first_crossings, least_values
 from sl_nerfstudio.rendering.ray_samples import first_crossing, sphere_interval, uniform_samples
 from sl_nerfstudio.rendering.settings import SamplingConfig
 from sl_nerfstudio.rendering.volume_rendering import Rendered, render
 
+CACHE_SAMPLES = 64  # along a ray, to find the surface
 _SHADOW_SAMPLES = 32
 _NEAR_SAMPLES = 32  # along a ray, to find out whether it passes the surface
 _FEWEST_SAMPLES = 6
@@ -60,10 +62,9 @@ class Renderer:
         """Whether rays come so close to the surface, by the cached grid, that they see anything."""
         near, far = _interval(origins, directions, ends)
         count = _NEAR_SAMPLES if ends is None else min(_NEAR_SAMPLES, max(2, ceil(_longest(ends) / self.cache.cell)))
-        t = uniform_samples(near, far, count, jitter=False)
-        f = self.cache.look_up((origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3))
+        least = self._least(origins, directions, near, far, count)
         between = 0.5 * (far - near) / count  # the surface may be this much closer than at the samples
-        return (f.reshape(t.shape).amin(-1) < self._reach + between) & (far > near)
+        return (least < self._reach + between) & (far > near)
 
     @property
     def _reach(self) -> Float[Tensor, ""] | float:
@@ -82,7 +83,10 @@ class Renderer:
         near, far = _interval(origins, directions, ends)
         if self.sampling.strategy == "uniform" or (ends is not None and _longest(ends) <= 2 * self._reach):
             return uniform_samples(near, far, samples, jitter)
-        t, found = first_crossing(self.cache.look_up, origins, directions, near, far)
+        if compiled_serves(origins):
+            t, found = first_crossings(self.cache.values, origins, directions, near, far, CACHE_SAMPLES)
+        else:
+            t, found = first_crossing(self.cache.look_up, origins, directions, near, far, CACHE_SAMPLES)
         low, high = torch.where(found, t - self._reach, near), torch.where(found, t + self._reach, far)
         if ends is not None:
             low, high = torch.maximum(low, near), torch.minimum(high, far)
@@ -96,9 +100,23 @@ class Renderer:
         to_projector = torch.nn.functional.normalize(projector_centre - p, dim=-1)
         start = p + 2 * self.cache.cell * normal
         _, far, _ = sphere_interval(start, to_projector)
-        t = uniform_samples(torch.zeros_like(far), far, _SHADOW_SAMPLES, jitter=False)
-        between = self.cache.look_up((start[:, None] + t[..., None] * to_projector[:, None]).reshape(-1, 3))
-        return (between.reshape(t.shape).amin(-1) > 0) & ((normal * to_projector).sum(-1) > 0)
+        least = self._least(start, to_projector, torch.zeros_like(far), far, _SHADOW_SAMPLES)
+        return (least > 0) & ((normal * to_projector).sum(-1) > 0)
+
+    def _least(
+        self,
+        origins: Float[Tensor, "rays 3"],
+        directions: Float[Tensor, "rays 3"],
+        near: Float[Tensor, "rays"],
+        far: Float[Tensor, "rays"],
+        count: int,
+    ) -> Float[Tensor, "rays"]:
+        """The least of the cached grid's values between the ends of rays."""
+        if compiled_serves(origins):
+            return least_values(self.cache.values, origins, directions, near, far, count)
+        t = uniform_samples(near, far, count, jitter=False)
+        f = self.cache.look_up((origins[:, None] + t[..., None] * directions[:, None]).reshape(-1, 3))
+        return f.reshape(t.shape).amin(-1)
 
 
 def _interval(

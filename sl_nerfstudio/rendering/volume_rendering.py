@@ -20,8 +20,7 @@ from torch.nn import functional as F
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.se3 import transform
-
-_EPSILON = 1e-6
+from sl_nerfstudio.rendering.compiled_rendering import EPSILON, compiled_serves, render_rays
 
 
 @dataclass(frozen=True)
@@ -58,6 +57,9 @@ def render(
     kappa: Float[Tensor, ""] | float,
 ) -> Rendered:
     """Render rays whose SDF is known at distances `t` (ascending)."""
+    if compiled_serves(sdf, pattern):
+        found = render_rays(sdf, t, origins, directions, T_projector_scene, projector, pattern, kappa)
+        return Rendered(found[:, 0], found[:, 1], found[:, 2:4], found[:, 4], found[:, 5])
     weights = interval_weights(sdf, kappa)
     middle = 0.5 * (t[:, 1:] + t[:, :-1])
     accumulation = weights.sum(-1)
@@ -65,13 +67,13 @@ def render(
     uv, in_front = project(projector, transform(T_projector_scene[:, None], p_scene))
     lit_weights = weights * in_front
     lit = lit_weights.sum(-1)
-    share = lit_weights / (lit[:, None] + _EPSILON)
+    share = lit_weights / (lit[:, None] + EPSILON)
     return Rendered(
         accumulation=accumulation,
-        depth=(weights * middle).sum(-1) / (accumulation + _EPSILON),
+        depth=(weights * middle).sum(-1) / (accumulation + EPSILON),
         coordinates=(share[..., None] * uv).sum(1),
         pattern=(lit_weights * look_up(pattern, uv)).sum(-1),
-        lit=lit / (accumulation + _EPSILON),
+        lit=lit / (accumulation + EPSILON),
     )
 
 
