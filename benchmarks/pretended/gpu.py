@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -16,8 +17,11 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from benchmarks.pretended.operations import indexes, launches, name_of, takes_scalars_of_the_cpu, wait_of
 from benchmarks.pretended.tensor import CUDA, DeviceTensor, on_cpu, on_gpu
+from sl_nerfstudio import device_kernels
 
 _OWN = "sl_nerfstudio"
+_FACTORIES = {"arange", "eye", "full", "linspace", "ones", "scalar_tensor", "zeros"}
+_KERNEL_RUN = device_kernels.run
 
 
 class MixedDevicesError(RuntimeError):
@@ -37,12 +41,16 @@ class Seen:
 class PretendedGpu(TorchDispatchMode):
     """Use as a context. `seen` counts from the start or from the last `counting()`."""
 
-    def __init__(self) -> None:
+    def __init__(self, kernels: bool = False) -> None:
+        """`kernels`: those in Warp run, too; otherwise they find no driver."""
         super().__init__()
         self.seen = Seen()
+        self.on_kernel: list[Callable[[Callable[[], None]], None]] = []
+        """Told of every kernel in Warp, as what runs it again."""
+        self._kernels = kernels
         self._functions = _Functions(self)
-        self._pulls_back = False  # from a tensor on the GPU
-        self.calls_factory = False
+        self.works_there = False  # in an operation on the GPU, whose parts torch makes where it believes to be
+        self.calls_factory = False  # for our own code, which says where
         self._stack = ExitStack()
 
     def __enter__(self) -> "PretendedGpu":
@@ -56,6 +64,8 @@ class PretendedGpu(TorchDispatchMode):
             (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
             (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
         ]
+        if self._kernels:
+            replaced += [(device_kernels, "run", self._run_kernel), (device_kernels, "obstacle", lambda _: None)]
         for owner, name, stand_in in replaced:
             self._stack.enter_context(mock.patch.object(owner, name, stand_in))
         self._stack.enter_context(torch.autograd.set_multithreading_enabled(False))
@@ -81,14 +91,32 @@ class PretendedGpu(TorchDispatchMode):
         """torch's engine, which switches the mode of functions off, and calls functions of ours."""
 
         def run(outputs: Any, *args: Any, **kwargs: Any) -> Any:
-            before, self._pulls_back = self._pulls_back, isinstance(outputs[0], DeviceTensor)
-            with self._functions:
-                try:
-                    return run_engine(outputs, *args, **kwargs)
-                finally:
-                    self._pulls_back = before
+            with self._functions, self.working(outputs):
+                return run_engine(outputs, *args, **kwargs)
 
         return run
+
+    @contextmanager
+    def working(self, arguments: Any) -> Iterator[None]:
+        """What torch makes inside is on the GPU, if any of the arguments is."""
+        before = self.works_there
+        self.works_there = any(isinstance(x, DeviceTensor) for x in arguments)
+        try:
+            yield
+        finally:
+            self.works_there = before
+
+    def _run_kernel(self, kernel: Any, dim: Any, arguments: tuple[Any, ...]) -> None:
+        tensors = [x for x in arguments if isinstance(x, Tensor)]
+        there = [isinstance(x, DeviceTensor) for x in tensors]
+        if any(there) and not all(there):
+            raise MixedDevicesError(f"{kernel.key}: {[f'{x.device} {tuple(x.shape)}' for x in tensors]}")
+        work = partial(_KERNEL_RUN, kernel, dim, tuple(on_cpu(x) for x in arguments))
+        work()
+        if any(there):
+            self.seen.launches[f"warp {kernel.key}"] += 1
+            for told in self.on_kernel:
+                told(work)
 
     def wait(self, why: str) -> None:
         """Note that the host waits for the device."""
@@ -101,8 +129,8 @@ class PretendedGpu(TorchDispatchMode):
         there = sum(isinstance(x, DeviceTensor) for x in tensors)
         out = func(*tree_map(on_cpu, args), **tree_map(on_cpu, kwargs))
         if there == 0:
-            engine_made = self._pulls_back and name_of(func) == "zeros" and not self.calls_factory
-            return on_gpu(out) if engine_made else out  # a gradient that is not there
+            made = self.works_there and not self.calls_factory and name_of(func) in _FACTORIES
+            return tree_map(on_gpu, out) if made else out
         self._check(func, args, tensors)
         if launches(func):
             self.seen.launches[name_of(func)] += 1
@@ -148,7 +176,8 @@ class _Functions(TorchFunctionMode):
             return self._read_or_uploaded(func, name, args, kwargs)
         device = kwargs.get("device")
         if device is None:
-            return func(*args, **kwargs)
+            with self._gpu.working(tree_leaves((args, kwargs))):
+                return func(*args, **kwargs)
         kwargs["device"] = torch.device("cpu")
         self._gpu.calls_factory = True
         try:

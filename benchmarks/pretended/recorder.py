@@ -1,6 +1,7 @@
 """A recording of operations on the pretended GPU, repeated as a CUDA graph repeats its own."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -33,8 +34,12 @@ class PretendedRecorder:
     def record(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
         """Raises RuntimeError if the host waits. Unlike CUDA it does the work; the first repetition is left out."""
         tape = _Tape()
-        with self._gpu.counting() as seen, tape:
-            result = work()
+        self._gpu.on_kernel.append(tape.work.append)
+        try:
+            with self._gpu.counting() as seen, tape:
+                result = work()
+        finally:
+            self._gpu.on_kernel.remove(tape.work.append)
         if seen.waits:
             raise RuntimeError(f"operation not permitted when stream is capturing: {next(iter(seen.waits))}")
         self.recordings += 1
@@ -53,20 +58,23 @@ class _Tape(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self._operations: list[tuple[Any, Any, Any, Any]] = []
+        self.work: list[Callable[[], None]] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Do it, and note it."""
         out = func(*args, **(kwargs or {}))
         if launches(func):
-            self._operations.append((func, args, kwargs or {}, out))
+            self.work.append(partial(_again, func, args, kwargs or {}, out))
         return out
 
     @torch.no_grad()
     def repeat(self) -> None:
         """Do all of them again, into the same memory."""
-        for func, args, kwargs, out in self._operations:
-            again = func(*args, **kwargs)
-            for old, new in zip(tree_leaves(out), tree_leaves(again), strict=True):
-                if isinstance(old, Tensor) and old is not new:
-                    on_cpu(old).view(new.shape).copy_(on_cpu(new))  # its shape may have been changed in place
+        for work in self.work:
+            work()
+
+
+def _again(func: Any, args: Any, kwargs: Any, out: Any) -> None:
+    for old, new in zip(tree_leaves(out), tree_leaves(func(*args, **kwargs)), strict=True):
+        if isinstance(old, Tensor) and old is not new:
+            on_cpu(old).view(new.shape).copy_(on_cpu(new))  # its shape may have been changed in place

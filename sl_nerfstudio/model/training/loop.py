@@ -102,6 +102,7 @@ class SLTrainer(Trainer):
                 self._adjust_poses()
         if several():
             share_state(self._model)
+            self._model.load_state_dict(self._model.state_dict())  # modules look again at what the host must know
         self._training = self._phases.enter_context(_shown_phase("train"))
 
     def _adjust_poses(self) -> None:

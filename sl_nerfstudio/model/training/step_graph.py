@@ -7,7 +7,7 @@ rates (`DeviceRates`), the random numbers' seeds. Where the operations themselve
 
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ WARM_UP = 3  # steps before a recording, so that libraries and constants are the
 T = TypeVar("T")
 
 
+@runtime_checkable
 class Recorder(Protocol):
     """What records and repeats operations."""
 

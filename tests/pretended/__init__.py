@@ -1,0 +1,1 @@
+"""What a GPU would do, seen without one."""

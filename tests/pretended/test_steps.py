@@ -1,0 +1,102 @@
+"""A training step on a GPU: no tensors of two devices meet, and the host never waits."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from benchmarks.pretended.gpu import MixedDevicesError, PretendedGpu
+from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import joint_of_prior
+from sl_nerfstudio.model.pose_refinement import ScanAdjustment, pose_prior, scene_rig
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
+
+RENDERED_FROM = 3
+
+
+def with_poses(refine, method, backend, config):
+    config.pipeline.model.refine_poses, config.pipeline.model.pose_method = refine, method
+    config.pipeline.model.sdf.backend = backend
+
+
+def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
+    """The adjustment runs on the CPU, and takes seconds."""
+    rig = scene_rig(scan, S_scene_world)
+    prior = pose_prior(scan, S_scene_world, prior)
+    decision = CrossValidation(0.1, 0.05, -0.01, 0.001, 3.0)
+    return ScanAdjustment(rig, prior.sigma, joint_of_prior(prior, rig), decision, 0.1, None, (1,))
+
+
+@pytest.mark.parametrize(
+    "method, refine, poses, backend",
+    [
+        ("sl-neus", "off", "adjust", "torch"),  # fixed
+        ("sl-neus", "free", "adjust", "warp"),  # refined before the first step
+        ("sl-neus", "rigid-rig", "render", "warp"),  # trained
+        ("sl-neus-paper", "free", "render-independently", "torch"),
+    ],
+)
+def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, backend):
+    with PretendedGpu(kernels=backend == "warp") as gpu:
+        training = begin(method, partial(with_poses, refine, poses, backend))
+        if refine == "free" and poses == "adjust":
+            monkeypatch.setattr("sl_nerfstudio.model.model.adjust_scan", adjusted_at_once)
+            assert "Poses adjusted" in training.model.adjust_poses(training.pipeline.datamanager.samples)
+            assert training.model.pose_sigma() is not None and training.model.unplaced() == [False, True, False]
+        assert all(x.device.type == "cuda" for x in training.model.state_dict().values())
+        before = {name: x.detach().clone() for name, x in training.model.named_parameters()}
+        for step in range(RENDERED_FROM + 2):
+            with gpu.counting() as seen:
+                loss, terms, metrics = training.step()
+            if step not in (0, RENDERED_FROM):  # constants are copied once
+                assert not seen.waits, f"step {step}: {dict(seen.waits)}"
+            assert seen.launches.total() > 100
+        assert loss.device.type == "cuda" and loss.isfinite()
+        assert "coordinates" in terms and metrics["coordinate_px"].isfinite()
+        moved = {name for name, x in training.model.named_parameters() if not torch.equal(x, before[name])}
+        assert {"field.encoding.table", "field.mlp.0.weight"} <= moved
+        assert ("device_poses.camera_step" in moved) == (poses != "adjust")
+        assert training.model.history()["step"] == [0.0]
+
+
+def test_a_pixel_table_that_does_not_fit_is_copied_batch_by_batch(begin, monkeypatch):
+    with PretendedGpu() as gpu:
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (1000, 1000))
+        training = begin("sl-neus-paper")
+        training.step()
+        with gpu.counting() as seen:
+            training.step()
+        assert seen.waits and all("samples.py" in place for place in seen.waits), dict(seen.waits)
+
+
+def test_the_pretended_gpu_finds_what_a_gpu_refuses_or_waits_for():
+    with PretendedGpu() as gpu:
+        there, here = torch.zeros(4, device="cuda"), torch.ones(4)
+        for wrong in (lambda: there + here, lambda: torch.cat([there, here]), lambda: here[there.long()]):
+            with pytest.raises(MixedDevicesError):
+                wrong()
+        with pytest.raises(TypeError, match="can't convert cuda"):
+            there.numpy()
+        assert (there + torch.tensor(2.0)).cpu().tolist() == [2.0] * 4  # scalars may be on the CPU
+        for reads in (
+            lambda: float(there[0]),
+            lambda: bool(there.any()),
+            lambda: there.tolist(),
+            lambda: there[there > 0],
+            lambda: there.nonzero(),
+            lambda: there.new_tensor([1.0]),
+            lambda: torch.tensor([1.0], device="cuda"),
+            lambda: here.to("cuda"),
+            lambda: there.copy_(here),
+            lambda: there[torch.tensor([1])],
+        ):
+            with gpu.counting() as seen:
+                reads()
+            assert seen.waits.total() == 1, dict(seen.waits)
+        with gpu.counting() as seen:
+            there[1:].fill_(3.0)
+            torch.where(there > 1, there, 0.0).sort()
+        assert not seen.waits and set(seen.launches) == {"fill_", "gt", "where", "sort"}
+    with pytest.raises(RuntimeError, match="after it was switched off"):
+        there + 1
