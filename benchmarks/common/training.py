@@ -55,10 +55,18 @@ class Training:
 
     def step(self) -> Any:
         """The next step, as nerfstudio's loop does it; returns loss, terms and metrics."""
-        step, self.done = self.done, self.done + 1
-        self.trainer.step = step
+        self.before()
+        return self.iterate()
+
+    def before(self) -> None:
+        """What comes before the next step: its number, seeds and annealing."""
+        step = self.trainer.step = self.done
         self.pipeline.train()
         for callback in self.trainer.callbacks:
             if TrainingCallbackLocation.BEFORE_TRAIN_ITERATION in callback.where_to_run:
                 callback.run_callback(step)
-        return self.trainer.train_iteration(step)
+
+    def iterate(self) -> Any:
+        """The step itself."""
+        self.done += 1
+        return self.trainer.train_iteration(self.done - 1)
