@@ -2,8 +2,8 @@
 
 python -m benchmarks.launches [--scan FOLDER] [--backends torch warp] [--details] [--output FILE]
 
-Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their values
-on the CPU, and every operation is counted where torch hands it to a device. Kernels in Warp are counted, too. A large
+Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their
+values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Warp are counted, too. A large
 operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA graph, a step is one launch, besides
 those that set its scalars.
 """
@@ -118,13 +118,14 @@ def _steps(training: Training, gpu: PretendedGpu) -> tuple[list, list]:
 def _scan(config: Config) -> Path:
     if config.scan is not None:
         return config.scan
-    return made_once(SynthConfig(output=Path(), frames=4, resolution=96), Path("outputs/bench")).scan.root
+    return made_once(SynthConfig(frames=4, resolution=96), Path("outputs/bench")).scan.root
 
 
 def report(rows: list[Row]) -> str:
     """All rows as a table."""
     lines = [
-        f"{'size':10s}{'backend':9s}{'launches':>9s}{'of Warp':>9s}{'waits':>7s}{'between':>9s}{'refresh':>9s}{'graph':>7s}"
+        f"{'size':10s}{'backend':9s}{'launches':>9s}{'of Warp':>9s}{'waits':>7s}{'between':>9s}{'refresh':>9s}"
+        f"{'graph':>7s}"
     ]
     for r in rows:
         figures = f"{r.launches:9d}{r.of_warp:9d}{r.waits:7d}{r.between:9d}{r.refresh:9d}{r.with_graph:7d}"

@@ -6,11 +6,13 @@ pass to table, MLP and poses, optimiser. Both sides do all of it.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.field.row_adam import RowAdam
 from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
 from sl_nerfstudio.field.torch_backend import knee
@@ -44,18 +46,17 @@ SIZES = {
 class Job:
     """The part of a step that all variants share: rays onto a sphere seen from outside, poses, losses."""
 
-    def __init__(self, size: Size, seed: int = 0) -> None:
-        generator = torch.Generator().manual_seed(seed)
+    def __init__(self, size: Size, device: str = "cpu", seed: int = 0) -> None:
         self.size = size
-        self.shift = nn.Parameter(torch.zeros(FRAMES, 3))  # stands for the poses: points are differentiated
-        self.frame = torch.randint(FRAMES, (size.rays,), generator=generator)
-        aim = F.normalize(torch.randn(size.rays, 3, generator=generator), dim=-1) * 0.5
-        eye = F.normalize(aim + 0.3 * torch.randn(size.rays, 3, generator=generator), dim=-1) * 3.0
+        self.on: Any = {"generator": torch.Generator(device).manual_seed(seed), "device": device}
+        self.shift = nn.Parameter(torch.zeros(FRAMES, 3, device=device))  # as poses do, it moves points
+        self.frame = torch.randint(FRAMES, (size.rays,), **self.on)
+        aim = F.normalize(torch.randn(size.rays, 3, **self.on), dim=-1) * 0.5
+        eye = F.normalize(aim + 0.3 * torch.randn(size.rays, 3, **self.on), dim=-1) * 3.0
         self.direction = F.normalize(aim - eye, dim=-1)
         self.origin = eye
         self.hit = (aim - eye).norm(dim=-1)
-        self.generator = generator
-        self.target = self._coordinates(aim) + 0.002 * torch.randn(size.rays, 2, generator=generator)
+        self.target = self._coordinates(aim) + 0.002 * torch.randn(size.rays, 2, **self.on)
 
     @staticmethod
     def _coordinates(p: Tensor) -> Tensor:
@@ -65,15 +66,15 @@ class Job:
     def rays(self) -> Tensor:
         """Points along the rays, [rays, samples, 3]."""
         half = 0.05 if self.size.near_surface else 1.0
-        steps = torch.rand(self.size.rays, self.size.samples, generator=self.generator)
-        steps = (torch.arange(self.size.samples) + steps) / self.size.samples
+        steps = torch.rand(self.size.rays, self.size.samples, **self.on)
+        steps = (torch.arange(self.size.samples, device=steps.device) + steps) / self.size.samples
         t = self.hit[:, None] - half + 2 * half * steps
         return self.origin[:, None] + self.shift[self.frame][:, None] + t[..., None] * self.direction[:, None]
 
     def eikonal_points(self) -> Tensor:
         """Points for the Eikonal term: half anywhere, half near the surface."""
-        p = torch.rand(self.size.eikonal, 3, generator=self.generator) * 2 - 1
-        p[::2] = F.normalize(p[::2], dim=-1) * (0.5 + 0.02 * torch.randn(len(p[::2]), 1, generator=self.generator))
+        p = torch.rand(self.size.eikonal, 3, **self.on) * 2 - 1
+        p[::2] = F.normalize(p[::2], dim=-1) * (0.5 + 0.02 * torch.randn(len(p[::2]), 1, **self.on))
         return p
 
     def loss(self, sdf: Tensor, points: Tensor, gradient: Tensor) -> Tensor:
@@ -88,16 +89,16 @@ class Job:
 class Ours:
     """Our field, with the optimisers that the methods use."""
 
-    def __init__(self, size: Size) -> None:
+    def __init__(self, size: Size, device: str = "cpu", backend: BackendName = "auto") -> None:
         torch.manual_seed(0)
-        self.job = Job(size)
-        self.field = SDFField(FieldConfig())
+        self.job = Job(size, device)
+        self.field = SDFField(FieldConfig(backend=backend)).to(device)
         self.optimisers = [
             RowAdam([self.field.encoding.table], lr=1e-3),
             torch.optim.Adam([*self.field.mlp.parameters(), self.job.shift], lr=1e-4, fused=True),
         ]
 
-    def step(self) -> float:
+    def step(self) -> Tensor:
         """Do one step, and return the loss before it."""
         for optimiser in self.optimisers:
             optimiser.zero_grad()
@@ -108,22 +109,33 @@ class Ours:
         loss.backward()
         for optimiser in self.optimisers:
             optimiser.step()
-        return loss.item()
+        return loss.detach()
 
 
 class Theirs:
     """nerfstudio's encoding in torch, gradients by double backward, torch's default Adam for all parameters."""
 
-    def __init__(self, size: Size, activation: Callable[[Tensor], Tensor]) -> None:
+    def __init__(
+        self,
+        size: Size,
+        activation: Callable[[Tensor], Tensor],
+        device: str = "cpu",
+        implementation: Literal["torch", "tcnn"] = "torch",
+    ) -> None:
         from nerfstudio.field_components.encodings import HashEncoding
 
         torch.manual_seed(0)
-        self.job = Job(size)
+        self.job = Job(size, device)
         self.activation = activation
         self.encoding = HashEncoding(
-            num_levels=5, min_res=16, max_res=256, log2_hashmap_size=19, features_per_level=8, implementation="torch"
-        )
-        self.mlp = SDFField(FieldConfig()).mlp
+            num_levels=5,
+            min_res=16,
+            max_res=256,
+            log2_hashmap_size=19,
+            features_per_level=8,
+            implementation=implementation,
+        ).to(device)
+        self.mlp = SDFField(FieldConfig()).mlp.to(device)
         parameters = [*self.encoding.parameters(), *self.mlp.parameters(), self.job.shift]
         self.optimiser = torch.optim.Adam(parameters, lr=1e-3)
 
@@ -134,7 +146,7 @@ class Theirs:
             h = self.activation(layer(h))
         return self.mlp[-1](h)[:, 0]
 
-    def step(self) -> float:
+    def step(self) -> Tensor:
         """Do one step, and return the loss before it."""
         self.optimiser.zero_grad()
         points = self.job.rays()
@@ -144,16 +156,17 @@ class Theirs:
         loss = self.job.loss(sdf, points, gradient)
         loss.backward()
         self.optimiser.step()
-        return loss.item()
+        return loss.detach()
 
 
-def _softplus(z: Tensor) -> Tensor:
+def softplus(z: Tensor) -> Tensor:
+    """nerfstudio's activation of signed distance fields."""
     return F.softplus(z, beta=100)
 
 
 VARIANTS: dict[str, Callable[[Size], Ours | Theirs]] = {
     "ours": Ours,
-    "nerfstudio": lambda size: Theirs(size, _softplus),
+    "nerfstudio": lambda size: Theirs(size, softplus),
     "nerfstudio, our activation": lambda size: Theirs(size, lambda z: knee(z, 0.02)),
     "nerfstudio, ReLU": lambda size: Theirs(size, F.relu),
 }

@@ -52,7 +52,7 @@ class SLTrainerConfig(TrainerConfig):
     cuda_graph: bool = True
     """On a GPU, record the operations of a step once and repeat them with one launch; off: launch each by itself."""
     tf32: bool = False
-    """Let a GPU's matrix products round their factors to 11 bits (TF32), which is faster; docs/gpu.md has the effect."""
+    """Let a GPU's matrix products round their factors to 11 bits (TF32), which is faster; see docs/gpu.md."""
     verbose: bool = False
     """Also print all settings and nerfstudio's own messages and table."""
     last_step: tyro.conf.Suppress[int | None] = None
@@ -258,7 +258,12 @@ def default_device() -> Literal["cpu", "cuda"]:
 def _require_devices(machine: MachineConfig) -> None:
     """Raise UserError unless this machine has the devices that are asked for."""
     kind, count = machine.device_type, machine.num_devices
-    available = {"cpu": cores(), "cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available())}
+    if kind == "mps":
+        raise UserError(
+            "--machine.device-type mps: Apple's GPUs do not compute in float64, which the poses need. "
+            "Leave the option out to train on the CPU."
+        )
+    available = {"cpu": cores(), "cuda": torch.cuda.device_count()}
     if not available[kind]:
         raise UserError(
             f"--machine.device-type {kind}: torch {torch.__version__} finds no such device on this machine. "

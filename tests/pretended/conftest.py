@@ -1,6 +1,7 @@
 """Tiny runs on the pretended GPU."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from benchmarks.common.training import Training, settings
+from sl_nerfstudio.field.cached_grid import CachedGrid
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from tests.dataparser.tiny_scan import TinyScan
 from tests.model.training.small_runs import own_signals
@@ -28,8 +30,10 @@ def _own_signals() -> Iterator[None]:
 
 
 @pytest.fixture()
-def begin(tiny_root: Path, tmp_path: Path) -> Callable[..., Training]:
+def begin(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Training]:
     """Begins a run with few pixels and a small field; the second of two levels begins at step 1, rendering at 3."""
+
+    monkeypatch.setattr("sl_nerfstudio.model.model.CachedGrid", partial(CachedGrid, 24))
 
     def begun(method: str, change: Callable[[SLTrainerConfig], Any] | None = None, **more: Any) -> Training:
         config = settings(method, tiny_root, tmp_path, more.pop("device", "cuda"), STEPS)

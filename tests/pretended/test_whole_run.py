@@ -45,7 +45,7 @@ def _evaluates(training, folder):
     metrics = training.pipeline.get_average_eval_image_metrics(output_path=folder / "images", get_std=True)
     assert np.isfinite(metrics["coordinate_px"]) and len(list((folder / "images").iterdir())) >= 3 * 4
     training.pipeline.eval()
-    rays, batch = training.pipeline.datamanager.next_eval(5)
+    rays, _ = training.pipeline.datamanager.next_eval(5)
     assert training.model(rays)["depth"].device.type == "cuda"
     training.pipeline.train()
 
@@ -61,17 +61,17 @@ def _shows(model):
     camera = Cameras(camera_to_worlds=pose, fx=focal, fy=focal, cx=focal / 4, cy=focal / 4, width=size, height=size)
     picture = model.get_outputs_for_camera(camera)
     assert picture["rgb"].shape == (12, 12, 3) and picture["rgb"].device.type == "cuda"
-    surface = Surface(model, resolution=24)
+    surface = Surface(model, resolution=16)
     for mode in MODES:
-        if mode != RENDERED:
+        if mode != RENDERED and mode != "views":
             assert surface.coloured(mode, 0).rgb.shape == (len(surface.mesh.vertices), 3)
     model.train()
 
 
 def _exports(model, folder):
     model.eval()
-    settings = ExportSettings(folder / "mesh.ply", resolution=24)
-    for kind in (settings, replace(settings, watertight=True), replace(settings, keep_unobserved=True)):
+    settings = ExportSettings(folder / "mesh.ply", resolution=16)
+    for kind in (settings, replace(settings, keep_unobserved=True)):
         try:
             assert len(build_surface(model, kind).marked.mesh.faces) > 100
         except UserError as error:  # a sphere after five steps may be nowhere near what was observed

@@ -147,7 +147,7 @@ class SLTrainer(Trainer):
         return result
 
     def _operations(self, rates: DeviceRates) -> Any:
-        """What nerfstudio's `train_iteration` does on the device, where neither precision is mixed nor steps are skipped."""
+        """What nerfstudio's `train_iteration` does on the device; precision is not mixed, and no step is left out."""
         groups = list(self.optimizers.parameters)
         self.optimizers.zero_grad_some(groups)
         _, terms, metrics = self.pipeline.get_train_loss_dict(step=self.step)

@@ -1,8 +1,9 @@
 """Training steps recorded as a CUDA graph: one launch a step in place of thousands.
 
-A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step to step
-must therefore be in tensors that are written before: sharpness, widths and level weights (the model's buffers), learning
-rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new graph is recorded.
+A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step to
+step must therefore be in tensors that are written before: sharpness, widths and level weights (the model's buffers),
+learning rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new graph is
+recorded.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -98,7 +99,7 @@ class StepGraph:
 
 
 class DeviceRates:
-    """Learning rates on the device of the parameters. The optimisers' own stay numbers, for schedules and checkpoints."""
+    """Learning rates on the parameters' device. The optimisers' own stay numbers, for schedules and checkpoints."""
 
     def __init__(self, optimizers: Iterable[Optimizer]) -> None:
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]

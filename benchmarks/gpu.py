@@ -1,0 +1,240 @@
+"""Everything that is to be known of a GPU, within ten minutes, into one file.
+
+python -m benchmarks.gpu [--device cpu --steps 2 --paper-steps 3 --default-steps 30 --compared-steps 2] [--only NAME]
+
+Step times and memory of both methods with every backend, with and without a CUDA graph; whole trainings, with their
+surfaces against the truth, and against the same training on the CPU; the same step with nerfstudio's own encoding, in
+torch and, if it can be imported, tiny-cuda-nn. A part that fails is written down with its error, and the next one
+begins; the file is written after each. With `--device cpu` all of it runs without a GPU, except for what needs one.
+"""
+
+import json
+import statistics
+import subprocess
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+
+from benchmarks.common.iteration_step import SIZES, Ours, Theirs, softplus
+from benchmarks.common.machine import describe
+from benchmarks.common.scans import made_once
+from benchmarks.common.training import Training, settings
+from sl_nerfstudio.errors import first_line
+from sl_nerfstudio.evaluation.evaluate import score_alignments
+from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.inputs import read_ground_truth, read_reference
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.trim import trim_to_observed
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.threads import one_library_thread
+
+METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
+_GROUPS = 10  # of timed steps; their median counts
+
+
+@dataclass(frozen=True)
+class Config:
+    """All measurements on one device."""
+
+    device: Literal["cuda", "cpu"] = "cuda"
+    """Where the field is; cpu: to try this command."""
+    frames: int = 22
+    """Frames of the scan, which is made in outputs/bench unless it is there."""
+    resolution: int = 400
+    """Width and height of its images."""
+    steps: int = 200
+    """Timed steps of each variant, after the first ones that are not timed."""
+    paper_steps: int = 10_000
+    """Length of the whole training of sl-neus-paper on the device."""
+    default_steps: int = 1000
+    """Length of the whole training of sl-neus, on the device and on the CPU."""
+    compared_steps: int = 300
+    """Length of the trainings of sl-neus-paper that compare the device with the CPU."""
+    mesh_resolution: int = 256
+    """Cells along the scene's box of the surfaces that are compared."""
+    only: tuple[str, ...] = ()
+    """Only parts whose names contain one of these; by default all."""
+    output: Path = Path("benchmarks/results/gpu.json")
+    """The result file."""
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Measure part after part; print and write each."""
+    warnings.simplefilter("ignore")
+    scan = made_once(SynthConfig(frames=config.frames, resolution=config.resolution), Path("outputs/bench")).scan.root
+    result: dict[str, Any] = {"machine": describe_device(config.device)}
+    begin = time.monotonic()
+    with one_library_thread():
+        for name, part in parts(config, scan).items():
+            try:
+                result[name] = part()
+            except Exception as error:  # whatever a driver or a library does, the other figures are still wanted
+                result[name] = {"error": first_line(error), "where": traceback.format_exc(limit=-3)}
+            print(f"{name}: {json.dumps(result[name])}", flush=True)
+            result["seconds"] = round(time.monotonic() - begin, 1)
+            config.output.parent.mkdir(parents=True, exist_ok=True)
+            config.output.write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]:
+    """All measurements by name."""
+    there, found = config.device, {}
+    for size in METHODS:
+        for backend in backends(there):
+            for graph in (False, True) if there == "cuda" else (False,):
+                name = f"step {size} {backend}{' graph' if graph else ''}"
+                found[name] = partial(step_times, config, scan, size, backend, graph)
+    for size in SIZES:
+        for name, make in encodings(there).items():
+            found[f"encoding {size} {name}"] = partial(encoding_times, config, partial(make, SIZES[size]))
+    for device in dict.fromkeys((there, "cpu")):
+        found[f"surface paper {device}"] = partial(surface, config, scan, "paper", device, config.compared_steps)
+        found[f"surface default {device}"] = partial(surface, config, scan, "default", device, config.default_steps)
+    found[f"surface paper {config.paper_steps} steps"] = partial(
+        surface, config, scan, "paper", there, config.paper_steps
+    )
+    return {name: part for name, part in found.items() if not config.only or any(x in name for x in config.only)}
+
+
+def backends(device: str) -> list[str]:
+    """What can compute the field there."""
+    return ["torch", "warp"] if device == "cuda" else ["torch", "numba"]
+
+
+def encodings(device: str) -> dict[str, Callable[..., Ours | Theirs]]:
+    """A step with our encoding and with nerfstudio's, in each implementation that there is."""
+    found: dict[str, Callable[..., Ours | Theirs]] = {
+        f"ours {backend}": partial(Ours, device=device, backend=backend) for backend in backends(device)
+    }
+    found["nerfstudio torch"] = partial(Theirs, activation=softplus, device=device)
+    if device == "cuda" and find_spec("tinycudann") is not None:
+        found["nerfstudio tiny-cuda-nn"] = partial(Theirs, activation=softplus, device=device, implementation="tcnn")
+    return found
+
+
+def begun(
+    config: Config, scan: Path, size: str, device: str, steps: int, backend: str, graph: bool, adjust: bool
+) -> Training:
+    """A training whose run folder is forgotten."""
+    run = settings(METHODS[size], scan, Path(tempfile.mkdtemp()), device, steps)
+    run.cuda_graph = graph
+    run.pipeline.model.sdf.backend = backend
+    torch.manual_seed(0)
+    return Training(run, adjust)
+
+
+def step_times(config: Config, scan: Path, size: str, backend: str, graph: bool) -> dict[str, Any]:
+    """Milliseconds of a step in which rays are rendered, and memory."""
+    _forget_memory(config.device)
+    training = begun(config, scan, size, config.device, 1000, backend, graph, adjust=False)
+    training.done = 601  # all levels have their weight
+    times = _timed(training.step, config.steps, config.device)
+    return {**times, "graph": training.trainer.recorded is not None, **_memory(config.device)}
+
+
+def encoding_times(config: Config, make: Callable[[], Ours | Theirs]) -> dict[str, Any]:
+    """Milliseconds of a step of benchmarks.iteration_time."""
+    _forget_memory(config.device)
+    return {**_timed(make().step, config.steps, config.device), **_memory(config.device)}
+
+
+def surface(config: Config, scan: Path, size: str, device: str, steps: int) -> dict[str, Any]:
+    """Seconds of a whole training without its start, and the distance of its surface from the truth."""
+    _forget_memory(device)
+    begin = time.perf_counter()
+    training = begun(config, scan, size, device, steps, "auto", True, adjust=True)
+    prepared = time.perf_counter()
+    for _ in range(steps):
+        training.step()
+    _wait(device)
+    trained = time.perf_counter()
+    return {
+        "steps": steps,
+        "prepare_s": round(prepared - begin, 2),
+        "train_s": round(trained - prepared, 2),
+        **rmse(config, training),
+        **_memory(device),
+    }
+
+
+def rmse(config: Config, training: Training) -> dict[str, Any]:
+    """RMS and median distance of the observed surface from the truth, in mm, after rigid alignment."""
+    model = training.model.eval()
+    whole = extract_mesh(model.sdf, config.mesh_resolution, device=model.device).mapped(model.S_scene_world.inverse())
+    observed = trim_to_observed(whole, model.scan, model.poses()).mesh
+    truth = read_ground_truth(model.scan)
+    reference = read_reference(truth.mesh_path, model.scan, truth.poses or model.poses(), 100_000, 0)
+    assert reference is not None
+    scores = score_alignments(IndexedMesh(observed), reference, model.poses(), truth.poses)
+    accuracy = scores["rigid"].accuracy
+    return {"rmse_mm": round(accuracy.rmse, 4), "median_mm": round(accuracy.median, 4)}
+
+
+def describe_device(device: str) -> dict[str, Any]:
+    """The machine, the GPU, its driver, and the versions that matter."""
+    found: dict[str, Any] = dict(describe())
+    found["warp"] = None
+    if find_spec("warp") is not None:
+        import warp
+
+        found["warp"] = warp.__version__
+    if device == "cuda":
+        properties = torch.cuda.get_device_properties(0)
+        found |= {"gpu": properties.name, "gpu_mb": properties.total_memory >> 20, "cuda": torch.version.cuda}
+        found["driver"] = _driver()
+    return found
+
+
+def _driver() -> str:
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0]
+    except (OSError, subprocess.CalledProcessError, IndexError):
+        return "unknown"
+
+
+def _timed(step: Callable[[], Any], steps: int, device: str) -> dict[str, float]:
+    for _ in range(max(3, min(steps, 20))):
+        step()
+    _wait(device)
+    size = max(steps // _GROUPS, 1)
+    times = []
+    for _ in range(min(_GROUPS, steps)):
+        begin = time.perf_counter()
+        for _ in range(size):
+            step()
+        _wait(device)
+        times.append((time.perf_counter() - begin) / size * 1e3)
+    return {"ms": round(statistics.median(times), 3), "best_ms": round(min(times), 3)}
+
+
+def _wait(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+def _forget_memory(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+
+
+def _memory(device: str) -> dict[str, int]:
+    if device != "cuda":
+        return {}
+    return {"peak_mb": torch.cuda.max_memory_allocated() >> 20, "reserved_mb": torch.cuda.max_memory_reserved() >> 20}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
