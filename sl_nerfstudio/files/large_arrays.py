@@ -62,7 +62,7 @@ class GrowingArray:
         except OSError as error:
             raise UserError(
                 f"{tempfile.gettempdir()}: cannot write a temporary file ({error.strerror})\n"
-                f"    cause:  the scan needs more memory than there is, and {self._bytes / 2**30:.1f} GB do not fit there\n"
+                f"    cause:  the scan is too large for the memory, and {self._bytes / 2**30:.1f} GB do not fit there\n"
                 "    remedy: set TMPDIR to a folder on a disk with more space"
             ) from error
         self._pieces = []
