@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
 from numpy import ndarray
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
@@ -255,11 +255,12 @@ def inverted(H: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
 
     Raises ArithmeticError if rounding has left it not positive definite.
     """
-    # LAPACK counts columns first: its upper triangle is the lower one here
-    factor, failed = dpotrf(H.numpy().T, lower=0, overwrite_a=1, clean=0)
+    transposed = H.numpy().T  # LAPACK stores columns one after the other: its upper triangle is the lower one here
+    potrf, potri = get_lapack_funcs(("potrf", "potri"), (transposed,))
+    factor, failed = potrf(transposed, lower=0, overwrite_a=1, clean=0)
     if failed:
         raise ArithmeticError(f"the leading minor of order {failed} is not positive")
-    out = torch.from_numpy(dpotri(factor, lower=0, overwrite_c=1)[0].T)
+    out = torch.from_numpy(potri(factor, lower=0, overwrite_c=1)[0].T)
     for first in range(0, len(out), _ROWS_AT_ONCE):
         rows, below = slice(first, first + _ROWS_AT_ONCE), slice(first + _ROWS_AT_ONCE, None)
         lower = out[rows, rows].tril()
