@@ -6,7 +6,7 @@ cells). (A plane would average better, but on a curved surface it is off by the 
 the adjustment would turn that offset into wrong poses.)
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.loops.drawing import draw_pixels
 from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory, look_up_windows
 from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
+from sl_nerfstudio.files.large_arrays import GrowingArray, largest_in_memory
 
 
 @dataclass(frozen=True)
@@ -49,15 +50,20 @@ class CoordinateMaps:
     max_roughness: float  # projector pixels; rougher windows are discontinuous
 
     @staticmethod
-    def of(images: Sequence[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
-        """From one image per frame; sizes may differ."""
+    def of(images: Iterable[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
+        """From one image per frame; sizes may differ. What is too large for memory is kept in a file."""
         settings = settings or LookUpSettings()
-        sizes = torch.tensor([i.shape[0] * i.shape[1] for i in images])
+        values, shapes = GrowingArray(largest_in_memory()), []
+        for image in images:
+            shapes.append(image.shape[:2])
+            values.append(image.reshape(-1, 2).float().numpy())
+        heights, widths = torch.tensor(shapes).T
+        sizes = widths * heights
         maps = CoordinateMaps(
-            values=torch.cat([i.reshape(-1, 2) for i in images]).float(),
+            values=torch.from_numpy(values.whole()),
             offsets=torch.cumsum(sizes, 0) - sizes,
-            widths=torch.tensor([i.shape[1] for i in images]),
-            heights=torch.tensor([i.shape[0] for i in images]),
+            widths=widths.contiguous(),
+            heights=heights.contiguous(),
             settings=settings,
             max_roughness=settings.roughness_px,
         )
@@ -77,6 +83,11 @@ class CoordinateMaps:
         pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
         w = self.widths[frame]
         return DrawnPixels(frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double())
+
+    def image(self, frame: int) -> Float[Tensor, "h w 2"]:
+        """The coordinate image of a frame."""
+        w, h, start = int(self.widths[frame]), int(self.heights[frame]), int(self.offsets[frame])
+        return self.values[start : start + w * h].reshape(h, w, 2)
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:

@@ -110,7 +110,7 @@ def adjust_registered(
         _poses_of(clouds, registration, index),
         S_scene_world,
     )
-    maps = CoordinateMaps.of([torch.from_numpy(clouds[k].coords) for k in index], s.adjustment.look_up)
+    maps = CoordinateMaps.of((torch.from_numpy(clouds[k].coords) for k in index), s.adjustment.look_up)
     prior = _prior(clouds, registration, index, S_scene_world.scale, s)
     found = adjust(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
     rig = restore(start, found.rig, baseline_scale(start, found.rig, None))

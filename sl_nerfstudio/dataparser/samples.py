@@ -12,8 +12,11 @@ from torch import Tensor
 
 from sl_nerfstudio.dataparser.held_out import block_hash, held_out_pixels, spread
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.large_arrays import GrowingArray, largest_in_memory
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Frame, Scan
+
+_COLUMNS = 6  # of the table
 
 
 @dataclass(frozen=True)
@@ -113,20 +116,21 @@ class PixelSamples:
 
 
 def build_samples(scan: Scan, show_progress: bool = True) -> PixelSamples:
-    """Read all frames of a scan, one in memory at a time.
+    """Read all frames of a scan, one in memory at a time. A table that is too large for memory is kept in a file.
 
     Raises UserError if the whole scan has too few masked pixels to train with some and test with others.
     """
     frames: Iterable[Frame] = track(scan.frames, "Reading frames") if show_progress else scan.frames
-    columns: dict[str, list[ndarray]] = {}
+    columns: dict[str, GrowingArray] = {}
+    most = largest_in_memory() // _COLUMNS
     first = [0]
     for number, frame in enumerate(frames):
         pixels = _frame_pixels(number, frame)
         first.append(first[-1] + len(pixels["row"]))
         for name, values in pixels.items():
-            columns.setdefault(name, []).append(values)
-    # column by column, each list released immediately: peak memory is the table and one more column
-    table = {name: torch.from_numpy(np.concatenate(columns.pop(name))) for name in list(columns)}
+            columns.setdefault(name, GrowingArray(most)).append(values)
+    # column by column, each released immediately: peak memory is the table and one more column
+    table = {name: torch.from_numpy(columns.pop(name).whole()) for name in list(columns)}
     if not table["held_out"].any():
         table["held_out"] = torch.from_numpy(_one_block(scan, table))
     if len(table["row"]) == 0 or table["held_out"].all():

@@ -207,13 +207,8 @@ def maps_and_held_out(
     scan: Scan, samples: PixelSamples, settings: AdjustmentSettings
 ) -> tuple[CoordinateMaps, HeldOutPixels]:
     """Coordinate images without the held-out pixels, and a selection of the held-out pixels."""
-    images, frames, uv_camera, uv_projector, blocks = [], [], [], [], []
+    frames, uv_camera, uv_projector, blocks = [], [], [], []
     for number, frame in enumerate(scan.frames):
-        rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
-        image = torch.full((frame.camera.h, frame.camera.w, 2), float("nan"))
-        row, column, held = samples.row[rows].long(), samples.column[rows].long(), samples.held_out[rows]
-        image[row[~held], column[~held]] = samples.coords[rows][~held]
-        images.append(image)
         index = samples.held_out_of(number)
         count = min(len(index), settings.cross_validation.pixels_per_frame)
         test = samples.at(index[torch.from_numpy(evenly_spaced(len(index), count))])
@@ -228,7 +223,18 @@ def maps_and_held_out(
     held_out = HeldOutPixels(
         frame_of, torch.cat(uv_camera), torch.cat(uv_projector), frame_of * most + torch.cat(blocks)
     )
+    images = (_training_coords(scan, samples, number) for number in range(len(scan.frames)))
     return CoordinateMaps.of(images, settings.look_up), held_out
+
+
+def _training_coords(scan: Scan, samples: PixelSamples, number: int) -> Float[Tensor, "h w 2"]:
+    """The coordinate image of a frame without its held-out pixels."""
+    camera = scan.frames[number].camera
+    rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
+    image = torch.full((camera.h, camera.w, 2), float("nan"))
+    row, column, held = samples.row[rows].long(), samples.column[rows].long(), samples.held_out[rows]
+    image[row[~held], column[~held]] = samples.coords[rows][~held]
+    return image
 
 
 def sigmas_in_scan_units(sigma: Float[Tensor, "frames 12"], S_scene_world: Similarity) -> Float[ndarray, "frames 4"]:

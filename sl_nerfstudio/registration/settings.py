@@ -246,6 +246,9 @@ class PairSelectionSettings:
     """angle between two lines of sight, in degrees, beyond which frames see no common surface"""
     partners: int = 8
     """pairs of each frame that are tried for closing cycles"""
+    compared_frames: int = 40
+    """frames that each is compared with to find those: with known poses the ones with the most similar lines of sight,
+    without any, random ones"""
     rounds: int = 2
     """rounds of closing cycles"""
     least_joined: float = 0.5

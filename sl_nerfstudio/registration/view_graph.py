@@ -1,9 +1,10 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.progress import track
@@ -63,7 +64,9 @@ class ViewGraph:
         """Register every frame with those that look most like it, wherever they are in the order."""
         n, likely = len(self.maps), self.settings.selection.likely_partners
         likeness = np.full((n, n), -np.inf)
-        for i, j in track(list(combinations(range(n), 2)), "comparing frames"):
+        most = self.settings.selection.compared_frames
+        rank = np.zeros((n, n)) if n - 1 <= most else self.rng.random((n, n))
+        for i, j in track(compared_pairs(rank, most), "comparing frames"):
             likeness[i, j] = likeness[j, i] = self._likeness((i, j))
         pairs = {
             (min(i, j), max(i, j))
@@ -129,7 +132,8 @@ class ViewGraph:
         selection, n = self.settings.selection, len(S_world_camera)
         tolerance = Tolerance(selection.overlap_tolerance, self.settings.pair.tolerance_sigmas)
         shares = np.zeros((n, n))
-        for i, j in combinations(range(n), 2):
+        sight = np.array([np.full(3, np.nan) if S is None else S.R[:, 2] for S in S_world_camera])
+        for i, j in compared_pairs(-sight @ sight.T, selection.compared_frames):
             a, b = S_world_camera[i], S_world_camera[j]
             if a is not None and b is not None and self.see_same_side(a, b):
                 maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
@@ -145,6 +149,18 @@ class ViewGraph:
     def _is_edge(self, pair: Pair) -> bool:
         match = self._tried.get(pair)
         return match is not None and is_accepted(match, self.settings.edge)
+
+
+def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
+    """Pairs (i, j) with i < j of each frame and the `most` others that rank lowest with it (NaN: last), in order."""
+    n = len(rank)
+    others = rank.copy()
+    np.fill_diagonal(others, np.nan)
+    nearest = np.argsort(others, axis=1, kind="stable")[:, : min(most, n - 1)]
+    chosen = np.zeros((n, n), dtype=bool)
+    chosen[np.arange(n)[:, None], nearest] = True
+    first, second = np.nonzero(np.triu(chosen | chosen.T, 1))
+    return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def split_by_slip(edges: Sequence[PairMatch], bounded_deg: float) -> tuple[list[PairMatch], list[PairMatch]]:

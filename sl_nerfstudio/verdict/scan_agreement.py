@@ -1,6 +1,6 @@
 """Cross-frame agreement of a scan, from its devices, poses and coordinate images in any world and unit."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity, centred_on
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate
-from sl_nerfstudio.scan.types import PoseSigma, Scan
+from sl_nerfstudio.scan.types import Frame, PoseSigma, Scan
 from sl_nerfstudio.verdict.cross_frame import CrossFrameAgreement, cross_frame_agreement
 from sl_nerfstudio.verdict.settings import CrossFrameSettings
 
@@ -26,26 +26,28 @@ def compare_scan_frames(
     scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None], settings: CrossFrameSettings | None = None
 ) -> CrossFrameAgreement:
     """The same as `compare_frames`, with the coordinates read from the scan's files, where the masks allow them."""
-    images = []
-    for frame in scan.frames:
-        coords = frame.read_coords()
-        coords[~frame.read_mask()] = np.nan
-        images.append(coords)
+    images = (_masked_coords(frame) for frame in scan.frames)
     return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma, settings)
+
+
+def _masked_coords(frame: Frame) -> Float32[ndarray, "h w 2"]:
+    coords = frame.read_coords()
+    coords[~frame.read_mask()] = np.nan
+    return coords
 
 
 def compare_frames(
     cameras: Sequence[Device],
     projector: Device,
     poses: DevicePoses,
-    coords: Sequence[Float32[ndarray, "_h _w 2"]],
+    coords: Iterable[Float32[ndarray, "_h _w 2"]],
     sigma: Sequence[PoseSigma | None],
     settings: CrossFrameSettings | None = None,
 ) -> CrossFrameAgreement:
     """Cross-frame agreement with the given poses; `sigma` in the poses' unit, None where poses count as exact."""
-    S_scene_world = _scene(cameras, projector, poses, coords)
+    maps = CoordinateMaps.of(torch.from_numpy(image) for image in coords)
+    S_scene_world = _scene(cameras, projector, poses, maps)
     rig = Rig.of(cameras, projector, poses, S_scene_world)
-    maps = CoordinateMaps.of([torch.from_numpy(image) for image in coords])
     rows = [_four(s, S_scene_world.scale) for s in sigma]
     stated = torch.tensor(rows, dtype=torch.float64).repeat_interleave(3, 1)
     return cross_frame_agreement(rig, maps, stated, settings)
@@ -63,11 +65,12 @@ def _scene(
     cameras: Sequence[Device],
     projector: Device,
     poses: DevicePoses,
-    coords: Sequence[Float32[ndarray, "_h _w 2"]],
+    maps: CoordinateMaps,
 ) -> Similarity:
     """World to scene: the centre of the decoded surface becomes the origin, its radius one."""
     parts = [np.zeros((0, 3))]
-    for camera, T_c, T_p, image in zip(cameras, poses.T_world_camera, poses.T_world_projector, coords, strict=True):
+    for k, (camera, T_c, T_p) in enumerate(zip(cameras, poses.T_world_camera, poses.T_world_projector, strict=True)):
+        image = maps.image(k).numpy()
         decoded = np.flatnonzero(np.isfinite(image).all(-1))
         some = decoded[evenly_spaced(len(decoded), min(_POINTS_PER_FRAME, len(decoded)))]
         row, column = np.divmod(some, image.shape[1])

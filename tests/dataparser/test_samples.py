@@ -99,3 +99,14 @@ def test_empty_masks_are_rejected(tmp_path: Path) -> None:
         Image.fromarray(np.zeros((CAMERA.h, CAMERA.w), np.uint8)).save(frame.mask_path)
     with pytest.raises(UserError, match=r"only 0 masked pixels in 3 frames.*Check masks/"):
         build_samples(scan)
+
+
+def test_a_table_in_a_file_is_the_same(scan: Scan, samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sl_nerfstudio.dataparser.samples.largest_in_memory", lambda: 0)
+    mapped = build_samples(scan, show_progress=False)
+    for field in dataclasses.fields(PixelSamples):
+        a, b = getattr(mapped, field.name), getattr(samples, field.name)
+        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b)
+    index = samples.draw(50, torch.Generator().manual_seed(2))
+    assert torch.equal(index, mapped.draw(50, torch.Generator().manual_seed(2)))
+    assert torch.equal(mapped.at(index).pattern, samples.at(index).pattern)

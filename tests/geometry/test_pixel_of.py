@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import DEVICES, generator, points_in_view, seeds
 
-from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.devices.compiled_view import view_of
 from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
 
 
@@ -25,6 +26,21 @@ def test_points_in_view_have_the_same_pixel(seed, name):
         column, row, in_front = compiled_pixel(device, p[k].numpy())
         assert in_front and front[k]
         assert [column, row] == pytest.approx(uv[k].tolist(), abs=1e-9)
+
+
+@given(seeds, st.sampled_from(sorted(DEVICES)))
+def test_derivatives_are_those_of_tensors_in_view_and_the_rest_everywhere(seed, name):
+    device, rng = DEVICES[name], generator(seed)
+    intrinsics = Intrinsics.of(device, torch.float64)
+    parameters = np.array([getattr(device, key) for key in PARAMETERS])
+    p = torch.cat([points_in_view((8,), rng), torch.randn(8, 3, generator=rng, dtype=torch.float64)])
+    (uv, front), J = project(intrinsics, p), project_jacobian(intrinsics, p)
+    for k in range(16):
+        u, v, in_front, *derivatives = view_of(MODELS[device.model].code, *p[k].numpy(), parameters)
+        assert bool(in_front) is bool(front[k])
+        assert [u, v] == pytest.approx(uv[k].tolist(), rel=1e-9, abs=1e-9)
+        if in_front:
+            assert derivatives == pytest.approx(J[k].flatten().tolist(), rel=1e-9, abs=1e-9)
 
 
 @given(st.sampled_from(sorted(DEVICES)), st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 from torch import Tensor
 
@@ -63,15 +63,16 @@ def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint joint"]
 
 def packed(joint: Float[Tensor, "joint joint"]) -> Float[Tensor, "entries"]:
     """The lower triangle, row by row: half of the memory."""
-    row, column = torch.tril_indices(len(joint), len(joint))
-    return joint[row, column]
+    return joint[_lower(len(joint))]
 
 
 def unpacked(entries: Float[Tensor, "entries"]) -> Float[Tensor, "joint joint"]:
     """The matrix of which `packed` gave the lower triangle."""
     size = round(((8 * len(entries) + 1) ** 0.5 - 1) / 2)
     out = entries.new_zeros(size, size)
-    row, column = torch.tril_indices(size, size)
-    out[row, column] = entries
-    out[column, row] = entries
-    return out
+    out[_lower(size)] = entries
+    return out + out.tril(-1).T
+
+
+def _lower(size: int) -> Bool[Tensor, "joint joint"]:
+    return torch.ones(size, size, dtype=torch.bool).tril()

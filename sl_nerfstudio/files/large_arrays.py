@@ -1,0 +1,77 @@
+"""Arrays that grow piece by piece: in memory, or in a temporary file once they are large.
+
+The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends it.
+The operating system keeps in memory what is used of it.
+"""
+
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+
+_SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def largest_in_memory() -> int:
+    """Bytes beyond which an array is kept in a file."""
+    return _memory(_CGROUP_LIMIT) // _SHARE
+
+
+class GrowingArray:
+    """Pieces with the same type and the same shape but for their length, one after the other."""
+
+    def __init__(self, most_bytes: int) -> None:
+        """`most_bytes`: beyond, the pieces go to a file."""
+        self._most = most_bytes
+        self._pieces: list[ndarray] = []
+        self._bytes = 0
+        self._file: IO[bytes] | None = None
+
+    def append(self, piece: ndarray) -> None:
+        """Add a piece at the end. Raises UserError if the disk is full."""
+        self._pieces.append(np.ascontiguousarray(piece))
+        self._bytes += piece.nbytes
+        if self._bytes > self._most:
+            self._write()
+
+    def whole(self) -> ndarray:
+        """All pieces as one array, mapped into memory if they are in a file. No piece may be added afterwards."""
+        if self._file is None:
+            pieces, self._pieces = self._pieces, []
+            return np.concatenate(pieces)
+        like = self._like
+        length = self._bytes // (like.itemsize * math.prod(like.shape[1:]))
+        with self._file as file:  # the mapped array does not need it
+            file.flush()
+            return np.memmap(file, like.dtype, "r+", shape=(length, *like.shape[1:]))
+
+    def _write(self) -> None:
+        self._like = self._pieces[0][:0]
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115  # `whole` closes it
+            for piece in self._pieces:
+                self._file.write(piece.tobytes())
+        except OSError as error:
+            raise UserError(
+                f"{tempfile.gettempdir()}: cannot write a temporary file ({error.strerror})\n"
+                f"    cause:  the scan is too large for the memory, and {self._bytes / 2**30:.1f} GB do not fit there\n"
+                "    remedy: set TMPDIR to a folder on a disk with more space"
+            ) from error
+        self._pieces = []
+
+
+def _memory(limit: Path) -> int:
+    """Bytes of memory of the machine, or fewer if the process's control group may use fewer."""
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(machine, int(limit.read_text()))
+    except (OSError, ValueError):  # no control groups, or "max"
+        return machine

@@ -1,0 +1,39 @@
+"""Arrays that grow: the same whole array from memory and from a file."""
+
+import tempfile
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files import large_arrays
+from sl_nerfstudio.files.large_arrays import GrowingArray, largest_in_memory
+
+
+@pytest.mark.parametrize("most", [0, 100, 10**6])
+def test_the_whole_is_what_was_added(most, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    rng, grown = np.random.default_rng(0), GrowingArray(most)
+    pieces = [rng.random((n, 2)).astype(np.float32) for n in (5, 0, 30, 1)]
+    for piece in pieces:
+        grown.append(piece[:, ::-1])
+    whole = grown.whole()
+    assert whole.dtype == np.float32 and isinstance(whole, np.memmap) == (most < 288)
+    np.testing.assert_array_equal(whole, np.concatenate(pieces)[:, ::-1])
+    whole[0] = 7  # as an array in memory
+    assert not list(tmp_path.iterdir())  # the file has no name that could stay behind
+
+
+def test_no_place_for_the_file_is_a_fault_of_the_user(monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
+    with pytest.raises(UserError, match=r"temporary file.*\n.*\n.*TMPDIR"):
+        GrowingArray(0).append(np.zeros(3))
+
+
+def test_the_limit_is_a_share_of_the_memory_that_may_be_used(tmp_path, monkeypatch):
+    limit = tmp_path / "memory.max"
+    limit.write_text("8000000\n")
+    monkeypatch.setattr(large_arrays, "_CGROUP_LIMIT", limit)
+    assert largest_in_memory() == 1000000
+    limit.write_text("max\n")
+    assert largest_in_memory() > 10**7
