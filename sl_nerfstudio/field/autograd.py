@@ -170,4 +170,6 @@ def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: Fie
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     same = [p.to(state.table.dtype) for p in points]
     with torch.autocast(points[0].device.type, enabled=False):
-        return function.apply(backend, buffer, state.active, *same, state.places, state.level_weights, state.table, *state.mlp)
+        return function.apply(
+            backend, buffer, state.active, *same, state.places, state.level_weights, state.table, *state.mlp
+        )

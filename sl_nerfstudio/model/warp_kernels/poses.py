@@ -110,9 +110,7 @@ def combined(turn: Turn, first: wp.int32):
 @part
 def twist(steps: wp.array2d(dtype=wp.float32), row: wp.int32, first: wp.int32):
     """Three numbers of an increment."""
-    return wp.vec3d(
-        wp.float64(steps[row, first]), wp.float64(steps[row, first + 1]), wp.float64(steps[row, first + 2])
-    )
+    return wp.vec3d(wp.float64(steps[row, first]), wp.float64(steps[row, first + 1]), wp.float64(steps[row, first + 2]))
 
 
 @part
