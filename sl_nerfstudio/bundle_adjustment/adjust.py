@@ -22,7 +22,12 @@ from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_
 from sl_nerfstudio.bundle_adjustment.residuals import Observations, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration, linearise_with_intrinsics
+from sl_nerfstudio.bundle_adjustment.self_calibration import (
+    UNKNOWNS,
+    SelfCalibration,
+    linearise_with_intrinsics,
+    with_smooth_derivatives,
+)
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread
@@ -204,7 +209,11 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
-    evidence = Evidence(state.rig, state.anchors, found.rows, extended, kernel, problem.settings.image_blocks)
+    smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)
+    s = problem.settings
+    evidence = Evidence(
+        state.rig, state.anchors, found.rows, extended, smooth, kernel, s.image_blocks, s.kernel.least_curvature
+    )
     free = free_parameters(refine, state.rig)
     known = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(

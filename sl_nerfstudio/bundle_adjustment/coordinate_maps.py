@@ -67,8 +67,20 @@ class CoordinateMaps:
             settings=settings,
             max_roughness=settings.roughness_px,
         )
-        usual = settings.roughness_medians * maps._median_roughness()
-        return replace(maps, max_roughness=max(settings.roughness_px, usual))
+        return maps._with_usual_roughness(settings)
+
+    def _with_usual_roughness(self, settings: LookUpSettings) -> "CoordinateMaps":
+        """With other settings; windows count as discontinuous that are much rougher than the median one."""
+        maps = replace(self, settings=settings)
+        return replace(
+            maps, max_roughness=max(settings.roughness_px, settings.roughness_medians * maps._median_roughness())
+        )
+
+    def with_windows(self, half_window: int) -> "CoordinateMaps":
+        """The same images, looked up in windows of another size, as full of decoded pixels as before."""
+        growth = (2 * half_window + 1) / (2 * self.settings.half_window + 1)
+        least = round(self.settings.least_pixels * growth**2)
+        return self._with_usual_roughness(replace(self.settings, half_window=half_window, least_pixels=least))
 
     @property
     def frames(self) -> int:

@@ -5,6 +5,11 @@ lens that is modelled slightly wrong, or a systematic error of the decoding, pus
 gradient is summed over blocks of each image, and the spread of those sums provides a second estimate (the
 cluster-robust "sandwich": Liang and Zeger, Biometrika 1986). The larger of the two is reported. The intrinsics are
 uncertain, too (`self_calibration`).
+
+Two things make a normal matrix too large. Weights of a robust kernel are not its second derivative
+(`Kernel.curvature`). And derivatives by the poses hold slopes of the decoded maps, whose errors add up in it as squares:
+along directions of which residuals know little, they outweigh what is there ("errors in variables"). So its slopes are
+those of wide windows.
 """
 
 from dataclasses import dataclass
@@ -45,8 +50,10 @@ class Evidence:
     anchors: Anchors
     rows: Observations
     linear: Linearisation
+    smooth: Linearisation  # the same with derivatives of wide windows, where there are any
     kernel: Kernel
     image_blocks: int  # along each side of the decoded part of an image
+    least_curvature: float  # of the kernel
 
     @property
     def blocks(self) -> int:
@@ -79,17 +86,19 @@ def pose_covariance(
     prior_H = noise**2 * poses_H, noise**2 * weight
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
-    equations.H_common.diagonal().add_(prior_H[1])
+    known = normal_equations(e.smooth, e.rows, *weights)
+    known.H_common.diagonal().add_(prior_H[1])
     change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
     g = torch.cat([(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change])
     G = _gauge(e.rig, len(g))
-    C = _expanded_inverse(free, equations, prior_H[0])
+    C = _expanded_inverse(free, known, prior_H[0])
     _remove_gauge(C, G)
     formal = C.T.contiguous()
     _remove_gauge(formal, G)
     squares, blocks = _spread(e, equations.depths, weights, C)
     free_blocks = max(blocks - free.count - UNKNOWNS, blocks / 4)  # degrees of freedom left after the fit of the poses
-    robust = blocks / max(free_blocks, 1.0) * squares + noise**2 * _quadratic(C, *prior_H)
+    curvature = max(e.kernel.curvature(e.linear.residuals), e.least_curvature)
+    robust = blocks / max(free_blocks, 1.0) / curvature**2 * squares + noise**2 * _quadratic(C, *prior_H)
     formal *= noise**2
     larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
     formal *= larger

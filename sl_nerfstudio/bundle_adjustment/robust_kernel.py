@@ -15,7 +15,12 @@ from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
 from sl_nerfstudio.bundle_adjustment.loops.medians import medians_by_frame
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals, array
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.geometry.robust import (
+    MAD_TO_SIGMA,
+    geman_mcclure_cost,
+    geman_mcclure_curvature,
+    geman_mcclure_weight,
+)
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,18 @@ class Kernel:
             parts.append(self.narrowest**2 / width2 * geman_mcclure_weight((value * value).sum(-1) / width2))
         own, cross = parts
         return own, torch.where(r.cross_valid, cross, torch.zeros_like(cross))
+
+    def curvature(self, r: Residuals) -> float:
+        """Second derivative of the cost over what the weights make of it, all residuals together.
+
+        Weighted normal equations take weights for constants, and so overrate what residuals say by the inverse of this
+        (Huber, Robust Statistics, 1981, section 7.6).
+        """
+        own2, cross2 = self._squares()
+        parts = (r.own, own2), (r.cross[r.cross_valid], cross2[r.cross_valid])
+        squares = [((value * value).sum(-1) / width2, width2) for value, width2 in parts]
+        true = sum(float((geman_mcclure_curvature(u) / width2).sum()) for u, width2 in squares)
+        return true / sum(float((geman_mcclure_weight(u) / width2).sum()) for u, width2 in squares)
 
     def cost(self, r: Residuals, valid: Bool[Tensor, "rows"]) -> float:
         """The data's part of the objective, px^2; half of its gradient is that of the weighted normal equations."""

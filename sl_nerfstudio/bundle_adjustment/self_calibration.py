@@ -16,7 +16,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, linearise
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import SelfCalibrationSettings
 from sl_nerfstudio.geometry.devices import Intrinsics, IntrinsicsChange, project, project_jacobian
@@ -116,3 +116,18 @@ def by_intrinsics(devices: Intrinsics, uv: Float[Tensor, "n 2"]) -> Float[Tensor
     out[..., 0] = uv - c
     out[..., 0, 1] = out[..., 1, 2] = f[..., 0]
     return out
+
+
+def with_smooth_derivatives(
+    linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
+) -> Linearisation:
+    """The same residuals; derivatives by poses and intrinsics from wide windows where a paraboloid fits them."""
+    wide = maps.with_windows(maps.settings.wide_half_window)
+    rows = Observations(observations.anchor, observations.frame)  # with a memory of its own
+    found = linearise_with_intrinsics(linearise(rig, anchors, rows, wide), rig, anchors, rows, wide)
+    fits = found.residuals.cross_valid
+    return replace(
+        linear,
+        cross=torch.where(fits[:, None, None], found.cross, linear.cross),
+        cross_depth=torch.where(fits[:, None], found.cross_depth, linear.cross_depth),
+    )

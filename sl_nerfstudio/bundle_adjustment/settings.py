@@ -12,6 +12,10 @@ class LookUpSettings:
 
     half_window: int = 3
     """Camera pixels to each side of the window in which a paraboloid is fitted."""
+    wide_half_window: int = 12
+    """The same for the windows whose derivatives say how much residuals know: errors of coordinates are shared over
+    about a period of the pattern, and derivatives of windows no larger than that are noisy, which looks like
+    information."""
     least_pixels: int = 24
     """Decoded pixels that a window must hold."""
     least_pivot: float = 1e-3
@@ -35,6 +39,8 @@ class KernelSettings:
     """Smallest width, as a multiple of the estimated noise."""
     fastest: float = 1.4
     """Largest factor by which a kernel narrows in one step."""
+    least_curvature: float = 0.2
+    """Smallest share of what weights say that residuals may really say: with less, most of them do not fit at all."""
     noise_floor_px: float = 0.01
     """Smallest plausible noise of one look-up, in pattern pixels."""
 

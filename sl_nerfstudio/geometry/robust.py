@@ -19,3 +19,11 @@ def geman_mcclure_weight(squared: Number) -> Number:
     1 for small residuals; beyond the width it falls with their fourth power.
     """
     return 1 / (1 + squared) ** 2
+
+
+def geman_mcclure_curvature(squared: Number) -> Number:
+    """Second derivative of the cost of a residual in the plane, as a weight: the mean over its two directions.
+
+    What a residual really says of the unknowns; less than its weight, and below zero beyond the kernel's width.
+    """
+    return (1 - squared) / (1 + squared) ** 3

@@ -144,3 +144,15 @@ def test_maps_that_are_noisy_everywhere_are_used_and_their_discontinuities_still
     discontinuous = (uv[:, 0] - 40).abs() < 2
     assert valid[(uv[:, 0] - 40).abs() > 5].float().mean() > 0.99
     assert not valid[discontinuous].any()
+
+
+def test_slopes_of_wide_windows_have_the_smaller_errors_of_more_pixels():
+    """With n x n pixels of equal noise, the variance of a slope is 12 / (n^2 (n^2 - 1)) of theirs."""
+    generator = torch.Generator().manual_seed(0)
+    maps = CoordinateMaps.of([0.3 * torch.randn(200, 200, 2, generator=generator)])
+    uv = pixel_centres(Device(150, 150, 1.0, 1.0, 0.0, 0.0), torch.float64).reshape(-1, 2) + 25
+    frame = torch.zeros(len(uv), dtype=torch.long)
+    for half_window in (3, 12):
+        slopes = maps.with_windows(half_window).look_up(frame, uv).jacobian
+        n2 = (2 * half_window + 1) ** 2
+        assert float(slopes.square().mean().sqrt()) == pytest.approx(0.3 * (12 / n2 / (n2 - 1)) ** 0.5, rel=0.1)

@@ -40,6 +40,21 @@ def test_weights_are_the_derivative_of_the_cost(seed, size, invalid):
     assert torch.allclose(g_cross / 2, w_cross[:, None] * r.cross, rtol=1e-10, atol=1e-14)
 
 
+@given(st.integers(0, 50), st.floats(0.05, 1.0), st.booleans())
+def test_curvature_is_that_of_the_cost_relative_to_its_weights(seed, size, invalid):
+    r, k = residuals(seed, size, invalid), kernel(0.5, 2.0, 1.0)
+    squares = torch.cat([k.width[FRAME] ** 2, k.width[PAIR].amax(0)[r.cross_valid] ** 2])
+    values = torch.cat([r.own, r.cross[r.cross_valid]])
+
+    def cost(x):
+        r2 = (x.reshape(-1, 2) ** 2).sum(-1)
+        return k.narrowest**2 * (r2 / (squares + r2)).sum()
+
+    hessian = torch.autograd.functional.hessian(cost, values.reshape(-1))
+    weights = torch.cat([k.weights(r)[0], k.weights(r)[1][r.cross_valid]])
+    assert k.curvature(r) == pytest.approx(float(hessian.trace() / 4 / weights.sum()), rel=1e-9, abs=1e-12)
+
+
 def test_a_gross_error_costs_the_same_at_any_width():
     far = Residuals(*(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)), torch.ones(5, dtype=torch.bool))
     assert kernel(0.5, 2.0, 1.0).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
