@@ -7,9 +7,9 @@ cluster-robust "sandwich": Liang and Zeger, Biometrika 1986). The larger of the 
 uncertain, too (`self_calibration`).
 
 Two things make a normal matrix too large. Weights of a robust kernel are not its second derivative
-(`Kernel.curvature`). And derivatives by the poses hold slopes of the decoded maps, whose errors add up in it as squares:
-along directions of which residuals know little, they outweigh what is there ("errors in variables"). So its slopes are
-those of wide windows.
+(`Kernel.curvature`). And derivatives by the poses hold slopes of the decoded maps, whose errors add up in it as
+squares: along directions of which residuals know little, they outweigh what is there ("errors in variables"). So its
+slopes are those of wide windows.
 """
 
 from dataclasses import dataclass
