@@ -4,8 +4,8 @@ python -m benchmarks.launches [--scan FOLDER] [--backends torch warp] [--details
 
 Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their
 values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Warp are counted, too. A
-large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA graph, a step is one launch, besides
-those that set its scalars.
+large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA graph, a step is one launch,
+besides those that set its scalars.
 """
 
 import tempfile
