@@ -40,6 +40,13 @@ class SLPixelSampler:
         self.begin(step)
         return self.samples.at(self._draw())
 
+    def choose(self, step: int) -> Int[Tensor, "n"]:
+        """Pixels for a step: indices of the table, or on a GPU of those not held out (`PixelSamples.training`)."""
+        self.begin(step)
+        if self.samples.device.type == "cpu":
+            return self._draw()
+        return self.samples.randint(len(self.samples.training), self.num_rays_per_batch, self.generator)
+
     def _draw(self) -> Int[Tensor, "n"]:
         if self.samples.device.type == "cpu" or self.held_out:
             return self.samples.draw(self.num_rays_per_batch, self.generator, self.held_out)

@@ -78,13 +78,13 @@ class PixelSamples:
         The time does not depend on the size of the table. `generator` must be on the table's device.
         """
         if held_out:
-            return self._held_out_index[self._randint(len(self._held_out_index), count, generator)]
-        index = self._randint(len(self), count, generator)
+            return self._held_out_index[self.randint(len(self._held_out_index), count, generator)]
+        index = self.randint(len(self), count, generator)
         while True:  # rejection sampling: a few per cent are held out, so two or three rounds
             again = self.held_out[index].nonzero()[:, 0]
             if len(again) == 0:
                 return index
-            index[again] = self._randint(len(self), len(again), generator)
+            index[again] = self.randint(len(self), len(again), generator)
 
     @cached_property
     def training(self) -> Int[Tensor, "n_training"]:
@@ -93,7 +93,7 @@ class PixelSamples:
 
     def draw_without_waiting(self, count: int, generator: torch.Generator | None = None) -> Int[Tensor, "n"]:
         """Like `draw` for training, but in a fixed number of operations, so that the host need not wait for a GPU."""
-        return self.training[self._randint(len(self.training), count, generator)].long()
+        return self.training[self.randint(len(self.training), count, generator)].long()
 
     def held_out_of(self, frame: int) -> Int[Tensor, "n"]:
         """Indices of one frame's held-out pixels."""
@@ -111,7 +111,8 @@ class PixelSamples:
             pattern=self.pattern[index].float(),
         )
 
-    def _randint(self, high: int, count: int, generator: torch.Generator | None) -> Int[Tensor, "n"]:
+    def randint(self, high: int, count: int, generator: torch.Generator | None) -> Int[Tensor, "n"]:
+        """Random numbers below `high`, on the table's device."""
         return torch.randint(high, (count,), generator=generator, device=self.device)
 
 

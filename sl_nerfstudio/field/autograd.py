@@ -94,36 +94,30 @@ class _ValueAndGradient(torch.autograd.Function):
 
 
 class _Merged(torch.autograd.Function):
-    """Values at points, and values with gradients at others, by a backend that evaluates them together."""
+    """Values at points, and gradients at those from `first` on, by a backend that evaluates them together."""
 
     @staticmethod
     def forward(
-        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        p, q, places, level_weights, table, *mlp = tensors
+        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, active: Active, first: int, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        p, places, level_weights, table, *mlp = tensors
         ctx.backend, ctx.buffer, ctx.parameters, ctx.active = backend, buffer, (table, *mlp), active
         state = FieldState(table, level_weights, tuple(mlp), places, active)
-        f, gradient, ctx.kept = backend.evaluate_all(state, _together(p, q), len(p))
+        f, gradient, ctx.kept = backend.evaluate_all(state, p, first)
         ctx.save_for_backward(p, places, level_weights, table, *mlp)
-        return f[: len(p)], f[len(p) :], gradient
+        return f, gradient
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
-        p, state = _kept(ctx)
+        _, state = _kept(ctx)
         to = _target(ctx)
-        g = _together(grad_outputs[0], grad_outputs[1])
-        wanted_points = ctx.needs_input_grad[3]
-        points = len(p) if wanted_points else 0
+        g, v = (x.contiguous() for x in grad_outputs)
         result = ctx.backend.pull_back_all(
-            state, ctx.kept, g, grad_outputs[2].contiguous(), points, to.parameters, to.table, to.marks
+            state, ctx.kept, g, v, ctx.needs_input_grad[4], to.parameters, to.table, to.marks
         )
-        dp = result.points if wanted_points else None
-        return (None, None, None, dp, None, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
-
-
-def _together(a: Tensor, b: Tensor) -> Tensor:
-    return torch.cat([a, b]) if len(a) and len(b) else (a if len(a) else b).contiguous()
+        mlp = result.mlp or [None] * len(state.mlp)
+        return (None, None, None, None, result.points, None, None, to.returned, *mlp)
 
 
 def value(
@@ -137,7 +131,7 @@ def value(
     If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
     if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p, p[:0])[0]
+        return _apply_merged(backend, buffer, state, p, len(p))[0]
     return _apply(_Value, backend, buffer, state, p)
 
 
@@ -149,27 +143,38 @@ def value_and_gradient(
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
     if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p.detach()[:0], p.detach())[1:]
+        return _apply_merged(backend, buffer, state, p.detach(), 0)
     return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
 
 
-def values_and_gradients(
+def value_and_last_gradients(
     backend: FieldBackend | MergedBackend,
     buffer: TableGradient | None,
     state: FieldState,
     p: Float[Tensor, "n 3"],
-    q: Float[Tensor, "k 3"],
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "k"], Float[Tensor, "k 3"]]:
-    """`value` at `p`, and `value_and_gradient` at `q`: together if the backend can, which saves launches on a GPU."""
+    first: int,
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"]]:
+    """`value` at all points, and gradients at the k points from `first` on, which are constants.
+
+    Together, if the backend can, which saves launches on a GPU.
+    """
     if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p, q.detach())
-    return value(backend, buffer, state, p), *value_and_gradient(backend, buffer, state, q)
+        return _apply_merged(backend, buffer, state, p, first)
+    f, gradient = value_and_gradient(backend, buffer, state, p[first:])
+    return torch.cat([value(backend, buffer, state, p[:first]), f]), gradient
 
 
-def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: FieldState, *points: Tensor) -> Any:
+def _apply_merged(
+    backend: MergedBackend, buffer: TableGradient | None, state: FieldState, p: Tensor, first: int
+) -> tuple[Tensor, Tensor]:
+    p = p.to(state.table.dtype).contiguous()
+    with torch.autocast(p.device.type, enabled=False):
+        tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
+        return _Merged.apply(backend, buffer, state.active, first, *tensors)
+
+
+def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
-    same = [p.to(state.table.dtype) for p in points]
-    with torch.autocast(points[0].device.type, enabled=False):
-        return function.apply(
-            backend, buffer, state.active, *same, state.places, state.level_weights, state.table, *state.mlp
-        )
+    with torch.autocast(p.device.type, enabled=False):
+        tensors = (p.to(state.table.dtype), state.places, state.level_weights, state.table, *state.mlp)
+        return function.apply(backend, buffer, state.active, *tensors)

@@ -102,14 +102,14 @@ class MergedBackend(Protocol):
         kept: Kept,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
-        points: int,
+        points: bool,
         parameters: bool,
         table_gradient: Float[Tensor, "rows f"] | None,
         marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
-        """Gradients of `sum g f + v . grad f`: by the first `points` points, none of which may have gradients.
+        """Gradients of `sum g f + v . grad f`, on request: by the points before `first`, and by the parameters.
 
-        On request also by the parameters; the table's as in `FieldBackend`.
+        Those of the other points are 0; the table's as in `FieldBackend`.
         """
         ...
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.field.autograd import value, value_and_gradient, values_and_gradients
+from sl_nerfstudio.field.autograd import value, value_and_gradient, value_and_last_gradients
 from sl_nerfstudio.field.backend import BackendName, FieldBackend, FieldState, MergedBackend, numba_cannot, warp_cannot
 from sl_nerfstudio.field.hash_grid import GridLayout, HashGrid
 from sl_nerfstudio.field.table_gradient import TableGradient
@@ -119,7 +119,7 @@ class SDFField(nn.Module):
     def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance; differentiable (once) with respect to the parameters and `p`."""
         state = self._state()
-        return value(self._backend(state), self._buffer(state), state, p)
+        return value(self._backend(), self._buffer(), state, p)
 
     def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """`sdf` as a column, under the name that `ns-export marching-cubes` uses."""
@@ -128,45 +128,56 @@ class SDFField(nn.Module):
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
         state = self._state()
-        return value_and_gradient(self._backend(state), self._buffer(state), state, p)
+        return value_and_gradient(self._backend(), self._buffer(), state, p)
 
     def _state(self) -> FieldState:
         mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
         encoding = self.encoding
         return FieldState(encoding.table, encoding.level_weights, mlp, encoding.places, encoding.active)
 
-    def sdf_and_gradients(
-        self, p: Float[Tensor, "n 3"], q: Float[Tensor, "k 3"]
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k"], Float[Tensor, "k 3"]]:
-        """`sdf(p)` and `sdf_and_gradient(q)`, which cost the fewest launches together."""
+    def sdf_and_last_gradients(
+        self, p: Float[Tensor, "n 3"], first: int
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"]]:
+        """`sdf` at all points, and gradients at the k points from `first` on, which are constants.
+
+        On a GPU this takes half the launches of `sdf` and `sdf_and_gradient`.
+        """
         state = self._state()
-        return values_and_gradients(self._backend(state), self._buffer(state), state, p, q)
+        return value_and_last_gradients(self._backend(), self._buffer(), state, p, first)
 
     def obstacle(self, backend: Literal["numba", "warp"]) -> str | None:
         """Why a compiled backend cannot serve the field where it is, or None if it can."""
         cannot = numba_cannot if backend == "numba" else warp_cannot
         return cannot(self.encoding.layout, self.encoding.table)
 
-    def _backend(self, state: FieldState) -> FieldBackend | MergedBackend:
-        name, table = self.config.backend, state.table
+    @property
+    def backend(self) -> Literal["torch", "numba", "warp"]:
+        """What serves the field where it is. Raises UserError if the one chosen by hand cannot."""
+        name, device = self.config.backend, self.encoding.table.device.type
         if name == "auto":
-            name = "numba" if table.device.type == "cpu" else "warp" if table.device.type == "cuda" else "torch"
+            name = "numba" if device == "cpu" else "warp" if device == "cuda" else "torch"
+        if name == "torch":
+            return "torch"
+        obstacle = self.obstacle(name)
+        if obstacle is None:
+            return name
+        if self.config.backend == "auto":
+            return "torch"
+        raise UserError(f"{obstacle}; choose the backend auto or torch")
+
+    def _backend(self) -> FieldBackend | MergedBackend:
+        name = self.backend
         if name == "torch":
             return self._torch
-        obstacle = self.obstacle(name)
-        if obstacle is not None and self.config.backend == "auto":
-            return self._torch
-        if obstacle is not None:
-            raise UserError(f"{obstacle}; choose the backend auto or torch")
         if name not in self._compiled:
             self._compiled[name] = (_numba_field if name == "numba" else _warp_field)(
                 self.encoding.layout, self.config.knee
             )
         return self._compiled[name]
 
-    def _buffer(self, state: FieldState) -> TableGradient | None:
+    def _buffer(self) -> TableGradient | None:
         """The table's persistent gradient buffer, if the compiled kernels write to one."""
-        return None if self._backend(state) is self._torch else TableGradient.of(self.encoding.table)
+        return None if self.backend == "torch" else TableGradient.of(self.encoding.table)
 
 
 def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:

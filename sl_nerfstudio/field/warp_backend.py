@@ -45,7 +45,7 @@ class WarpField:
 
     def evaluate_all(self, state: FieldState, p: Float[Tensor, "n 3"], first: int) -> tuple[Tensor, Tensor, _Kept]:
         """See `MergedBackend`."""
-        p, n, depth = p.detach().contiguous(), len(p), FIRST + FEATURES * self.layout.levels
+        n, depth = len(p), FIRST + FEATURES * self.layout.levels
         weights, biases = _layers(state)
         hidden = weights[0].shape[0]
         packed, f = p.new_empty(hidden, depth), p.new_empty(n)
@@ -65,8 +65,8 @@ class WarpField:
             for weight, z_layer in zip([*weights[-2:0:-1], packed], reversed(z), strict=True):
                 u.insert(0, self._through(h[0], z_layer[first:]))
                 h.insert(0, torch.mm(u[0], weight))
-            launch(grid_kernels.to_points, n - first, *grid, p[first:], h[0], p.new_empty(0), gradient)
-        return f, gradient, _Kept(p, first, packed, z, a, u, h)
+            launch(grid_kernels.to_points, n - first, *grid, p[first:], h[0], p.new_empty(0), n - first, gradient)
+        return f, gradient, _Kept(p.detach(), first, packed, z, a, u, h)
 
     def pull_back_all(
         self,
@@ -74,7 +74,7 @@ class WarpField:
         kept: Kept,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
-        points: int,
+        points: bool,
         parameters: bool,
         table_gradient: Float[Tensor, "rows f"] | None,
         marks: UInt8[Tensor, "marks"] | None,
@@ -93,8 +93,9 @@ class WarpField:
                 along.append(self._through(z_dot[-1], z[first:]))
         grads: list[Tensor] = []
         if parameters:
-            top = along[-1].sum(0) if first < n else g.new_zeros(weights[-1].shape[1])
-            grads = [torch.addmv(top, kept.a[-1].T, g)[None], g.sum(0, keepdim=True)]
+            top = kept.a[-1].T
+            by_last = torch.addmv(along[-1].sum(0), top, g) if first < n else torch.mv(top, g)
+            grads = [by_last[None], g.sum(0, keepdim=True)]
         none, empty = p.new_empty(0), p.new_empty(0, 0)
         d, upstream = weights[-1], g
         for layer in reversed(range(len(kept.z))):
@@ -113,9 +114,9 @@ class WarpField:
             place = (state.places, self._smooth, state.level_weights)
             size = (self.layout.levels, n)
             launch(grid_kernels.scatter, size, *place, p, d, first, v, u, table_gradient, marked)
-        dp = p.new_empty(points, 3)
-        if points:
-            launch(grid_kernels.to_points, points, *grid, p[:points], d[:points], g[:points], dp)
+        dp = torch.empty_like(p) if points else None
+        if dp is not None:
+            launch(grid_kernels.to_points, n, *grid, p, d, g, first, dp)
         return Pulled(dp, tuple(grads) if parameters else None)
 
     def _through(self, x: Tensor, z: Tensor) -> Tensor:

@@ -53,6 +53,7 @@ class SLModel(Model):
     surface_width_now: Tensor
     noise_px: Tensor
     px_per_length: Tensor
+    camera_params: Tensor
     projector_params: Tensor
     pattern: Tensor
     intrinsics_change: Tensor
@@ -76,6 +77,10 @@ class SLModel(Model):
         projector = Intrinsics.of(self.scan.projector)
         self._projector_kind: DeviceKind = projector.model
         self._projector_distorted = projector.distorted
+        cameras = Intrinsics.of([frame.camera for frame in self.scan.frames])
+        self._camera_kind: DeviceKind = cameras.model
+        self._cameras_distorted = cameras.distorted
+        self.register_buffer("camera_params", cameras.params, persistent=False)
         self.register_buffer("projector_params", projector.params, persistent=False)
         self.register_buffer("pattern", torch.from_numpy(self.scan.read_pattern()).float(), persistent=False)
         # a checkpoint must hold more than weights: the step, for annealing; the decoding noise, measured once; and the
@@ -143,6 +148,11 @@ class SLModel(Model):
         """The projector's intrinsics, batch ()."""
         return Intrinsics(self.projector_params, self._projector_kind, self._projector_distorted)
 
+    @property
+    def cameras(self) -> Intrinsics:
+        """The cameras' intrinsics, batch (frames)."""
+        return Intrinsics(self.camera_params, self._camera_kind, self._cameras_distorted)
+
     # ---- training
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -209,7 +219,8 @@ class SLModel(Model):
         c = self.config
         self._step = step
         self.kappa_now.fill_(kappa_at(c.annealing, step, c.schedule_iterations))
-        self.surface_width_now.fill_(surface_width_at(step, c.schedule_iterations))
+        if c.losses.direct:
+            self.surface_width_now.fill_(surface_width_at(step, c.schedule_iterations))
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: sets the levels to those of the checkpoint's step."""
@@ -219,7 +230,19 @@ class SLModel(Model):
     @property
     def operations_of_step(self) -> tuple[Any, ...]:
         """Equal for steps that do the same operations: all that changes otherwise is in tensors."""
-        return self._renders(self._step), self.field.encoding.active
+        return self.renders_now, self.field.encoding.active
+
+    @property
+    def renders_now(self) -> bool:
+        """Whether the current step renders rays; before, the field is only fitted to triangulated points."""
+        return self._renders(self._step)
+
+    @property
+    def has_kernels(self) -> bool:
+        """Whether there are kernels for a whole step: not for triangulated points from which poses learn."""
+        poses = self.device_poses
+        moves = poses.camera_step.requires_grad or poses.projector_step.requires_grad
+        return self.field.backend == "warp" and not (moves and self.config.losses.direct)
 
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
@@ -242,7 +265,7 @@ class SLModel(Model):
         outputs: dict[str, Any] = {"origins": origins, "directions": directions}
         if self.config.losses.direct:
             outputs["T_scene_projector"] = now.T_scene_projector[views]
-        if self._renders(self._step):
+        if self.renders_now:
             s = self.config.sampling
             n = min(s.render_rays, len(origins))
             T_projector_scene = now.T_projector_scene[views[:n]]

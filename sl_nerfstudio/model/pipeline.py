@@ -54,13 +54,14 @@ class SLPipelineConfig(VanillaPipelineConfig):
 
 
 class SLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline with five differences.
+    """nerfstudio's pipeline with six differences.
 
     - The random numbers of a training step depend only on the seed and the step: a resumed run continues as an
       uninterrupted one would.
     - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
     - The viewer shows the scan (viewer/), and at the end of training the next commands are printed.
+    - On a GPU, kernels compute the losses of a step (kernel_step.py).
     - Several processes average their gradients without DistributedDataParallel (training/shared_training.py).
     """
 
@@ -93,6 +94,16 @@ class SLPipeline(VanillaPipeline):
                 kwargs={"trainer": training_callback_attributes.trainer},
             ),
         ]
+
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs, losses and metrics of a step; by kernels without outputs, where there are kernels for all of it."""
+        sampler, model = self.datamanager.train_pixel_sampler, self._sl_model
+        if sampler.samples.device != model.pattern.device or not model.has_kernels:
+            return super().get_train_loss_dict(step)
+        from sl_nerfstudio.model.kernel_step import kernel_step  # imports Warp
+
+        self.datamanager.train_count += 1
+        return {}, *kernel_step(model, sampler.samples, sampler.choose(step))
 
     @property
     def _sl_model(self) -> SLModel:

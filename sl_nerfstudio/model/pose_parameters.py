@@ -11,7 +11,7 @@ increments to it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -21,6 +21,8 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCov
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.model.settings import SLModelSettings
+
+ProjectorMoves = Literal["nothing", "relative pose", "own pose"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class FrameTransforms:
 
 class PoseParameters(nn.Module):
     """Base poses (float64 buffers, saved with the weights) and increments to them."""
+
+    about_scene = True
+    """Whether cameras turn about the scene's centre; otherwise about their own."""
+    projector_moves_by: ProjectorMoves = "relative pose"
+    """What the projector's increment changes."""
 
     start_camera: Tensor
     start_projector: Tensor
@@ -165,6 +172,8 @@ class RigPoseParameters(PoseParameters):
 class StaticProjectorParameters(PoseParameters):
     """`T_scene_camera = exp(delta) base`, and a projector that does not move."""
 
+    projector_moves_by = "nothing"
+
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See PoseParameters."""
         return self._camera_about_scene(), self.base_projector
@@ -173,6 +182,9 @@ class StaticProjectorParameters(PoseParameters):
 class IndependentPoseParameters(PoseParameters):
     """`T = base exp(xi)` for camera and projector separately: each rotates about its own centre."""
 
+    about_scene = False
+    projector_moves_by = "own pose"
+
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See PoseParameters."""
         return self._camera_about_itself(), self.base_projector @ exp_se3(self.projector_step.double())
@@ -180,6 +192,8 @@ class IndependentPoseParameters(PoseParameters):
 
 class CoupledPoseParameters(PoseParameters):
     """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres, and their projectors move with them."""
+
+    about_scene = False
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """See PoseParameters."""

@@ -186,10 +186,17 @@ def to_points(
     p: wp.array(dtype=wp.vec3),
     de: wp.array2d(dtype=wp.float32),
     outward: wp.array(dtype=wp.float32),
+    count: wp.int32,
     dp: wp.array(dtype=wp.vec3),
 ):
-    """Adjoint `dp` of the points: that of the encoded points, and `outward` (or 1) times the slope of the distance."""
+    """Adjoint `dp` of the points: that of the encoded points, and `outward` (or 1) times the slope of the distance.
+
+    It is 0 for points from `count` on.
+    """
     i = wp.tid()
+    if i >= count:
+        dp[i] = wp.vec3()
+        return
     q = p[i]
     step = q - in_box(q)
     distance = wp.length(step)

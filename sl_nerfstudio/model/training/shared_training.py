@@ -52,7 +52,11 @@ def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
 
 
 def _average_rows(buffer: TableGradient) -> None:
-    """Only the rows that any process marked: a batch of points touches a part of the table."""
+    """Only the rows that any process marked: a batch of points touches a part of the table. On a GPU, all rows."""
+    if len(buffer.marks) == 0:
+        dist.all_reduce(buffer.buffer)
+        buffer.buffer /= dist.get_world_size()
+        return
     marks = buffer.trusted_marks().clone()
     dist.all_reduce(marks, dist.ReduceOp.MAX)
     rows = marks[: len(buffer.buffer)].nonzero()[:, 0]

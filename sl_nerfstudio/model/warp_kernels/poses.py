@@ -127,8 +127,14 @@ def inner(a: wp.mat33d, b: wp.mat33d):
 
 
 @part
-def add_adjoint(steps: wp.array2d(dtype=wp.float32), row: wp.int32, g: wp.mat44d, out: wp.array2d(dtype=wp.float32)):
-    """Add to the adjoint of an increment, from that of its pose."""
+def note_adjoint(
+    steps: wp.array2d(dtype=wp.float32),
+    row: wp.int32,
+    g: wp.mat44d,
+    shared: wp.bool,
+    out: wp.array2d(dtype=wp.float32),
+):
+    """The adjoint of an increment, from that of its pose; added to it, if the increment is that of all frames."""
     v = twist(steps, row, 0)
     w = twist(steps, row, 3)
     turn = turn_of(w)
@@ -146,8 +152,13 @@ def add_adjoint(steps: wp.array2d(dtype=wp.float32), row: wp.int32, g: wp.mat44d
         c = turn.coefficients
         d_R = s[0] * W + c[0] * E + s[1] * W2 + c[1] * E2
         d_V = s[1] * W + c[1] * E + s[2] * W2 + c[2] * E2
-        wp.atomic_add(out, row, k, wp.float32(by_v[k]))
-        wp.atomic_add(out, row, 3 + k, wp.float32(inner(g_R, d_R) + wp.dot(g_t, d_V * v)))
+        by_w = inner(g_R, d_R) + wp.dot(g_t, d_V * v)
+        if shared:
+            wp.atomic_add(out, row, k, wp.float32(by_v[k]))
+            wp.atomic_add(out, row, 3 + k, wp.float32(by_w))
+        else:
+            out[row, k] = wp.float32(by_v[k])
+            out[row, 3 + k] = wp.float32(by_w)
 
 
 @kernel
@@ -189,9 +200,10 @@ def poses_adjoint(
     d_camera_step: wp.array2d(dtype=wp.float32),
     d_projector_step: wp.array2d(dtype=wp.float32),
 ):
-    """Add to the adjoints of the increments, from those of the poses."""
+    """Adjoints of the increments, from those of the poses; one that is shared by all frames must begin as 0."""
     i = wp.tid()
     row = wp.where(projector_step.shape[0] == 1, 0, i)
+    shared = projector_step.shape[0] < camera_step.shape[0]
     base = base_camera[i]
     g = wp.mat44d(d_camera[i])
     g_own = wp.mat44d(d_projector[i])
@@ -202,11 +214,12 @@ def poses_adjoint(
         rest = inverse(base) * base_projector[i]
         moved = exponential(projector_step, row) * rest
         g += g_own * wp.transpose(moved)
-        add_adjoint(projector_step, row, wp.transpose(camera) * g_own * wp.transpose(rest), d_projector_step)
+        g_step = wp.transpose(camera) * g_own * wp.transpose(rest)
+        note_adjoint(projector_step, row, g_step, shared, d_projector_step)
     elif projector == 2:
-        add_adjoint(projector_step, row, wp.transpose(base_projector[i]) * g_own, d_projector_step)
+        note_adjoint(projector_step, row, wp.transpose(base_projector[i]) * g_own, shared, d_projector_step)
     if about_scene != 0:
         g = g * wp.transpose(base)
     else:
         g = wp.transpose(base) * g
-    add_adjoint(camera_step, i, g, d_camera_step)
+    note_adjoint(camera_step, i, g, False, d_camera_step)

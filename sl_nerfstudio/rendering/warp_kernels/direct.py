@@ -23,7 +23,7 @@ def direct(
     measured: wp.array(dtype=wp.vec2),
     weight: wp.array(dtype=wp.float32),
     at_least: wp.array(dtype=wp.float32),
-    width: wp.array(dtype=wp.float32),
+    width: wp.array(dtype=wp.float64),
     sums: wp.array(dtype=wp.float32),
 ):
     """Add the terms of each point to the sums."""
@@ -34,8 +34,9 @@ def direct(
         counts = wp.where(wp.isfinite(measured[i][0]) and wp.isfinite(measured[i][1]), 1.0, 0.0)
         w = weight[i]
         if w > 0.0:
+            spread = wp.float32(width[0])
             wp.atomic_add(sums, 5, w)
-            wp.atomic_add(sums, 6, w * width[0] * (1.0 - wp.exp(-wp.abs(f[i]) / width[0])))
+            wp.atomic_add(sums, 6, w * spread * (1.0 - wp.exp(-wp.abs(f[i]) / spread)))
             wp.atomic_add(sums, 7, 1.0)
             wp.atomic_add(sums, 8, wp.max(at_least[i] - sides[i], 0.0))
             wp.atomic_add(sums, 9, wp.max(sides[n + i], 0.0))
@@ -56,9 +57,13 @@ def losses(
     surface: wp.float32,
     free_space: wp.float32,
     eikonal: wp.float32,
+    ordered: wp.array(dtype=wp.float32),
     out: wp.array(dtype=wp.float32),
 ):
-    """The weighted losses: coordinates, pattern, surface, free space, Eikonal."""
+    """The weighted losses: coordinates, pattern, surface, free space, Eikonal; then how well rays fit.
+
+    That is the lower median of the errors of the coordinates, which come in ascending order, and the patterns' cosine.
+    """
     by_pixel = per_pixel
     if per_length > 0.0:
         by_pixel = per_length / px_per_length[0]
@@ -70,6 +75,18 @@ def losses(
     out[2] = surface * sums[6] / weights
     out[3] = free_space * ((sums[8] + _BEHIND * sums[9]) / number + _FACING * sums[10] / weights)
     out[4] = eikonal * sums[11] / wp.max(sums[12], 1.0)
+    low = wp.int32(0)
+    high = ordered.shape[0]
+    while low < high:  # how many are finite
+        middle = (low + high) / 2
+        if wp.isfinite(ordered[middle]):
+            low = middle + 1
+        else:
+            high = middle
+    out[5] = wp.nan
+    if low > 0:
+        out[5] = ordered[(low - 1) / 2]
+    out[6] = sums[2] / (wp.max(wp.sqrt(sums[3]), 1.0e-8) * wp.max(wp.sqrt(sums[4]), 1.0e-8))
 
 
 @kernel
@@ -81,7 +98,7 @@ def direct_adjoint(
     measured: wp.array(dtype=wp.vec2),
     weight: wp.array(dtype=wp.float32),
     at_least: wp.array(dtype=wp.float32),
-    width: wp.array(dtype=wp.float32),
+    width: wp.array(dtype=wp.float64),
     sums: wp.array(dtype=wp.float32),
     surface: wp.float32,
     free_space: wp.float32,
@@ -107,7 +124,7 @@ def direct_adjoint(
         if w > 0.0:
             weights = wp.max(sums[5], 1.0e-9)
             each = g_free_space[0] * free_space / wp.max(sums[7], 1.0)
-            by_f = g_surface[0] * surface * w / weights * wp.exp(-wp.abs(f[i]) / width[0]) * wp.sign(f[i])
+            by_f = g_surface[0] * surface * w / weights * wp.exp(-wp.abs(f[i]) / wp.float32(width[0])) * wp.sign(f[i])
             if f[i] == 0.0:
                 by_f = wp.float32(0.0)
             if at_least[i] - sides[i] >= 0.0:

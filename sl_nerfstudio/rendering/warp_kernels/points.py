@@ -43,9 +43,19 @@ def centre(T: wp.mat44):
     return wp.vec3(T[0, 3], T[1, 3], T[2, 3])
 
 
+@part
+def in_ball(noise: wp.array(dtype=wp.float32), first: wp.int32):
+    """A point uniform in the unit ball, from three random numbers."""
+    z = 2.0 * noise[first] - 1.0
+    angle = 6.283185307179586 * noise[first + 1]
+    around = wp.sqrt(wp.max(1.0 - z * z, 0.0))
+    return wp.pow(noise[first + 2], 1.0 / 3.0) * wp.vec3(around * wp.cos(angle), around * wp.sin(angle), z)
+
+
 @kernel
-def pixel_rays(
+def rays_and_random_points(
     index: wp.array(dtype=wp.int64),
+    among: wp.array(dtype=wp.int32),
     frame: wp.array(dtype=wp.int32),
     row: wp.array(dtype=wp.int16),
     column: wp.array(dtype=wp.int16),
@@ -60,10 +70,21 @@ def pixel_rays(
     directions: wp.array(dtype=wp.vec3),
     measured: wp.array(dtype=wp.vec2),
     captured: wp.array(dtype=wp.float32),
+    noise: wp.array(dtype=wp.float32),
+    random_points: wp.array(dtype=wp.vec3),
 ):
-    """Camera rays through the centres of the pixels `index` of a table, and what was measured there."""
+    """Camera rays through the centres of the pixels `index` of a table, and what was measured there.
+
+    `index` counts the rows `among` of the table, if there are any. Besides, points in the unit ball.
+    """
     i = wp.tid()
-    k = index[i]
+    if i < random_points.shape[0]:
+        random_points[i] = in_ball(noise, 3 * i)
+    if i >= index.shape[0]:
+        return
+    k = wp.int32(index[i])
+    if among.shape[0] > 0:
+        k = among[k]
     view = frame[k]
     T = T_scene_camera[view]
     views[i] = view
@@ -144,7 +165,7 @@ def sample(
     along_surface: wp.int32,
     cell: wp.float32,
     half_width: wp.float32,
-    kappa: wp.array(dtype=wp.float32),
+    kappa: wp.array(dtype=wp.float64),
     t: wp.array2d(dtype=wp.float32),
     points: wp.array(dtype=wp.vec3),
 ):
@@ -169,7 +190,7 @@ def sample(
                     crossing = low + (wp.float32(i) - 0.5 + share) * step
                 before = here
         if found != 0:
-            reach = half_width / kappa[0] + cell
+            reach = half_width / wp.float32(kappa[0]) + cell
             low = crossing - reach
             high = crossing + reach
     count = t.shape[1]
@@ -177,17 +198,6 @@ def sample(
         x = low + (high - low) * (wp.float32(i) + noise[ray * count + i]) / wp.float32(count)
         t[ray, i] = x
         points[ray * count + i] = o + x * d
-
-
-@kernel
-def random_points(noise: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec3)):
-    """Points uniform in the unit ball, from three random numbers each."""
-    i = wp.tid()
-    z = 2.0 * noise[3 * i] - 1.0
-    angle = 6.283185307179586 * noise[3 * i + 1]
-    around = wp.sqrt(wp.max(1.0 - z * z, 0.0))
-    radius = wp.pow(noise[3 * i + 2], 1.0 / 3.0)
-    points[i] = radius * wp.vec3(around * wp.cos(angle), around * wp.sin(angle), z)
 
 
 @kernel

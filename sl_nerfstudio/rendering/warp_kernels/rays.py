@@ -56,26 +56,27 @@ def render(
     model: wp.int32,
     distorted: wp.int32,
     pattern: wp.array2d(dtype=wp.float32),
-    kappa: wp.array(dtype=wp.float32),
+    kappa: wp.array(dtype=wp.float64),
     measured: wp.array(dtype=wp.vec2),
     captured: wp.array(dtype=wp.float32),
     before: wp.array2d(dtype=wp.float32),
-    accumulation: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
     coordinates: wp.array(dtype=wp.vec2),
     rendered: wp.array(dtype=wp.float32),
     lit: wp.array(dtype=wp.float32),
     lit_weight: wp.array(dtype=wp.float32),
+    error: wp.array(dtype=wp.float32),
     sums: wp.array(dtype=wp.float32),
 ):
-    """What each ray sees; `before` is the logarithm of the transparency in front of each sample."""
+    """What each ray sees; `before` is the logarithm of the transparency in front of each sample.
+
+    `error` is the distance between coordinates, infinite where none were decoded.
+    """
     ray = wp.tid()
     o = origins[ray]
     d = directions[ray]
     T = T_scene_projector[views[ray]]
-    k = kappa[0]
+    k = wp.float32(kappa[0])
     total = wp.float32(0.0)
-    along = wp.float32(0.0)
     seen = wp.float32(0.0)
     uv = wp.vec2()
     brightness = wp.float32(0.0)
@@ -91,7 +92,6 @@ def render(
         if weight > 0.0:
             middle = 0.5 * (t[ray, i] + t[ray, i + 1])
             total += weight
-            along += weight * middle
             pixel = project(params, model, distorted, turned_back(T, o + middle * d - centre(T)))
             if pixel.lit != 0:
                 seen += weight
@@ -101,14 +101,13 @@ def render(
     before[ray, sdf.shape[1] - 1] = transparency
     uv = uv / (seen + _EPSILON)
     share = seen / (total + _EPSILON)
-    accumulation[ray] = total
-    depth[ray] = along / (total + _EPSILON)
     coordinates[ray] = uv
     rendered[ray] = brightness
     lit[ray] = share
     lit_weight[ray] = seen
     count = counts(measured[ray], share)
     off = uv - wp.vec2(number(measured[ray][0]), number(measured[ray][1]))
+    error[ray] = wp.where(wp.isfinite(measured[ray][0]) and wp.isfinite(measured[ray][1]), wp.length(off), wp.inf)
     wp.atomic_add(sums, 0, count * (wp.abs(off[0]) + wp.abs(off[1])))
     wp.atomic_add(sums, 1, count)
     wp.atomic_add(sums, 2, brightness * captured[ray])
@@ -128,7 +127,7 @@ def render_adjoint(
     model: wp.int32,
     distorted: wp.int32,
     pattern: wp.array2d(dtype=wp.float32),
-    kappa: wp.array(dtype=wp.float32),
+    kappa: wp.array(dtype=wp.float64),
     measured: wp.array(dtype=wp.vec2),
     captured: wp.array(dtype=wp.float32),
     before: wp.array2d(dtype=wp.float32),
@@ -154,7 +153,7 @@ def render_adjoint(
     d = directions[ray]
     view = views[ray]
     T = T_scene_projector[view]
-    k = kappa[0]
+    k = wp.float32(kappa[0])
     samples = sdf.shape[1]
     uv = coordinates[ray]
     # adjoint of this ray's coordinates and intensity
