@@ -44,9 +44,7 @@ class VertexViews:
 class _FrameViews:
     """The same of one frame."""
 
-    vertex: Int64[ndarray, "m"]
-    view: SurfaceView
-    residual: Float[ndarray, "m 2"]
+    columns: dict[str, ndarray]  # those of VertexViews with an entry for each pair, except `frame`
     noise_px: float
     window_ratio: float  # variance of a window's value over that of a pixel; NaN if unknown
 
@@ -80,20 +78,20 @@ def collect_views(
     for first in track(range(0, len(scan.frames), threads()), task):
         frames = list(enumerate(scan.frames))[first : first + threads()]
         found += results([partial(_views_of, points, normals, occluder, frame, scan, poses, k) for k, frame in frames])
-    vertex = np.concatenate([f.vertex for f in found])
+    vertex = np.concatenate([f.columns["vertex"] for f in found])
     order = np.argsort(vertex, kind="stable")
-    frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
+    frame = np.repeat(np.arange(len(found)), [len(f.columns["vertex"]) for f in found])
     ratios = np.array([f.window_ratio for f in found])
     usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
 
     def joined(name: str) -> ndarray:
-        return np.concatenate([getattr(f.view, name).numpy() for f in found])[order]
+        return np.concatenate([f.columns.pop(name) for f in found])[order]
 
     return VertexViews(
         vertex=chosen[vertex[order]],
         frame=frame[order],
         slope=joined("slope"),
-        residual=np.concatenate([f.residual for f in found])[order],
+        residual=joined("residual"),
         pixels_per_area=joined("pixels_per_area"),
         ray_angle=joined("ray_angle"),
         noise_px=np.array([f.noise_px for f in found]),
@@ -126,7 +124,9 @@ def _views_of(
     view = SurfaceView(**{name: value[torch.from_numpy(good)] for name, value in vars(view).items()})
     residual = residual[good]
     noise = _spread(_across(view, residual))
-    return _FrameViews(seen[good], view, residual, noise, _window_ratio(coords, view, noise))
+    columns = {"vertex": seen[good], "residual": residual}
+    columns |= {name: getattr(view, name).numpy() for name in ("slope", "pixels_per_area", "ray_angle")}
+    return _FrameViews(columns, noise, _window_ratio(coords, view, noise))
 
 
 def _across(view: SurfaceView, residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
