@@ -28,11 +28,12 @@ import tyro
 from benchmarks.common.iteration_step import SIZES, Ours, Theirs, softplus
 from benchmarks.common.machine import describe
 from benchmarks.common.scans import made_once
-from benchmarks.common.training import Training, settings
+from benchmarks.common.training import Training, model_of, settings
 from sl_nerfstudio.errors import first_line
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.evaluation.inputs import read_ground_truth, read_reference
+from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.trim import trim_to_observed
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -107,7 +108,7 @@ def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]
     return {name: part for name, part in found.items() if not config.only or any(x in name for x in config.only)}
 
 
-def backends(device: str) -> list[str]:
+def backends(device: str) -> list[BackendName]:
     """What can compute the field there."""
     return ["torch", "warp"] if device == "cuda" else ["torch", "numba"]
 
@@ -124,17 +125,17 @@ def encodings(device: str) -> dict[str, Callable[..., Ours | Theirs]]:
 
 
 def begun(
-    config: Config, scan: Path, size: str, device: str, steps: int, backend: str, graph: bool, adjust: bool
+    config: Config, scan: Path, size: str, device: str, steps: int, backend: BackendName, graph: bool, adjust: bool
 ) -> Training:
     """A training whose run folder is forgotten."""
     run = settings(METHODS[size], scan, Path(tempfile.mkdtemp()), device, steps)
     run.cuda_graph = graph
-    run.pipeline.model.sdf.backend = backend
+    model_of(run).sdf.backend = backend
     torch.manual_seed(0)
     return Training(run, adjust)
 
 
-def step_times(config: Config, scan: Path, size: str, backend: str, graph: bool) -> dict[str, Any]:
+def step_times(config: Config, scan: Path, size: str, backend: BackendName, graph: bool) -> dict[str, Any]:
     """Milliseconds of a step in which rays are rendered, and memory."""
     _forget_memory(config.device)
     training = begun(config, scan, size, config.device, 1000, backend, graph, adjust=False)
@@ -163,15 +164,15 @@ def surface(config: Config, scan: Path, size: str, device: str, steps: int) -> d
         "steps": steps,
         "prepare_s": round(prepared - begin, 2),
         "train_s": round(trained - prepared, 2),
-        **rmse(config, training),
+        **rmse(config.mesh_resolution, training),
         **_memory(device),
     }
 
 
-def rmse(config: Config, training: Training) -> dict[str, Any]:
+def rmse(resolution: int, training: Training) -> dict[str, Any]:
     """RMS and median distance of the observed surface from the truth, in mm, after rigid alignment."""
     model = training.model.eval()
-    whole = extract_mesh(model.sdf, config.mesh_resolution, device=model.device).mapped(model.S_scene_world.inverse())
+    whole = extract_mesh(model.sdf, resolution, device=model.device).mapped(model.S_scene_world.inverse())
     observed = trim_to_observed(whole, model.scan, model.poses()).mesh
     truth = read_ground_truth(model.scan)
     reference = read_reference(truth.mesh_path, model.scan, truth.poses or model.poses(), 100_000, 0)

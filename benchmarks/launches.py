@@ -20,7 +20,7 @@ import tyro
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.scans import made_once
-from benchmarks.common.training import Training, settings
+from benchmarks.common.training import Training, data_of, model_of, settings
 from benchmarks.pretended.gpu import PretendedGpu
 from benchmarks.pretended.recorder import PretendedRecorder
 from sl_nerfstudio.model.training.step_graph import WARM_UP
@@ -75,9 +75,9 @@ def count(size: str, backend: Backend, config: Config) -> Row:
     with PretendedGpu(kernels=backend == "warp") as gpu, tempfile.TemporaryDirectory() as folder:
         run = settings(METHODS[size], _scan(config), Path(folder), "cuda", 1000)
         run.cuda_graph = False
-        run.pipeline.model.sdf.backend = backend
+        model_of(run).sdf.backend = backend
         if config.rays is not None:
-            run.pipeline.datamanager.train_num_rays_per_batch = config.rays
+            data_of(run).train_num_rays_per_batch = config.rays
         training = Training(run)
         training.done = 601  # rays are rendered, and all levels have their weight
         training.step()

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
+from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.model.config import SLModelConfig
 from sl_nerfstudio.model.pipeline import SLPipeline
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.model.training.loop import SLTrainer
@@ -25,6 +27,16 @@ def settings(method: str, scan: Path, output: Path, device: str, steps: int) -> 
     config.pipeline.datamanager.data = scan
     config.machine.device_type = cast(Any, device)
     return config
+
+
+def model_of(run: SLTrainerConfig) -> SLModelConfig:
+    """The settings of its model."""
+    return cast(SLModelConfig, run.pipeline.model)
+
+
+def data_of(run: SLTrainerConfig) -> SLDataManagerConfig:
+    """The settings of its pixels."""
+    return cast(SLDataManagerConfig, run.pipeline.datamanager)
 
 
 class Training:

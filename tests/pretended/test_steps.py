@@ -99,4 +99,4 @@ def test_the_pretended_gpu_finds_what_a_gpu_refuses_or_waits_for():
             torch.where(there > 1, there, 0.0).sort()
         assert not seen.waits and set(seen.launches) == {"fill_", "gt", "where", "sort"}
     with pytest.raises(RuntimeError, match="after it was switched off"):
-        there + 1
+        torch.add(there, 1)
