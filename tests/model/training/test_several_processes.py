@@ -34,6 +34,7 @@ forked = functools.partial(mp.start_processes, start_method="fork")
 def _two_cores_and_forks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launching.mp, "spawn", forked)
     monkeypatch.setattr("sl_nerfstudio.model.trainer.cores", lambda: 2)
+    monkeypatch.setattr(launching, "cores", lambda: 2)  # one thread each: OpenMP teams do not survive a fork
 
 
 def by_two(root: Path, output: Path, **more: Any) -> SLTrainerConfig:
