@@ -17,6 +17,7 @@ from torch import Tensor
 wp.config.log_level = wp.LOG_WARNING  # else it prints its version, its devices and what it compiles
 
 Argument = Tensor | float | int | Any  # the last one: vectors of Warp
+_BLOCK = 64  # threads: some kernels have a thread per ray, and a few hundred rays should keep many multiprocessors busy
 _watchers: list[Callable[[str], None]] = []
 
 
@@ -56,7 +57,7 @@ def run(kernel: wp.Kernel, dim: int | tuple[int, ...], arguments: tuple[Argument
     ]
     if device.type == "cuda":
         stream = _stream(device.index, torch.cuda.current_stream(device).cuda_stream)
-        wp.launch(kernel, dim, values, stream=stream, record_tape=False)
+        wp.launch(kernel, dim, values, stream=stream, block_dim=_BLOCK, record_tape=False)
     else:
         wp.launch(kernel, dim, values, device="cpu", record_tape=False)
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 _ROWS = 512
@@ -23,18 +24,17 @@ class History(nn.Module):
         """Steps between two entries."""
         self.register_buffer("state", torch.tensor([self._used, self.every]))  # the same two, for the checkpoint
         self.register_load_state_dict_post_hook(_read_state)
+        self.register_state_dict_pre_hook(_write_state)
 
     @torch.no_grad()
-    def add(self, step: int, values: Mapping[str, Tensor | float]) -> None:
+    def add(self, step: int, values: Mapping[str, Float[Tensor, ""]]) -> None:
         """Append one row; missing values are NaN. When the table is full, every other row is removed.
 
         Values on a GPU stay there, so that the host need not wait for them.
         """
         row = self.table[self._used]
+        row[1:] = torch.stack([values.get(name, row[0]) for name in self.names])  # unused rows are NaN
         row[0].fill_(step)
-        for place, name in zip(row[1:], self.names, strict=True):
-            value = values.get(name, float("nan"))
-            place.copy_(value) if isinstance(value, Tensor) else place.fill_(value)
         self._used += 1
         if self._used == _ROWS:
             kept = self.table[::2].clone()
@@ -42,8 +42,6 @@ class History(nn.Module):
             self.table[: len(kept)] = kept
             self._used = len(kept)
             self.every *= 2
-        self.state[0].fill_(self._used)
-        self.state[1].fill_(self.every)
 
     def latest(self, name: str) -> float:
         """The value of the last row, NaN if there is none."""
@@ -53,6 +51,11 @@ class History(nn.Module):
         """Columns by name, `step` first."""
         rows = self.table[: self._used].cpu()
         return {name: rows[:, i].tolist() for i, name in enumerate(("step", *self.names))}
+
+
+def _write_state(history: History, *_: object) -> None:
+    """Before a checkpoint is written."""
+    history.state.copy_(torch.tensor([history._used, history.every]))
 
 
 def _read_state(history: History, _: object) -> None:

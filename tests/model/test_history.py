@@ -4,14 +4,19 @@ import math
 from itertools import pairwise
 
 import pytest
+import torch
 
 from sl_nerfstudio.model.history import History
+
+
+def row(loss: float, rmse: float) -> dict[str, torch.Tensor]:
+    return {"loss": torch.tensor(loss, dtype=torch.float64), "rmse": torch.tensor(rmse)}
 
 
 def filled(count: int) -> History:
     history = History(["loss", "rmse"])
     for step in range(count):
-        history.add(step, {"loss": 1.0 / (1 + step), "rmse": float(step)})
+        history.add(step, row(1.0 / (1 + step), step))
     return history
 
 
@@ -31,7 +36,7 @@ def test_entries_get_sparser_as_a_run_gets_longer():
     history, added = History(["loss"]), 0
     for step in range(10_000):
         if step % history.every == 0:
-            history.add(step, {"loss": 0.0})
+            history.add(step, {"loss": torch.tensor(0.0)})
             added += 1
     steps = history.curves()["step"]
     assert added < 1200 and history.every == 20
@@ -45,12 +50,12 @@ def test_a_checkpoint_continues_without_a_difference():
     second.load_state_dict(first.state_dict())
     assert second.every == first.every and second.curves() == first.curves()
     for step in range(600, 1000):
-        second.add(step, {"loss": 1.0 / (1 + step), "rmse": float(step)})
+        second.add(step, row(1.0 / (1 + step), step))
     assert second.curves() == whole.curves() and second.every == whole.every
 
 
 def test_missing_values_are_nan_and_unknown_names_are_ignored():
     history = History(["loss", "rmse"])
-    history.add(3, {"loss": 2.0, "other": 1.0})
+    history.add(3, {"loss": torch.tensor(2.0), "other": torch.tensor(1.0)})
     curves = history.curves()
     assert curves["step"] == [3.0] and curves["loss"] == [2.0] and math.isnan(curves["rmse"][0])

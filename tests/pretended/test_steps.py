@@ -51,7 +51,7 @@ def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, ba
                 loss, terms, metrics = training.step()
             if step not in (0, RENDERED_FROM):  # constants are copied once
                 assert not seen.waits, f"step {step}: {dict(seen.waits)}"
-            assert seen.launches.total() > 100
+            assert seen.launches.total() > 20
         assert loss.device.type == "cuda" and loss.isfinite()
         assert "coordinates" in terms and metrics["coordinate_px"].isfinite()
         moved = {name for name, x in training.model.named_parameters() if not torch.equal(x, before[name])}

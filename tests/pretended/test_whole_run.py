@@ -32,13 +32,26 @@ def test_a_whole_run(begin, tmp_path):
         assert all(x.device.type == "cuda" for x in found.values())
         for name, value in wanted.items():
             torch.testing.assert_close(found[name].cpu(), value, rtol=0, atol=0, equal_nan=True, msg=name)
+        assert _recordable(again)
         again.done = 5
         assert torch.equal(again.step()[0], training.step()[0])  # also the optimisers' state
     here = begin("sl-neus", lambda config: setattr(config, "load_checkpoint", saved), device="cpu")
     for name, value in here.model.state_dict().items():
         torch.testing.assert_close(value, wanted[name], rtol=0, atol=0, equal_nan=True, msg=name)
+    assert not _recordable(here)
     here.done = 5
     assert here.step()[0].isfinite()
+
+
+def _recordable(training):
+    """Whether torch's optimisers let a CUDA graph record them: the checkpoint says what was right where it was written."""
+    (flag,) = {group["capturable"] for group in training.trainer.optimizers.optimizers["mlp"].param_groups}
+    return flag
+
+
+def test_the_gpus_of_apple_are_refused(begin):
+    with pytest.raises(UserError, match=r"device-type mps: Apple's GPUs do not compute in float64.* on the CPU"):
+        begin("sl-neus", device="mps")
 
 
 def _evaluates(training, folder):

@@ -132,6 +132,12 @@ def _three_steps(rank: int, folder: Path) -> None:
             optimiser.step()
             optimiser.zero_grad()
     assert greatest(rank, "cpu") == 1
+    buffer = TableGradient.of(table)
+    buffer.attach(table)
+    buffer.marks = torch.zeros(0, dtype=torch.uint8)  # as on a GPU
+    buffer.buffer.copy_(gradients(rank, 9)[0])
+    average_gradients([table])
+    torch.testing.assert_close(buffer.buffer, (gradients(0, 9)[0] + gradients(1, 9)[0]) / 2)
     torch.save([table.detach(), matrix.detach()], folder / f"{rank}.pt")
 
 
