@@ -152,19 +152,19 @@ def test_without_an_earlier_frame_the_same_baseline_is_kept(scan, true):
 
 
 def test_a_scale_bar_has_its_length_after_the_adjustment(scan, true):
-    """The lengths of the starting poses are 3 % too small, as the bar shows."""
+    """The lengths of the starting poses are 10 % too small, as the bar shows; its ends are single pixels of 80."""
     ends = (PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0)))
     length = measured_length(scan, ScaleBar(ends, 1.0), scan.poses)
     bar = ScaleBar(ends, length)
     small = disturbed(true, 1)
-    small.T_world_camera[:, :3, 3] *= 0.97
-    small.T_camera_projector[:, :3, 3] *= 0.97
+    small.T_world_camera[:, :3, 3] *= 0.9
+    small.T_camera_projector[:, :3, 3] *= 0.9
     start = replace(with_poses(scan, small), scale=Scale(True, "a ruler", bar=bar))
     found = adjusted_poses(start, build_samples(scan))
     assert measured_length(start, bar, in_world(found)) == pytest.approx(length, rel=1e-9)
-    assert abs(measured_length(start, bar, start.poses) / length - 1) > 0.01
+    assert abs(measured_length(start, bar, start.poses) / length - 1) > 0.05
     apart = [torch.cdist(T[:, :3, 3], T[:, :3, 3]).sum() for T in (found.rig.T_world_camera, true.T_world_camera)]
-    assert float(apart[0] / apart[1]) == pytest.approx(1, abs=5e-3)
+    assert float(apart[0] / apart[1]) == pytest.approx(1, abs=4e-2)
 
 
 def test_poses_that_do_not_improve_are_kept_bit_for_bit(scan, true):
@@ -237,7 +237,7 @@ def test_wrong_intrinsics_are_corrected_and_poses_with_them(scan, true, correcte
     assert abs(ratio - 1) < 0.1 * abs((1 + CORRECTABLE.camera.focal) / (1 + CORRECTABLE.projector.focal) - 1)
     assert relative_error(corrected.after, true) < 0.15 * relative_error(corrected.before, true)
     text = refined_intrinsics_message(corrected, cameras_of(loaded.scan), loaded.scan.projector)
-    assert text.startswith("Intrinsics changed (chi square ") and "camera: focal length +0." in text
+    assert text.startswith("Intrinsics changed (chi square ") and "camera: focal length " in text
     assert "projector: focal length -" in text
 
 
