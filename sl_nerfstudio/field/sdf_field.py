@@ -176,8 +176,9 @@ class SDFField(nn.Module):
         return self._compiled[name]
 
     def _buffer(self) -> TableGradient | None:
-        """The table's persistent gradient buffer, if the compiled kernels write to one."""
-        return None if self.backend == "torch" else TableGradient.of(self.encoding.table)
+        """The table's persistent gradient buffer, if there will be a gradient and compiled kernels write to it."""
+        wanted = torch.is_grad_enabled() and self.backend != "torch"
+        return TableGradient.of(self.encoding.table) if wanted else None
 
 
 def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:

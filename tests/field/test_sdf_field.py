@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
+from sl_nerfstudio.field.table_gradient import TableGradient
 from sl_nerfstudio.field.torch_backend import knee
 from tests.field.fields import make_field, plain_sdf, points_around, relative
 
@@ -113,6 +114,16 @@ def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> No
     assert bool(f[17].isnan()) and bool(n[17].isnan().any())
     others = torch.arange(200) != 17
     torch.testing.assert_close(f[others].detach(), clean[others])
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
+def test_without_gradients_there_is_no_buffer_for_them(backend: str) -> None:
+    field, p = make_field(backend), points_around(50).float()
+    with torch.inference_mode():
+        f, n = field.sdf_and_gradient(p)
+    assert TableGradient.known(field.encoding.table) is None
+    got, normal = field.sdf_and_gradient(p)
+    assert torch.equal(f, got.detach()) and torch.equal(n, normal.detach())
 
 
 def test_infinite_points_do_not_crash_the_compiled_kernels() -> None:
