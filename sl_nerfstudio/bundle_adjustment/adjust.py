@@ -19,9 +19,9 @@ from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
 from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
-from sl_nerfstudio.bundle_adjustment.residuals import Observations, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import Observations, Residuals, linearise, residuals_of, viewing_cosines
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
+from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of, noise_ratios
 from sl_nerfstudio.bundle_adjustment.self_calibration import (
     UNKNOWNS,
     SelfCalibration,
@@ -136,7 +136,7 @@ def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
         target = s.kernel.medians * frame_medians(r, found.pairs, start.frames)
         noise = noise_of(r, float(torch.minimum(found.widths, target).min()), s.kernel)
         widths = narrowed(found.widths, target, s.kernel).clamp_min(s.kernel.noises * noise)
-        kernel = Kernel(widths, found.state.anchors.frame, found.pairs)
+        kernel = _kernel(found.state, found.rows, widths, r, problem)
         per_frame = float(r.cross_valid.sum()) / start.frames
         weight = rough_weight(noise, per_frame, s.independent_residuals) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
@@ -149,6 +149,15 @@ def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
         if settled:
             break
     return found
+
+
+def _kernel(
+    state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals, problem: _Problem
+) -> Kernel:
+    """The kernel with the noise that look-ups have by how obliquely a camera sees the surface."""
+    cosine = viewing_cosines(state.rig, state.anchors, rows)
+    ratio = noise_ratios(r, cosine, problem.settings.kernel)
+    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), ratio)
 
 
 @one_library_thread()
@@ -206,7 +215,8 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     state, maps = found.state, problem.maps
     linear = linearise(state.rig, state.anchors, found.rows, maps)
-    r, kernel = linear.residuals, Kernel(found.widths, state.anchors.frame, found.pairs)
+    r = linear.residuals
+    kernel = _kernel(state, found.rows, found.widths, r, problem)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)

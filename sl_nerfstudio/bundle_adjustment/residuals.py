@@ -28,6 +28,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.loops.residuals import cross_residuals, own_residuals, positions
 from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
 from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.geometry.se3 import rotate, transform
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,14 @@ def pixels_of_rows(
     rows = (array(observations.anchor), array(observations.frame))
     positions(n, rig.arrays, *_anchor_arrays(anchors), *rows, uv, in_front)
     return torch.from_numpy(uv), torch.from_numpy(in_front)
+
+
+def viewing_cosines(rig: Rig, anchors: Anchors, observations: Observations) -> Float[Tensor, "rows"]:
+    """Cosine between the surface's normal and the line of sight of the camera that looks an anchor up."""
+    T, i = rig.T_world_camera, anchors.frame
+    p_world = transform(T[i], anchors.depth[:, None] * anchors.d_camera)[observations.anchor]
+    normal = rotate(T[i], anchors.normal)[observations.anchor]
+    return torch.nn.functional.cosine_similarity(normal, T[observations.frame, :3, 3] - p_world, dim=-1)
 
 
 def _residuals(

@@ -30,6 +30,7 @@ class Kernel:
     width: Float[Tensor, "frames"]  # projector pixels
     frame: Int[Tensor, "anchors"]
     pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks it up
+    noise_ratio: Float[Tensor, "rows"] | None = None  # noise of each look-up over the usual one: as much wider
 
     @property
     def narrowest(self) -> float:
@@ -64,7 +65,9 @@ class Kernel:
         return self.narrowest**2 * sum(float(geman_mcclure_cost(r2 / w2).sum()) for r2, w2 in (own, cross))
 
     def _squares(self) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
-        return self.width[self.frame] ** 2, self.width[self.pair].amax(0) ** 2
+        cross = self.width[self.pair].amax(0)
+        cross = cross if self.noise_ratio is None else cross * self.noise_ratio
+        return self.width[self.frame] ** 2, cross**2
 
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
@@ -89,3 +92,21 @@ def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
     return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)
+
+
+def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSettings) -> Float[Tensor, "rows"]:
+    """Noise of each look-up over that of all, from the residuals of those that see their surface as obliquely.
+
+    `cosine`: between the surface's normal and the line of sight. Classes hold equally many look-ups.
+    """
+    size, known = r.cross.norm(dim=-1), r.cross_valid
+    if not known.any():
+        return torch.ones_like(size)
+    shares = np.linspace(0, 1, settings.obliqueness_classes + 1)[1:-1]
+    group = torch.bucketize(cosine, torch.from_numpy(np.quantile(array(cosine[known]), shares)))
+    usual, ratio = size[known].median(), torch.ones_like(size)
+    for k in range(settings.obliqueness_classes):
+        mine = group == k
+        if (mine & known).any():
+            ratio[mine] = size[mine & known].median() / usual.clamp_min(settings.noise_floor_px)
+    return ratio.clamp_min(settings.least_noise_ratio)

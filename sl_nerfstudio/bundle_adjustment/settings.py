@@ -39,6 +39,10 @@ class KernelSettings:
     """Smallest width, as a multiple of the estimated noise."""
     fastest: float = 1.4
     """Largest factor by which a kernel narrows in one step."""
+    obliqueness_classes: int = 8
+    """Classes of look-ups, by the cosine at which the camera sees the surface, each of which has its own noise."""
+    least_noise_ratio: float = 0.5
+    """Smallest noise of such a class, relative to that of all look-ups."""
     least_curvature: float = 0.2
     """Smallest share of what weights say that residuals may really say: with less, most of them do not fit at all."""
     noise_floor_px: float = 0.01

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of
+from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of, noise_ratios
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 
 SETTINGS = KernelSettings()
@@ -95,3 +95,23 @@ def test_the_noise_is_the_robust_sigma_of_the_inliers():
     assert noise_of(r, 0.9, SETTINGS) == pytest.approx(0.3, rel=0.03)
     exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
     assert noise_of(exact, 0.9, SETTINGS) == SETTINGS.noise_floor_px
+
+
+def test_look_ups_that_see_obliquely_are_as_noisy_as_their_residuals_say():
+    """Residuals three times as large below a cosine of 0.5: their kernel is as much wider, their weight smaller."""
+    generator = torch.Generator().manual_seed(3)
+    cosine = torch.rand(20_000, generator=generator, dtype=torch.float64)
+    noise = torch.where(cosine < 0.5, 0.3, 0.1).double()
+    cross = noise[:, None] * torch.randn(20_000, 2, generator=generator, dtype=torch.float64)
+    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20_000, dtype=torch.bool))
+    ratio = noise_ratios(r, cosine, SETTINGS)
+    assert ratio[cosine < 0.48].median() / ratio[cosine > 0.52].median() == pytest.approx(3.0, rel=0.1)
+    pair = torch.zeros(2, 20_000, dtype=torch.long)
+    one = Kernel(torch.tensor([1.0], dtype=torch.float64), torch.tensor([0]), pair, ratio)
+    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
+    assert torch.allclose(one.weights(exact)[1], 1 / ratio**2)
+
+
+def test_without_any_look_up_all_count_alike():
+    none = Residuals(torch.zeros(1, 2).double(), torch.zeros(3, 2).double(), torch.zeros(3, dtype=torch.bool))
+    assert (noise_ratios(none, torch.rand(3).double(), SETTINGS) == 1).all()
