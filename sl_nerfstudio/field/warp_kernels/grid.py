@@ -240,10 +240,12 @@ def scatter(
     if weight == 0.0:
         return
     column = FIRST + FEATURES * level
-    cell = cell_of(places, smooth, level, p[i])
     d = vec8()
     for j in range(FEATURES):
         d[j] = weight * de[i, column + j]
+    if i < first and wp.dot(d, d) == 0.0:
+        return  # most samples of a sharp surface: in free space, or deep behind it
+    cell = cell_of(places, smooth, level, p[i])
     along = vec8()
     direction = wp.vec3()
     if i >= first:
