@@ -1,6 +1,6 @@
 """What fewer digits in a GPU's matrix products do to the surface: TF32 and bfloat16, emulated on the CPU.
 
-python -m benchmarks.precision [--steps 250] [--output benchmarks/results/precision.json]
+python -m benchmarks.sensitivity.precision [--steps 250] [--output FILE]
 
 The factors of every float32 product (`mm`, `addmm`, `bmm`) are rounded as the GPU's units round them, to 11 bits (TF32)
 or 8 (bfloat16); sums stay float32. All else of the training is the same, random numbers included. The field is smaller
