@@ -44,7 +44,7 @@ def test_a_whole_run(begin, tmp_path):
 
 
 def _recordable(training):
-    """Whether torch's optimisers let a CUDA graph record them: the checkpoint says what was right where it was written."""
+    """Whether torch's optimisers let a CUDA graph record them: the file says what was right elsewhere."""
     (flag,) = {group["capturable"] for group in training.trainer.optimizers.optimizers["mlp"].param_groups}
     return flag
 

@@ -92,7 +92,7 @@ class StepGraph:
         if self._replay is None:
             try:
                 self._replay, self._result = self._recorder.record(self._work)
-            except RuntimeError as error:
+            except (RuntimeError, AttributeError) as error:  # of CUDA; of a torch without what is called
                 raise NotRecordedError(last_line(error)) from error
         self._replay()
         return self._result
