@@ -127,8 +127,8 @@ def _scan(config: Config) -> Path:
 def report(rows: list[Row]) -> str:
     """All rows as a table."""
     lines = [
-        f"{'size':10s}{'backend':9s}{'launches':>9s}{'most':>6s}{'of Warp':>9s}{'waits':>7s}{'between':>9s}{'refresh':>9s}"
-        f"{'graph':>7s}"
+        f"{'size':10s}{'backend':9s}{'launches':>9s}{'most':>6s}{'of Warp':>9s}{'waits':>7s}"
+        f"{'between':>9s}{'refresh':>9s}{'graph':>7s}"
     ]
     for r in rows:
         figures = f"{r.launches:9d}{r.most:6d}{r.of_warp:9d}{r.waits:7d}{r.between:9d}{r.refresh:9d}{r.with_graph:7d}"
