@@ -41,7 +41,7 @@ def test_the_surface_is_near_the_truth(evaluation):
     accuracy, completeness = evaluation["rigid"]["accuracy"], evaluation["rigid"]["completeness"]
     assert accuracy["rmse"] < LARGEST_SURFACE_MM
     assert completeness["median"] < LARGEST_SURFACE_MM
-    assert abs(evaluation["similarity"]["scale"] - 1) < 2e-3
+    assert abs(evaluation["similarity"]["scale"] - 1) < 4e-3
 
 
 def test_poses_of_both_devices_are_near_the_truth(evaluation):
