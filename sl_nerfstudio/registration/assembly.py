@@ -19,7 +19,7 @@ from sl_nerfstudio.registration.increments import log_at
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality, support
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
-from sl_nerfstudio.registration.pairs.slip import screw_motion
+from sl_nerfstudio.registration.pairs.slip import NO_COST, MotionCost, motion_cost, screw_motion
 from sl_nerfstudio.registration.pairs.surface_agreement import Agreement, Side, Tolerance, agreement
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings
@@ -238,13 +238,23 @@ class Assembly:
                 break
         own = first if e.target in first else second
         surface, to_camera = self._sides[e.target].map, own[e.target].inverse()
-        moved = []
+        rises = []
         for sense in (1.0, -1.0):
             M = screw_motion(sense * np.radians(s.slip_deg) * e.slip_direction, surface)
             M = own[e.target] @ M @ to_camera
             S = M @ joint.S_first_second if own is first else joint.S_first_second @ M
-            moved.append(self._misfit_cost(first, second, S, sigmas))
-        return min(moved) < still + self._settings.pair.slip_rise
+            rises.append(self._motion_cost(first, second, joint.S_first_second, S, sigmas).rise)
+        return min(rises) < self._settings.pair.slip_rise
+
+    def _motion_cost(
+        self, first: Component, second: Component, still: Similarity, moved: Similarity, sigmas: float
+    ) -> MotionCost:
+        """What a motion of one component against the other costs, all pairs of frames across together."""
+        width, total = Tolerance(0.0, sigmas), NO_COST
+        for i, j in self._facing(first, second, still):
+            S_i_j = [first[i].inverse() @ S @ second[j] for S in (still, moved)]
+            total = total + motion_cost((self._sides[j], self._sides[i]), *S_i_j, width, self._settings.pair)
+        return total
 
     def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
         """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""

@@ -144,6 +144,8 @@ class PairSettings:
     """slip, in degrees, up to which several pairs together connect frames: an uncertainty like any other"""
     slip_steps: int = 5
     """steps by which the rest of the motion follows each of these rotations"""
+    slip_sigmas: float = 3.0
+    """displacement along its normal, in standard deviations of both surfaces, from which a point notices a motion"""
     slip_rise: float = 0.056
     """rise of the mean robust cost from which a motion is noticed: three standard errors of about 40 independent points
     that each have one standard deviation"""

@@ -4,6 +4,8 @@ A table, or a vase without texture, looks the same after some motions. The norma
 normals makes information where there is none. So the motion that they know least is tried.
 """
 
+from dataclasses import astuple, dataclass
+
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
@@ -27,6 +29,64 @@ def weakest_rotation(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "
     return x
 
 
+@dataclass(frozen=True)
+class MotionCost:
+    """Robust cost of the points that a motion moves along their normals; sums and counts in shares of all points."""
+
+    still: float  # sum of the costs of these points before the motion
+    moved: float  # after it
+    judged_still: float  # how many of these points the other frame can judge
+    judged_moved: float
+    judged: float  # how many of all points it can judge
+
+    def __add__(self, other: "MotionCost") -> "MotionCost":
+        """Of two pairs of frames together."""
+        return MotionCost(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def rise(self) -> float:
+        """Rise of their mean cost, in the units of a rise of all points: few points must notice a motion all the more.
+
+        The standard error of a mean over a share of the points is larger by the root of that share.
+        """
+        if min(self.judged_still, self.judged_moved) <= 0:
+            return 0.0
+        rise = self.moved / self.judged_moved - self.still / self.judged_still
+        return rise * float(np.sqrt(self.judged_still / self.judged))
+
+
+NO_COST = MotionCost(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def motion_cost(
+    sides: tuple[Side, Side], still: Similarity, moved: Similarity, kernel: Tolerance, settings: PairSettings
+) -> MotionCost:
+    """What a motion from one similarity to another costs, of the points of both frames that can tell.
+
+    Points that stay on their own tangent plane tell nothing, whatever they are: those of a vase that turns about its
+    axis, or of the table below it.
+    """
+    source, target = sides
+    both = Hypotheses.joined([Hypotheses.of(still), Hypotheses.of(moved)])
+    all_judged = float(agreement(source, target, both[[0]], kernel, kernel, settings.agreement).judged[0])
+    some = (
+        _moved_points(source, still, moved, settings.slip_sigmas),
+        _moved_points(target, still.inverse(), moved.inverse(), settings.slip_sigmas),
+    )
+    share = (len(some[0].points) / len(source.points) + len(some[1].points) / len(target.points)) / 2
+    found = agreement(*some, both, kernel, kernel, settings.agreement)
+    before, after = (share * found.judged).tolist()
+    return MotionCost(float(found.cost[0]) * before, float(found.cost[1]) * after, before, after, all_judged)
+
+
+def _moved_points(side: Side, still: Similarity, moved: Similarity, sigmas: float) -> Side:
+    """The points that a motion moves along their normals by more than some standard deviations of both surfaces."""
+    step = moved.points(side.points) - still.points(side.points)
+    along = np.abs((step * (side.normals @ still.R.T)).sum(1))
+    some = along > sigmas * 2**0.5 * still.scale * side.sigma
+    return Side(side.map, side.points[some], side.normals[some], side.sigma[some])
+
+
 def slip_deg(
     sides: tuple[Side, Side],
     S_target_source: Similarity,
@@ -36,12 +96,13 @@ def slip_deg(
 ) -> float:
     """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
 
-    A motion is noticed where the mean robust cost of the points rises, with a kernel as narrow as the surfaces agree,
-    though everything but its rotation may follow: the axis of a surface of revolution is never known exactly.
+    A motion is noticed where the mean robust cost of the points that it moves rises, with a kernel as narrow as the
+    surfaces agree, though everything but its rotation may follow: the axis of a surface of revolution is never known
+    exactly.
     """
     surface, unit = sides[1].map, Tolerance(0.0, common.sigmas / settings.common_rms)
     angles = np.array([0.0, *settings.slip_angles_deg])
-    least = np.full(len(angles), np.inf)
+    rise = np.full(len(angles) - 1, np.inf)
     for sense in (1.0, -1.0):
         moved = Hypotheses.joined(
             [
@@ -51,9 +112,11 @@ def slip_deg(
         )
         for _ in range(settings.slip_steps):
             moved = _followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas), settings)
-        least = np.minimum(least, agreement(*sides, moved, unit, unit, settings.agreement).cost)
-    noticed = np.flatnonzero(least > least[0] + settings.slip_rise)
-    return float(angles[noticed[0] - 1] if len(noticed) else angles[-1])
+        still, *others = (moved.similarity(k) for k in range(len(angles)))
+        rises = [motion_cost(sides, still, other, unit, settings).rise for other in others]
+        rise = np.minimum(rise, rises)
+    noticed = np.flatnonzero(rise > settings.slip_rise)
+    return float(angles[noticed[0]] if len(noticed) else angles[-1])
 
 
 def _followed(

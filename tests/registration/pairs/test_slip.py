@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.registration.increments import exp_at
 from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.slip import screw_motion, weakest_rotation
+from sl_nerfstudio.registration.pairs.slip import MotionCost, screw_motion, weakest_rotation
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.registration.analytic_clouds import difference
@@ -108,3 +108,33 @@ def test_a_ball_slips():
     ball = build_surface_map(cloud_of_depth(lambda x, y: 4 * (1 - np.sqrt(1 - 0.9 * (x**2 + y**2)) * 0.3), 60))
     found = register_pair((ball, ball), (0, 1), PAIR.nearby, np.random.default_rng(0))
     assert found.rotation_sigma_deg > found.slip_deg > 0
+
+
+def depth_of_table(ridge: bool):
+    """A table, with a ridge of 3 % of its area far from the middle, or without."""
+
+    def depth(x, y):
+        height = 0.12 * np.clip(1 - np.abs(x - 0.3) / 0.06, 0, None) * (np.abs(y - 0.1) < 0.15)
+        return 3 - (height if ridge else 0 * x)
+
+    return build_surface_map(cloud_of_depth(depth, 120))
+
+
+def test_a_few_points_that_a_motion_moves_hold_a_table_in_place():
+    """All points but those of the ridge stay on the table's plane, whatever the motion; their number says nothing."""
+    bare, held = (
+        register_pair((one, one), (0, 1), PAIR.nearby, np.random.default_rng(0))
+        for one in (depth_of_table(False), depth_of_table(True))
+    )
+    assert bare is not None and held is not None
+    assert bare.slip_deg == pytest.approx(PAIR.slip_angles_deg[-1])
+    assert held.slip_deg <= PAIR.bounded_slip_deg
+
+
+def test_fewer_points_must_notice_a_motion_all_the_more():
+    """The rise of a mean in its standard errors, which go with the root of the number of points."""
+    few, many = MotionCost(0.02, 0.08, 0.1, 0.1, 0.9), MotionCost(0.18, 0.72, 0.9, 0.9, 0.9)
+    assert few.rise == pytest.approx(0.6 / 3)
+    assert many.rise == pytest.approx(0.6)
+    assert (few + many).rise == pytest.approx(0.6 * (1 / 1.8) ** 0.5)
+    assert MotionCost(0.0, 0.0, 0.0, 0.0, 0.9).rise == 0
