@@ -252,8 +252,9 @@ class Assembly:
         """What a motion of one component against the other costs, all pairs of frames across together."""
         width, total = Tolerance(0.0, sigmas), NO_COST
         for i, j in self._facing(first, second, still):
-            S_i_j = [first[i].inverse() @ S @ second[j] for S in (still, moved)]
-            total = total + motion_cost((self._sides[j], self._sides[i]), *S_i_j, width, self._settings.pair)
+            before, after = (first[i].inverse() @ S @ second[j] for S in (still, moved))
+            sides = self._sides[j], self._sides[i]
+            total = total + motion_cost(sides, before, after, width, self._settings.pair)
         return total
 
     def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
