@@ -19,7 +19,7 @@ from sl_nerfstudio.registration.increments import log_at
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality, support
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
-from sl_nerfstudio.registration.pairs.slip import NO_COST, MotionCost, motion_cost, screw_motion
+from sl_nerfstudio.registration.pairs.slip import MotionCost, motion_cost, screw_motion
 from sl_nerfstudio.registration.pairs.surface_agreement import Agreement, Side, Tolerance, agreement
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings
@@ -243,18 +243,18 @@ class Assembly:
             M = screw_motion(sense * np.radians(s.slip_deg) * e.slip_direction, surface)
             M = own[e.target] @ M @ to_camera
             S = M @ joint.S_first_second if own is first else joint.S_first_second @ M
-            rises.append(self._motion_cost(first, second, joint.S_first_second, S, sigmas).rise)
+            rises.append(self._rise(first, second, joint.S_first_second, S, sigmas))
         return min(rises) < self._settings.pair.slip_rise
 
-    def _motion_cost(
-        self, first: Component, second: Component, still: Similarity, moved: Similarity, sigmas: float
-    ) -> MotionCost:
-        """What a motion of one component against the other costs, all pairs of frames across together."""
-        width, total = Tolerance(0.0, sigmas), NO_COST
+    def _rise(self, first: Component, second: Component, still: Similarity, moved: Similarity, sigmas: float) -> float:
+        """How much a motion of one component against the other costs, all pairs of frames across together."""
+        width, total = Tolerance(0.0, sigmas), None
         for i, j in self._facing(first, second, still):
-            S_i_j = [first[i].inverse() @ S @ second[j] for S in (still, moved)]
-            total = total + motion_cost((self._sides[j], self._sides[i]), *S_i_j, width, self._settings.pair)
-        return total
+            before, after = (first[i].inverse() @ S @ second[j] for S in (still, moved))
+            sides = self._sides[j], self._sides[i]
+            one: MotionCost = motion_cost(sides, before, after, width, self._settings.pair)
+            total = one if total is None else total + one
+        return 0.0 if total is None else total.rise
 
     def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
         """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
+from sl_nerfstudio.registration.pairs.surface_agreement import Agreement, Side, Tolerance, agreement
 from sl_nerfstudio.registration.settings import PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
@@ -30,53 +30,70 @@ def weakest_rotation(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "
 
 
 @dataclass(frozen=True)
-class MotionCost:
-    """Robust cost of the points that a motion moves along their normals; sums and counts in shares of all points."""
+class CostOfPoints:
+    """Robust cost of some points before and after a motion; sums and counts in shares of all points."""
 
-    still: float  # sum of the costs of these points before the motion
-    moved: float  # after it
-    judged_still: float  # how many of these points the other frame can judge
+    still: float  # sum of the costs before the motion
+    moved: float
+    judged_still: float  # how many of the points the other frame can judge
     judged_moved: float
-    judged: float  # how many of all points it can judge
 
-    def __add__(self, other: "MotionCost") -> "MotionCost":
+    def __add__(self, other: "CostOfPoints") -> "CostOfPoints":
         """Of two pairs of frames together."""
-        return MotionCost(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+        return CostOfPoints(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
     @property
     def rise(self) -> float:
-        """Rise of their mean cost, in the units of a rise of all points: few points must notice a motion all the more.
-
-        The standard error of a mean over a share of the points is larger by the root of that share.
-        """
+        """Of the mean cost; 0 where nothing is judged."""
         if min(self.judged_still, self.judged_moved) <= 0:
             return 0.0
-        rise = self.moved / self.judged_moved - self.still / self.judged_still
-        return rise * float(np.sqrt(self.judged_still / self.judged))
+        return self.moved / self.judged_moved - self.still / self.judged_still
 
 
-NO_COST = MotionCost(0.0, 0.0, 0.0, 0.0, 0.0)
+@dataclass(frozen=True)
+class MotionCost:
+    """What a motion costs: all points, and those that it moves along their normals."""
+
+    every: CostOfPoints
+    telling: CostOfPoints
+
+    def __add__(self, other: "MotionCost") -> "MotionCost":
+        """Of two pairs of frames together."""
+        return MotionCost(self.every + other.every, self.telling + other.telling)
+
+    @property
+    def rise(self) -> float:
+        """The larger rise, in the units of a rise of all points: few points must notice a motion all the more.
+
+        The standard error of a mean over a share of the points is larger by the inverse root of that share.
+        """
+        share = self.telling.judged_still / max(self.every.judged_still, 1e-9)
+        return max(self.every.rise, self.telling.rise * float(np.sqrt(share)))
 
 
 def motion_cost(
     sides: tuple[Side, Side], still: Similarity, moved: Similarity, kernel: Tolerance, settings: PairSettings
 ) -> MotionCost:
-    """What a motion from one similarity to another costs, of the points of both frames that can tell.
+    """What a motion from one similarity to another costs the points of both frames.
 
     Points that stay on their own tangent plane tell nothing, whatever they are: those of a vase that turns about its
     axis, or of the table below it.
     """
     source, target = sides
     both = Hypotheses.joined([Hypotheses.of(still), Hypotheses.of(moved)])
-    all_judged = float(agreement(source, target, both[[0]], kernel, kernel, settings.agreement).judged[0])
     some = (
         _moved_points(source, still, moved, settings.slip_sigmas),
         _moved_points(target, still.inverse(), moved.inverse(), settings.slip_sigmas),
     )
     share = (len(some[0].points) / len(source.points) + len(some[1].points) / len(target.points)) / 2
-    found = agreement(*some, both, kernel, kernel, settings.agreement)
+    every = _cost_of(agreement(*sides, both, kernel, kernel, settings.agreement), 1.0)
+    return MotionCost(every, _cost_of(agreement(*some, both, kernel, kernel, settings.agreement), share))
+
+
+def _cost_of(found: Agreement, share: float) -> CostOfPoints:
+    """Of points that are a share of all; `found` is before and after the motion."""
     before, after = (share * found.judged).tolist()
-    return MotionCost(float(found.cost[0]) * before, float(found.cost[1]) * after, before, after, all_judged)
+    return CostOfPoints(float(found.cost[0]) * before, float(found.cost[1]) * after, before, after)
 
 
 def _moved_points(side: Side, still: Similarity, moved: Similarity, sigmas: float) -> Side:
@@ -96,9 +113,9 @@ def slip_deg(
 ) -> float:
     """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
 
-    A motion is noticed where the mean robust cost of the points that it moves rises, with a kernel as narrow as the
-    surfaces agree, though everything but its rotation may follow: the axis of a surface of revolution is never known
-    exactly.
+    A motion is noticed where the mean robust cost of all points, or of those that it moves, rises, with a kernel as
+    narrow as the surfaces agree, though everything but its rotation may follow: the axis of a surface of revolution is
+    never known exactly.
     """
     surface, unit = sides[1].map, Tolerance(0.0, common.sigmas / settings.common_rms)
     angles = np.array([0.0, *settings.slip_angles_deg])

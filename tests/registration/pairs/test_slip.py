@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.registration.increments import exp_at
 from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.slip import MotionCost, screw_motion, weakest_rotation
+from sl_nerfstudio.registration.pairs.slip import CostOfPoints, MotionCost, screw_motion, weakest_rotation
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.registration.analytic_clouds import difference
@@ -133,8 +133,9 @@ def test_a_few_points_that_a_motion_moves_hold_a_table_in_place():
 
 def test_fewer_points_must_notice_a_motion_all_the_more():
     """The rise of a mean in its standard errors, which go with the root of the number of points."""
-    few, many = MotionCost(0.02, 0.08, 0.1, 0.1, 0.9), MotionCost(0.18, 0.72, 0.9, 0.9, 0.9)
+    every = CostOfPoints(0.18, 0.24, 0.9, 0.9)
+    few = MotionCost(every, CostOfPoints(0.02, 0.08, 0.1, 0.1))
     assert few.rise == pytest.approx(0.6 / 3)
-    assert many.rise == pytest.approx(0.6)
-    assert (few + many).rise == pytest.approx(0.6 * (1 / 1.8) ** 0.5)
-    assert MotionCost(0.0, 0.0, 0.0, 0.0, 0.9).rise == 0
+    assert MotionCost(every, every).rise == pytest.approx(0.06 / 0.9)
+    assert (few + few).rise == pytest.approx(few.rise)
+    assert MotionCost(every, CostOfPoints(0.0, 0.0, 0.0, 0.0)).rise == pytest.approx(0.06 / 0.9)
