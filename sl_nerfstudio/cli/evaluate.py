@@ -82,6 +82,7 @@ def _evaluate(config: EvalConfig) -> None:
     evaluation = evaluate(
         inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
         config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
+        true_units=inputs.true_units,
     )  # fmt: skip
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
     capture = _next_capture(evaluation, inputs)

@@ -46,11 +46,14 @@ class Evaluation:
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
     cross: CrossFrameAgreement | None = None  # of the frames with each other, under the evaluated poses
     completeness: Completeness | None = None
+    true_units: str | None = None  # what the truth's files say
 
     @property
     def truth_units(self) -> str:
         """Unit of distances from the truth; a scan of unknown unit is scaled to that of the truth."""
-        return "units of the truth" if self.units == "arbitrary" else self.units
+        if self.units != "arbitrary":
+            return self.units
+        return self.true_units if self.true_units not in (None, "arbitrary") else "units of the truth"
 
     @property
     def alignment(self) -> str:
@@ -70,11 +73,13 @@ def evaluate(
     seed: int = 0,
     on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None = None,
     sigma: Sequence[PoseSigma | None] = (),
+    true_units: str | None = None,
 ) -> Evaluation:
     """Evaluate `mesh` with `poses` on `scan`; `sigma` is the stated uncertainty of the poses, if they are rough.
 
-    `on_frame` is called with each frame and its pixels in turn (to make pictures). Raises UserError if the mesh cannot
-    be a surface of this scan.
+    `true_units`, as the files of the truth state it, names distances where the scan's own unit is unknown. `on_frame`
+    is called with each frame and its pixels in turn (to make pictures). Raises UserError if the mesh cannot be a
+    surface of this scan.
     """
     surface = IndexedMesh(mesh)
     agreement = _agreement(surface, scan, poses, on_frame)
@@ -95,6 +100,7 @@ def evaluate(
         starting_poses=not moved,
         cross=compare_scan_frames(scan, poses, sigma or [None] * len(scan.frames)),
         completeness=assess_completeness(surface, agreement),
+        true_units=true_units,
     )
 
 

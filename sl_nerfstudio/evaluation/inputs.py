@@ -49,6 +49,7 @@ class EvaluationInputs:
     training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
     quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
     joint: JointCovariance | None = None  # of the evaluated poses, if it is known
+    true_units: str | None = None  # of the truth that is compared with, where its files say
 
     @property
     def stated_sigma(self) -> list[PoseSigma | None]:
@@ -77,6 +78,7 @@ def read_inputs(
         scan=scan,
         poses=evaluated,
         true_poses=truth.poses,
+        true_units=truth.units if reference is None else None,
         reference=read_reference(reference or truth.mesh_path, scan, truth.poses or evaluated, samples, seed),
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),

@@ -133,7 +133,8 @@ def read_ground_truth(scan: Scan) -> GroundTruth:
     mesh, transforms = folder / "mesh.ply", folder / TRANSFORMS
     cameras, projectors = _read_both_kinds(transforms, scan) if transforms.exists() else (None, None)
     poses = None if cameras is None or projectors is None else DevicePoses(cameras, projectors)
-    return GroundTruth(mesh if mesh.exists() else None, poses)
+    units = _read(transforms, str(folder)).get("units") if transforms.exists() else None
+    return GroundTruth(mesh if mesh.exists() else None, poses, units if isinstance(units, str) else None)
 
 
 def read_pose_sigmas(path: Path, scan: Scan) -> list[PoseSigma | None]:

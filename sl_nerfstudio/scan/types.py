@@ -157,3 +157,4 @@ class GroundTruth:
 
     mesh_path: Path | None
     poses: DevicePoses | None
+    units: str | None  # of both; may be known where the scan's unit is not

@@ -88,3 +88,4 @@ def test_without_a_unit_the_scale_is_not_an_error() -> None:
     unknown = replace(GOOD, units="arbitrary")
     assert unknown.alignment == "similarity"
     assert (GOOD.truth_units, unknown.truth_units) == ("mm", "units of the truth")
+    assert replace(unknown, true_units="mm").truth_units == "mm"  # the truth's own files say

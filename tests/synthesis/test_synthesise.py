@@ -48,7 +48,7 @@ def test_a_scan_is_faultless_and_complete(make):
     assert check_scan(root) == []
     scan = read_scan(root)
     truth = read_ground_truth(scan)
-    assert len(scan.frames) == 4 and scan.units == "mm"
+    assert len(scan.frames) == 4 and scan.units == truth.units == "mm"
     assert scan.scale == Scale(True, "baseline of frame 0", baseline_of="frame_00000")
     assert truth.mesh_path == root / "ground_truth/mesh.ply"
     assert (root / "pattern.json").is_file()
