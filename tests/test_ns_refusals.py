@@ -1,0 +1,170 @@
+"""ns-train on what it cannot use: a message, status 1, nothing written."""
+
+import copy
+import json
+import math
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.dataparser.tiny_scan import TinyScan
+
+with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
+    warnings.simplefilter("ignore")
+    from nerfstudio.scripts import train as ns_train
+
+from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return TinyScan().write(tmp_path_factory.mktemp("scans") / "sphere")
+
+
+def start(root: Path | None, **settings: Any) -> None:
+    """What ns-train does with its parsed command line."""
+    config = copy.deepcopy(sl_neus.config)
+    config.data = root
+    for name, value in settings.items():
+        setattr(config, name, value)
+    ns_train.main(config)
+
+
+def refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *a: Any, **k: Any
+) -> str:
+    """The message; checks that nothing was written."""
+    empty = tmp_path / "here"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    with pytest.raises(SystemExit) as exit_:
+        start(*a, **k)
+    assert exit_.value.code == 1
+    assert not list(empty.iterdir())
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err
+    return err
+
+
+def edit(root: Path, change: Callable[[dict], Any]) -> None:
+    content = json.loads((root / "transforms.json").read_text())
+    change(content)
+    (root / "transforms.json").write_text(json.dumps(content))
+
+
+def invert_poses(content: dict) -> None:
+    for frame in content["frames"]:
+        for key in ("transform_matrix", "projector_transform_matrix"):
+            frame[key] = np.linalg.inv(frame[key]).tolist()
+
+
+def set_in_frame(number: int, key: str, value: Any) -> Callable[[Path], None]:
+    return lambda root: edit(root, lambda content: content["frames"][number].update({key: value}))
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 250], [0, 0, 0, 1]]
+NOT_A_NUMBER = [[math.nan, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 250], [0, 0, 0, 1]]
+FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated image": (lambda r: truncate(r / "images/frame_00001.png"), "images/frame_00001.png"),
+    "missing coords": (lambda r: (r / "coords/frame_00002.npz").unlink(), "coords/frame_00002.npz"),
+    "mirrored pose": (set_in_frame(1, "transform_matrix", MIRRORED), "transform_matrix"),
+    "NaN pose": (set_in_frame(1, "projector_transform_matrix", NOT_A_NUMBER), "projector_transform_matrix"),
+    "focal length 0": (lambda r: edit(r, lambda c: c.update(fl_x=0)), "fl_x"),
+    "world-to-camera": (lambda r: edit(r, invert_poses), "world"),
+    "empty mask": (
+        lambda r: Image.fromarray(np.zeros((40, 48), np.uint8)).save(r / "masks/frame_00000.png"),
+        "masks/frame_00000.png",
+    ),
+    "path outside": (set_in_frame(0, "file_path", "../images/frame_00000.png"), "file_path"),
+    "one frame": (lambda r: edit(r, lambda c: c.update(frames=c["frames"][:1])), "frame"),
+    "frame twice": (lambda r: edit(r, lambda c: c["frames"].append(c["frames"][0])), "frame_00000"),
+    "no transforms.json": (lambda r: (r / "transforms.json").unlink(), "transforms.json"),
+}
+
+
+@pytest.mark.parametrize("damage, named", FAULTS.values(), ids=FAULTS.keys())
+def test_bad_scans_do_not_start(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    damage: Callable[[Path], Any],
+    named: str,
+) -> None:
+    root = TinyScan().write(tmp_path / "scan")
+    damage(root)
+    message = refused(tmp_path, monkeypatch, capfd, root)
+    assert message.startswith("error: ") and str(root) in message
+    assert named in message and "remedy: " in message
+
+
+@pytest.mark.parametrize(
+    "settings, expected",
+    [
+        ({"max_num_iterations": 0}, "--max-num-iterations 0: at least 1"),
+        ({"load_dir": Path("nowhere")}, "--load-dir nowhere: no checkpoint step-*.ckpt there"),
+        ({"load_checkpoint": Path("none.ckpt")}, "--load-checkpoint none.ckpt: no such file"),
+    ],
+)
+def test_bad_settings_do_not_start(
+    scan: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    settings: dict[str, Any],
+    expected: str,
+) -> None:
+    assert expected in refused(tmp_path, monkeypatch, capfd, scan, **settings)
+
+
+def test_without_a_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    assert "no scan given. Add --data FOLDER" in refused(tmp_path, monkeypatch, capfd, None)
+
+
+def test_truncated_checkpoint(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "step-000000005.ckpt"
+    torch.save({"schedulers": {}, "weights": torch.zeros(1000)}, checkpoint)
+    truncate(checkpoint)
+    message = refused(tmp_path, monkeypatch, capfd, scan, load_dir=tmp_path)
+    assert "step-000000005.ckpt: cannot be read as a checkpoint" in message
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
+def test_a_gpu_that_is_not_there(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    machine = copy.deepcopy(sl_neus_paper.config.machine)
+    machine.device_type = "cuda"
+    assert "--machine.device-type cuda" in refused(tmp_path, monkeypatch, capfd, scan, machine=machine)
+
+
+def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
+    """The installed ns-train, in a separate process."""
+    root = TinyScan(frames=2).write(tmp_path / "scan")
+    (root / "coords/frame_00001.npz").unlink()
+    (tmp_path / "here").mkdir()
+    done = subprocess.run(
+        [str(Path(sys.executable).with_name("ns-train")), "sl-neus", "--data", str(root)],
+        cwd=tmp_path / "here",
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stdout + done.stderr
+    assert "coords/frame_00001.npz" in done.stderr and "remedy:" in done.stderr
+    assert not list((tmp_path / "here").iterdir())
