@@ -87,7 +87,7 @@ def print_tables(evaluation: Evaluation) -> None:
         table = Table(title=f"Distances in {units}", title_justify="left")
         for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):
             table.add_column(column, justify="right" if column.strip() else "left")
-        for name, score in evaluation.surface.items():
+        for name, score in evaluation.comparable.items():
             a, c = score.accuracy, score.completeness
             chamfer, scale = f"{score.chamfer:.3g}", f"{score.scale:.5f}"
             table.add_row(name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale)

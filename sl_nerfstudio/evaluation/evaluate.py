@@ -60,6 +60,12 @@ class Evaluation:
         """The alignment to judge by: rigid, or with scale if the scan's unit is unknown."""
         return "similarity" if self.units == "arbitrary" else "rigid"
 
+    @property
+    def comparable(self) -> dict[str, SurfaceScore]:
+        """The scores that say something: without a known unit, only the one after an alignment with scale."""
+        known = self.units != "arbitrary"
+        return {name: score for name, score in self.surface.items() if known or name == "similarity"}
+
 
 @one_library_thread()
 def evaluate(
