@@ -16,11 +16,13 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from sl_nerfstudio.cores import cores
+from sl_nerfstudio.memory import keep_freed_memory
 
 T = TypeVar("T")
 
 if torch.get_num_threads() > cores():  # torch does not know of quotas
     torch.set_num_threads(cores())
+keep_freed_memory()
 
 _ours: int | None = None  # threads of our own loops while torch has one
 
