@@ -12,7 +12,7 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # numbers of malloc.h
 
 
 def keep_freed_memory() -> bool:
-    """Arrays below 256 MiB come from memory that stays with the process, up to 1 GiB of it unused at the end of the heap.
+    """Arrays below 256 MiB come from memory that stays with the process; up to 1 GiB of it may be unused at its end.
 
     With glibc on Linux, whose `mallopt` this sets (mallopt(3)); elsewhere nothing changes. Returns whether it was set.
     """

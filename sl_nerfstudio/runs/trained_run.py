@@ -21,6 +21,7 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model.training.checkpoints import checkpoints_in, read_checkpoint
 from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
+from sl_nerfstudio.runs.late_compiler import compiler_on_demand
 from sl_nerfstudio.scan import Scan
 
 _SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
@@ -88,7 +89,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
     Raises UserError for anything missing, broken or made by another method.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), compiler_on_demand():
         warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
         from sl_nerfstudio.dataparser.dataparser import load_scan
         from sl_nerfstudio.model.pipeline import SLPipeline, require_together

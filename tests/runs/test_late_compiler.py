@@ -1,0 +1,42 @@
+"""An export loads a run without torch's compiler; what was decorated with it still works."""
+
+import subprocess
+import sys
+
+import torch
+
+from sl_nerfstudio.runs.late_compiler import compiler_on_demand
+
+CODE = """
+import sys
+from sl_nerfstudio.runs.trained_run import load_run
+from pathlib import Path
+try:
+    load_run(Path("nothing.yml"))
+except Exception as error:
+    print(type(error).__name__, "torchvision.ops" in sys.modules, "torch._dynamo" in sys.modules)
+from torchvision.ops.roi_align import is_compile_supported
+print(is_compile_supported("meta"), "torch._dynamo" in sys.modules)
+"""
+
+
+def test_loading_a_run_does_not_import_the_compiler(tmp_path):
+    command = [sys.executable, "-c", CODE]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.splitlines() == ["UserError True False", "False True"]
+
+
+def test_a_function_is_compiled_when_it_is_called_first(monkeypatch):
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda model, **settings: asked.append(settings) or model)
+    with compiler_on_demand():
+
+        @torch.compile(dynamic=True)
+        def twice(x: float) -> float:
+            """Doubles."""
+            return 2 * x
+
+    assert not asked
+    assert [twice(2.0), twice(3.0)] == [4.0, 6.0]
+    assert asked == [{"dynamic": True}]
+    assert twice.__doc__ == "Doubles."
