@@ -1,16 +1,17 @@
 """The vertices of a mesh that a camera sees and a projector lights."""
 
-from dataclasses import dataclass, fields
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.rays import world_pixels
+from sl_nerfstudio.compiled import compiled_range
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices.compiled_view import view_of
+from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.threads import results, split, threads
 
 
 class Occluder:
@@ -36,10 +37,8 @@ class Occluder:
         Rays start two edge lengths away from the surface, along the normal and towards the eye, so that they do not hit
         the triangles they start from.
         """
-        way = eye - points
-        distance = np.sqrt(dot(way, way))[:, None]
-        start = points + self._start * (normals + way / distance)
-        rays = np.concatenate([(start - self._centre) * self._scale, (eye - start) * self._scale], 1).astype(np.float32)
+        rays = np.empty((len(points), 6), np.float32)
+        _write_rays(len(points), points, normals, eye, self._start, self._centre, self._scale, rays)
         return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
@@ -63,33 +62,63 @@ def lit_vertices(
 ) -> LitVertices:
     """The vertices that face both devices and project into image and pattern, and that the mesh hides from neither."""
     views = ((camera, T_world_camera), (projector, T_world_projector))
-    parts = results(
-        [
-            partial(_lit_part, vertices, normals, occluder, np.arange(first, last), *views)
-            for first, last in split(len(vertices), threads(), 1)
-        ]
-    )
-    return LitVertices(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(LitVertices)))
+    packed = np.stack([_packed(device, T) for device, T in views])
+    uv, faces = np.empty((len(vertices), 2, 2)), np.empty(len(vertices), np.bool_)
+    _project_facing(len(vertices), vertices, normals, packed, uv, faces)
+    vertex = np.flatnonzero(faces)
+    for _, T in views:
+        vertex = vertex[~occluder.hidden(vertices[vertex], normals[vertex], np.asarray(T[:3, 3], dtype=np.float64))]
+    uv = uv[vertex]
+    return LitVertices(vertex, uv[:, 0], uv[:, 1])
 
 
-def _lit_part(
-    vertices: Float[ndarray, "v 3"],
-    normals: Float[ndarray, "v 3"],
-    occluder: Occluder,
-    vertex: Int64[ndarray, "n"],
-    *views: tuple[Device, Float[ndarray, "4 4"]],
-) -> LitVertices:
-    """The same for the vertices numbered `vertex`."""
-    for _, T in views:
-        vertex = vertex[dot(T[:3, 3] - vertices[vertex], normals[vertex]) > 0]
-    pixels: list[Float[ndarray, "n 2"]] = []
-    for device, T in views:
-        uv, inside = world_pixels(device, T, vertices[vertex])
-        vertex, pixels = vertex[inside], [found[inside] for found in (*pixels, uv)]
-    for _, T in views:
-        free = ~occluder.hidden(vertices[vertex], normals[vertex], T[:3, 3])
-        vertex, pixels = vertex[free], [found[free] for found in pixels]
-    return LitVertices(vertex, *pixels)
+def _packed(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
+    """A device for compiled loops: its pose's inverse, where it is, parameters, code, and size of the image."""
+    T = np.asarray(T_world_device, dtype=np.float64)
+    R, t = T[:3, :3], T[:3, 3]
+    world = np.concatenate([R.T, -R.T @ t[:, None]], 1)
+    numbers = [float(x) for x in (MODELS[device.model].code, device.w, device.h)]
+    return np.concatenate([world.reshape(-1), t, Intrinsics.of(device, torch.float64).params.numpy(), numbers])
+
+
+@compiled_range
+def _project_facing(first, last, vertices, normals, devices, uv, faces):
+    """Pixels `uv` (v, devices, 2) of vertices, and whether they face all devices (26 numbers each) and are inside."""
+    for i in range(first, last):
+        faces[i] = True
+        for k in range(len(devices)):
+            d = devices[k]
+            x, y, z = vertices[i]
+            a, b, c = normals[i]
+            if not (d[12] - x) * a + (d[13] - y) * b + (d[14] - z) * c > 0:
+                faces[i] = False
+                break
+        if not faces[i]:
+            continue
+        for k in range(len(devices)):
+            d = devices[k]
+            x, y, z = vertices[i]
+            X = d[0] * x + d[1] * y + d[2] * z + d[3]
+            Y = d[4] * x + d[5] * y + d[6] * z + d[7]
+            Z = d[8] * x + d[9] * y + d[10] * z + d[11]
+            found = view_of(d[23], X, Y, Z, d[15:23])
+            u, v = found[0], found[1]
+            uv[i, k, 0], uv[i, k, 1] = u, v
+            if not (found[2] and 0 <= u < d[24] and 0 <= v < d[25]):
+                faces[i] = False
+                break
+
+
+@compiled_range
+def _write_rays(first, last, points, normals, eye, start, centre, scale, rays):
+    """Rays (n, 6) from beside points of the surface to the eye, in units of `scale` around `centre`."""
+    for i in range(first, last):
+        x, y, z = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
+        distance = (x * x + y * y + z * z) ** 0.5
+        for k in range(3):
+            begin = points[i, k] + start * (normals[i, k] + (eye[k] - points[i, k]) / distance)
+            rays[i, k] = (begin - centre[k]) * scale
+            rays[i, 3 + k] = (eye[k] - begin) * scale
 
 
 def dot(a: Float[ndarray, "n k"], b: Float[ndarray, "n k"]) -> Float[ndarray, "n"]:

@@ -7,13 +7,18 @@ those of `bundle_adjustment.residuals`; intrinsics are shares of the focal lengt
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.self_calibration import by_intrinsics
+from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
-from sl_nerfstudio.geometry.se3 import hat, inverse, rotate, transform
+from sl_nerfstudio.geometry.devices.models import MODELS
+from sl_nerfstudio.geometry.se3 import hat, inverse, transform
+from sl_nerfstudio.meshing import compiled_derivatives as loops
 
 
 @dataclass(frozen=True)
@@ -40,36 +45,37 @@ class SurfaceView:
     ray_angle: Float[Tensor, "n"]  # between camera ray and projector ray, radian
 
 
-def view_surface(d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> SurfaceView:
-    """The view of points with unit normals, which must be in front of both devices and face the camera."""
-    T_camera_world = inverse(d.T_world_camera)
-    p, n = transform(T_camera_world, p_world), rotate(T_camera_world, normal)
-    ray = torch.nn.functional.normalize(p, dim=-1)
-    by_point = _projector_jacobian(d, p)
-    slope = (by_point @ ray[..., None]).squeeze(-1) / (ray * n).sum(-1, keepdim=True)
-    K = project_jacobian(d.camera, p)
-    back = p - d.T_camera_projector[:3, 3]
-    return SurfaceView(
-        p_camera=p,
-        by_point=by_point,
-        uv_camera=project(d.camera, p)[0],
-        uv_projector=project(d.projector, transform(inverse(d.T_camera_projector), p))[0],
-        slope=slope,
-        by_pixel=by_point @ _along_surface(K, n),
-        pixels_per_area=torch.linalg.det(torch.cat([K, n[:, None]], 1)).abs(),
-        ray_angle=torch.acos((ray * torch.nn.functional.normalize(back, dim=-1)).sum(-1).clamp(-1, 1)),
+def packed_devices(d: FrameDevices) -> Float[ndarray, "devices"]:
+    """The devices of a frame as compiled loops read them."""
+    T_camera_world, T_projector_camera = inverse(d.T_world_camera), inverse(d.T_camera_projector)
+    codes = [float(MODELS[device.model].code) for device in (d.camera, d.projector)]
+    matrices = [T[:3].reshape(-1).numpy() for T in (T_camera_world, T_projector_camera)]
+    return np.concatenate(
+        [*matrices, d.T_camera_projector[:3, 3].numpy(), d.camera.params.numpy(), d.projector.params.numpy(), codes]
     )
 
 
-def by_poses_and_intrinsics(
-    d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], view: SurfaceView
-) -> Float[Tensor, "n 2 18"]:
-    """Derivatives of the residual by delta and rho of the frame, then by the six intrinsics."""
-    # A frame that moves carries along what it measured: only the motion across the surface changes the residual.
-    by_delta = -view.slope[:, :, None] * torch.cat([normal, torch.linalg.cross(p_world, normal)], -1)[:, None]
-    by_rho = torch.cat([-view.by_point, view.by_point @ hat(view.p_camera)], -1)
-    by_camera = -view.by_pixel @ by_intrinsics(d.camera, view.uv_camera)
-    return torch.cat([by_delta, by_rho, by_camera, by_intrinsics(d.projector, view.uv_projector)], -1)
+def view_surface(d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> SurfaceView:
+    """The view of points with unit normals, which must be in front of both devices and face the camera."""
+    rows = np.empty((len(p_world), loops.VIEW))
+    _view_points(len(rows), packed_devices(d), p_world.numpy(), normal.numpy(), rows)
+    views = torch.from_numpy(rows)
+    return SurfaceView(
+        p_camera=views[:, loops.P_CAMERA : loops.BY_POINT],
+        by_point=views[:, loops.BY_POINT : loops.UV_CAMERA].unflatten(1, (2, 3)),
+        uv_camera=views[:, loops.UV_CAMERA : loops.UV_PROJECTOR],
+        uv_projector=views[:, loops.UV_PROJECTOR : loops.SLOPE],
+        slope=views[:, loops.SLOPE : loops.BY_PIXEL],
+        by_pixel=views[:, loops.BY_PIXEL : loops.AREA].unflatten(1, (2, 2)),
+        pixels_per_area=views[:, loops.AREA],
+        ray_angle=views[:, loops.ANGLE],
+    )
+
+
+@compiled_range
+def _view_points(first, last, devices, points, normals, rows):
+    for i in range(first, last):
+        loops.view_point(devices, points[i], normals[i], rows[i])
 
 
 def point_equations(d: FrameDevices, p_world: Float[Tensor, "n 3"]) -> tuple[Tensor, Tensor]:
@@ -95,8 +101,3 @@ def point_equations(d: FrameDevices, p_world: Float[Tensor, "n 3"]) -> tuple[Ten
 def _projector_jacobian(d: FrameDevices, p_camera: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:
     T = inverse(d.T_camera_projector)
     return project_jacobian(d.projector, transform(T, p_camera)) @ T[:3, :3]
-
-
-def _along_surface(K: Float[Tensor, "n 2 3"], normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 2"]:
-    """Motion along the tangent plane that moves the camera pixel by one in x and in y."""
-    return torch.linalg.inv(torch.cat([K, normal[:, None]], 1))[..., :2]

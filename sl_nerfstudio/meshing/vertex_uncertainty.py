@@ -7,10 +7,7 @@ averages (`sigma_independent`). Errors of poses and intrinsics are shared by the
 is propagated, less the rigid motion of the whole surface, which changes no shape.
 """
 
-from functools import partial
-
 import numpy as np
-import torch
 from jaxtyping import Float, Int64
 from numpy import ndarray
 
@@ -19,14 +16,13 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.surface_derivatives import by_poses_and_intrinsics, view_surface
+from sl_nerfstudio.meshing.shared_rows import add_variances, write_rows
+from sl_nerfstudio.meshing.surface_derivatives import packed_devices
 from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, independent_variance
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
 from sl_nerfstudio.scan.types import Scan
-from sl_nerfstudio.threads import parallel
 
-_ENTRIES = 8_000_000  # derivatives that are in memory at a time
 _GAUGE_VERTICES = 4000  # of which the rigid motion of the whole surface is fitted
 
 
@@ -58,7 +54,11 @@ def vertex_uncertainty(
 def _shared_variance(
     mesh: Mesh, scan: Scan, poses: DevicePoses, views: VertexViews, joint: JointCovariance
 ) -> Float[ndarray, "v"]:
-    """Variance along the normal from the errors of poses and intrinsics, up to a rigid motion of the surface."""
+    """Variance along the normal from the errors of poses and intrinsics, up to a rigid motion of the surface.
+
+    A row of derivatives is s - r m: s has entries for the frames that see the vertex, r is its rigid motion, m what the
+    rigid motion of the whole surface is of. So its variance takes time by the vertex's own frames, not by all.
+    """
     seen, normals = np.unique(views.vertex), mesh.vertex_normals()
     out = np.full(len(mesh.vertices), np.nan)
     if len(seen) == 0:
@@ -68,13 +68,12 @@ def _shared_variance(
     some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
     rows = surface_rows(mesh.vertices, normals, scan, poses, views, some)
     motion = np.linalg.lstsq(rigid[some], rows, rcond=None)[0]
-    chunk = max(_ENTRIES // len(joint.matrix), 1)
-
-    def write(part: Int64[ndarray, "n"]) -> None:
-        rows = surface_rows(mesh.vertices, normals, scan, poses, views, part) - rigid[part] @ motion
-        out[part] = np.einsum("vi,vi->v", rows @ joint.matrix, rows)
-
-    parallel([partial(write, seen[first : first + chunk]) for first in range(0, len(seen), chunk)])
+    shared = joint.matrix @ motion.T
+    first, last = ranges_of(views, seen)
+    add_variances(
+        len(seen), seen, first, last, views.frame, views.pixels_per_area, _all_devices(scan, poses), mesh.vertices,
+        normals, rigid, joint.matrix, shared, motion @ shared, out,
+    )  # fmt: skip
     return np.maximum(out, 0.0)
 
 
@@ -87,30 +86,20 @@ def surface_rows(
     vertices: Int64[ndarray, "v"],
 ) -> Float[ndarray, "v joint"]:
     """Derivatives of vertices along their normals by (delta, rho, intrinsics); `vertices` ascend, each has a view."""
-    n = len(scan.frames)
-    pairs, row = pairs_of(views, vertices)
-    out, total = np.zeros((len(vertices), 12 * n + UNKNOWNS)), np.zeros(len(vertices))
-    for k in np.unique(views.frame[pairs]).tolist():
-        mine = views.frame[pairs] == k
-        at, weight = pairs[mine], views.pixels_per_area[pairs[mine]]
-        p, normal = (torch.from_numpy(x[views.vertex[at]]) for x in (points, normals))
-        devices = devices_of(scan, poses, k)
-        view = view_surface(devices, p, normal)
-        B, slope = by_poses_and_intrinsics(devices, p, normal, view).numpy(), view.slope.numpy()
-        pull = -weight[:, None] * np.einsum("mi,mij->mj", slope, B)
-        columns = columns_of(k, n)
-        out[row[mine][:, None], columns] += pull[:, :12]
-        out[row[mine], 12 * n :] += pull[:, 12:]
-        total[row[mine]] += weight * (slope**2).sum(1)
-    return out / total[:, None]
+    out = np.zeros((len(vertices), 12 * len(scan.frames) + UNKNOWNS))
+    first, last = ranges_of(views, vertices)
+    devices = _all_devices(scan, poses)
+    write_rows(len(vertices), vertices, first, last, views.frame, views.pixels_per_area, devices, points, normals, out)
+    return out
 
 
-def pairs_of(views: VertexViews, vertices: Int64[ndarray, "v"]) -> tuple[Int64[ndarray, "m"], Int64[ndarray, "m"]]:
-    """Positions in `views` of ascending vertices, and for each position which of the vertices it belongs to."""
-    first, last = np.searchsorted(views.vertex, vertices), np.searchsorted(views.vertex, vertices, side="right")
-    number = last - first
-    row = np.repeat(np.arange(len(vertices)), number)
-    return np.arange(number.sum()) + np.repeat(first - np.cumsum(number) + number, number), row
+def _all_devices(scan: Scan, poses: DevicePoses) -> Float[ndarray, "frames devices"]:
+    return np.stack([packed_devices(devices_of(scan, poses, k)) for k in range(len(scan.frames))])
+
+
+def ranges_of(views: VertexViews, vertices: Int64[ndarray, "v"]) -> tuple[Int64[ndarray, "v"], Int64[ndarray, "v"]]:
+    """First and last (exclusive) position in `views` of each vertex."""
+    return np.searchsorted(views.vertex, vertices), np.searchsorted(views.vertex, vertices, side="right")
 
 
 def columns_of(frame: int, frames: int) -> Int64[ndarray, "12"]:

@@ -2,15 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
+from sl_nerfstudio.meshing.compiled_derivatives import VIEW, derive_residual, view_point
 from sl_nerfstudio.meshing.surface_derivatives import (
     FrameDevices,
-    by_poses_and_intrinsics,
+    packed_devices,
     point_equations,
     view_surface,
 )
@@ -57,6 +59,15 @@ def on_plane(d: FrameDevices, uv: Tensor, p: Tensor, normal: Tensor) -> Tensor:
     return project(d.projector, transform(T, eye + distance * ray))[0]
 
 
+def derivatives(d: FrameDevices, p: Tensor, normal: Tensor) -> Tensor:
+    """Derivatives of the residuals by (delta, rho, intrinsics), from the compiled loop's function."""
+    devices, view, out = packed_devices(d), np.empty(VIEW), np.empty((len(p), 2, 18))
+    for point, across, by in zip(p.numpy(), normal.numpy(), out, strict=True):
+        view_point(devices, point, across, view)
+        derive_residual(devices, point, across, view, by)
+    return torch.from_numpy(out)
+
+
 @pytest.mark.parametrize("light", LIGHTS, ids=("pinhole", "DOE"))
 def test_the_prediction_of_a_pixel_changes_as_rays_and_planes_do(light):
     d, (p, normal) = frame_of(light), surface()
@@ -68,7 +79,7 @@ def test_the_prediction_of_a_pixel_changes_as_rays_and_planes_do(light):
     for column, way in enumerate(torch.eye(2, dtype=torch.float64)):
         beside = [on_plane(d, uv + sign * STEP * way, p, normal) for sign in (1, -1)]
         assert torch.allclose(view.by_pixel[..., column], (beside[0] - beside[1]) / (2 * STEP), rtol=1e-6, atol=1e-5)
-    found = by_poses_and_intrinsics(d, p, normal, view)
+    found = derivatives(d, p, normal)
     for column, way in enumerate(torch.eye(18, dtype=torch.float64)):
         after = [on_plane(changed(d, sign * STEP * way), uv, p, normal) for sign in (1, -1)]
         expected = (after[0] - after[1]) / (2 * STEP)
