@@ -100,6 +100,12 @@ class TableGradient:
         self.marks.copy_(marks)
         self._version = self.buffer._version
 
+    def move(self, buffer: Tensor, marks: Tensor) -> None:
+        """Continue in other memory, of the same shapes; the table's `grad` must be set to it by the caller."""
+        buffer.copy_(self.buffer)
+        marks.copy_(self.trusted_marks())
+        self.buffer, self.marks, self._version = buffer, marks, buffer._version
+
     def clear(self) -> None:
         """Set the buffer to zero."""
         if self.buffer.device.type != "cpu":

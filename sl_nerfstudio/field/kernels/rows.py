@@ -41,6 +41,54 @@ def clear(gradient, marks, start, stop, rows):
                 gradient[rows[k] * FEATURES + i] = _ZERO
 
 
+@part
+def list_any(marks, start, stop, rows):
+    """As `list_marked`, of rows that any process marked (processes, marks), which are then marked in all of them."""
+    words, n, row = marks.view(np.int64), 0, start
+    while row < stop and n <= len(rows) - 8:
+        together = words[0, row // 8]
+        for k in range(1, len(words)):
+            together |= words[k, row // 8]
+        if together != 0:
+            for k in range(len(words)):
+                words[k, row // 8] = together
+            for i in range(row, min(row + 8, stop)):
+                if marks[0, i]:
+                    rows[n] = i
+                    n += 1
+        row += 8
+    return n, row
+
+
+@kernel
+def average(gradients, marks, start, stop, rows, own, count):
+    """Mean over processes of the rows in `start .. stop` that any of them marked, for all of them; marks become equal.
+
+    `gradients` [process, row * 8], `marks` [process, row]. Every `count`-th stretch of LIST rows, from number `own` on,
+    is done; `start` is at a multiple of LIST * count.
+    """
+    processes, share = len(gradients), _ONE / np.float32(len(gradients))
+    first = start + own * LIST
+    while first < stop:
+        end = min(first + LIST, stop)
+        row = first
+        while row < end:
+            n, row = list_any(marks, row, end, rows)
+            for k in range(n):
+                if k + _AHEAD < n:
+                    for p in range(processes):
+                        prefetch(gradients[p], (rows[k + _AHEAD] * FEATURES,))
+                at = rows[k] * FEATURES
+                for i in range(at, at + FEATURES):
+                    total = gradients[0, i]
+                    for p in range(1, processes):
+                        total += gradients[p, i]
+                    total *= share
+                    for p in range(processes):
+                        gradients[p, i] = total
+        first += count * LIST
+
+
 @kernel
 def adam(table, gradient, moments, steps, marks, start, stop, rows, corrections, lr, beta1, beta2, eps):
     """One step of Adam for every marked row whose gradient is not exactly zero; clears the gradient and the marks.

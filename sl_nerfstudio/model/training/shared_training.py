@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from sl_nerfstudio.field.table_gradient import TableGradient
+from sl_nerfstudio.model.training.shared_table import SharedTable
 
 
 def several() -> bool:
@@ -33,30 +34,56 @@ def share_state(module: nn.Module) -> None:
             tensor.copy_(whole)
 
 
-@torch.no_grad()
-def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Replace the gradients by their means over all processes."""
-    dense: list[Tensor] = []
-    for parameter in parameters:
-        buffer = TableGradient.known(parameter)
-        if buffer is not None and buffer.holds(parameter.grad):
-            _average_rows(buffer)
-        elif parameter.grad is not None:
-            dense.append(parameter.grad)
-    if dense:  # one message: the tensors of a perceptron are small
-        together = torch.cat([gradient.reshape(-1) for gradient in dense])
-        dist.all_reduce(together)
-        together /= dist.get_world_size()
-        for gradient, mean in zip(dense, together.split([gradient.numel() for gradient in dense]), strict=True):
-            gradient.copy_(mean.view_as(gradient))
+class MeanGradients:
+    """Replaces gradients by their means over all processes."""
+
+    def __init__(self) -> None:
+        self._shared: dict[TableGradient, SharedTable | None] = {}
+
+    @torch.no_grad()
+    def __call__(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Once in every step; all processes call this with the same parameters."""
+        dense: list[Tensor] = []
+        shared: list[SharedTable] = []
+        for parameter in parameters:
+            buffer = TableGradient.known(parameter)
+            if buffer is None or not buffer.holds(parameter.grad):
+                dense += [] if parameter.grad is None else [parameter.grad]
+            elif len(buffer.marks) == 0:  # on a GPU: all rows
+                dist.all_reduce(buffer.buffer)
+                buffer.buffer /= dist.get_world_size()
+            elif (table := self._shared_table(parameter, buffer)) is not None:
+                buffer.trusted_marks()
+                shared.append(table)
+            else:
+                _average_rows(buffer)
+        _average_dense(dense)  # all processes have come here when one has the result
+        for table in shared:
+            table.average()
+        if shared:
+            dist.barrier()  # before one of them writes gradients again
+
+    def _shared_table(self, parameter: nn.Parameter, buffer: TableGradient) -> SharedTable | None:
+        if buffer not in self._shared:
+            self._shared[buffer] = SharedTable.of(buffer)
+            parameter.grad = buffer.buffer
+        return self._shared[buffer]
+
+
+def _average_dense(gradients: list[Tensor]) -> None:
+    """In one message, because the tensors of a perceptron are small; without any, wait for the others."""
+    if not gradients:
+        dist.barrier()
+        return
+    together = torch.cat([gradient.reshape(-1) for gradient in gradients])
+    dist.all_reduce(together)
+    together /= dist.get_world_size()
+    for gradient, mean in zip(gradients, together.split([gradient.numel() for gradient in gradients]), strict=True):
+        gradient.copy_(mean.view_as(gradient))
 
 
 def _average_rows(buffer: TableGradient) -> None:
-    """Only the rows that any process marked: a batch of points touches a part of the table. On a GPU, all rows."""
-    if len(buffer.marks) == 0:
-        dist.all_reduce(buffer.buffer)
-        buffer.buffer /= dist.get_world_size()
-        return
+    """Only the rows that any process marked: a batch of points touches a part of the table."""
     marks = buffer.trusted_marks().clone()
     dist.all_reduce(marks, dist.ReduceOp.MAX)
     rows = marks[: len(buffer.buffer)].nonzero()[:, 0]
@@ -78,9 +105,13 @@ class SharedOptimizers(Optimizers):
     The mean is taken before a gradient scaler looks for infinities, so that all processes find the same.
     """
 
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[nn.Parameter]]) -> None:
+        super().__init__(config, param_groups)
+        self._average = MeanGradients()
+
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:  # pyright: ignore
         """See nerfstudio's Optimizers."""
-        average_gradients(parameter for name in param_groups for parameter in self.parameters[name])
+        self._average(parameter for name in param_groups for parameter in self.parameters[name])
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 

@@ -19,14 +19,14 @@ from sl_nerfstudio.field.row_adam import RowAdam
 from sl_nerfstudio.field.table_gradient import TableGradient
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training import launching
-from sl_nerfstudio.model.training.shared_training import average_gradients, greatest, share_state
+from sl_nerfstudio.model.training import launching, shared_table
+from sl_nerfstudio.model.training.shared_training import MeanGradients, greatest, share_state
 from sl_nerfstudio.runs.trained_run import load_run
 from tests.model.training.small_runs import folder_of, go_on, last_state, require_equal, settings, status, train
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
 
-ROWS = 40
+ROWS = 3000  # each process averages some of them
 forked = functools.partial(mp.start_processes, start_method="fork")
 
 
@@ -120,6 +120,7 @@ def _three_steps(rank: int, folder: Path) -> None:
     model = nn.ParameterList([nn.Parameter(torch.randn(ROWS, 8)), nn.Parameter(torch.randn(3, 5))])
     share_state(model)
     table, matrix = model
+    average_gradients = MeanGradients()
     optimisers = RowAdam([table], lr=0.1), torch.optim.SGD([matrix], lr=0.1)
     for step in range(3):
         buffer = TableGradient.of(table)
@@ -141,8 +142,11 @@ def _three_steps(rank: int, folder: Path) -> None:
     torch.save([table.detach(), matrix.detach()], folder / f"{rank}.pt")
 
 
-def test_all_processes_take_the_step_along_the_mean_of_their_gradients(tmp_path):
+@pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
+def test_all_processes_take_the_step_along_the_mean_of_their_gradients(tmp_path, monkeypatch, shared):
     """Against torch's own Adam with the mean gradient, in rows that every step touches, and against none elsewhere."""
+    if not shared:  # as on several machines
+        monkeypatch.setattr(shared_table, "_opened", lambda *_: None)
     _in_two(_three_steps, tmp_path)
     (table, matrix), other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     require_equal([table, matrix], other)
