@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
+
 _THIN = 0.1  # height divided by length
 
 
@@ -11,23 +13,46 @@ def nearest_on_triangle(
     p: Float[ndarray, "n 3"], a: Float[ndarray, "n 3"], b: Float[ndarray, "n 3"], c: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 3"]:
     """Nearest point to each `p` on its triangle `a b c`: the foot on the plane if inside, else on the nearest edge."""
-    normal = np.cross(b - a, c - a)
-    norm2 = (normal**2).sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        foot = p - (((p - a) * normal).sum(1) / norm2)[:, None] * normal
+    out = np.empty(p.shape)
+    _nearest(p, a, b, c, out)
+    return out
+
+
+@compiled
+def _cross(ax, ay, az, bx, by, bz):
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@compiled
+def _nearest(points, firsts, seconds, thirds, out):
+    for i in range(len(points)):
+        p, a, b, c = points[i], firsts[i], seconds[i], thirds[i]
+        nx, ny, nz = _cross(b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2])
+        norm2 = nx * nx + ny * ny + nz * nz
         inside = norm2 > 0
+        x, y, z = p
+        if inside:
+            away = ((p[0] - a[0]) * nx + (p[1] - a[1]) * ny + (p[2] - a[2]) * nz) / norm2
+            x, y, z = p[0] - away * nx, p[1] - away * ny, p[2] - away * nz
+            for start, end in ((a, b), (b, c), (c, a)):
+                sx, sy, sz = _cross(
+                    *(end[0] - start[0], end[1] - start[1], end[2] - start[2]),
+                    *(x - start[0], y - start[1], z - start[2]),
+                )
+                inside = inside and sx * nx + sy * ny + sz * nz >= 0
+        if inside:
+            out[i, 0], out[i, 1], out[i, 2] = x, y, z
+            continue
+        best = np.inf
         for start, end in ((a, b), (b, c), (c, a)):
-            inside &= (np.cross(end - start, foot - start) * normal).sum(1) >= 0
-    best = np.where(inside[:, None], foot, np.inf)
-    distance2 = np.where(inside, 0.0, np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        side = end - start
-        t = ((p - start) * side).sum(1) / np.maximum((side**2).sum(1), 1e-300)
-        point = start + np.clip(t, 0, 1)[:, None] * side
-        square = ((p - point) ** 2).sum(1)
-        nearer = square < distance2
-        best, distance2 = np.where(nearer[:, None], point, best), np.where(nearer, square, distance2)
-    return best
+            sx, sy, sz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+            along = (p[0] - start[0]) * sx + (p[1] - start[1]) * sy + (p[2] - start[2]) * sz
+            t = min(max(along / max(sx * sx + sy * sy + sz * sz, 1e-300), 0.0), 1.0)
+            x, y, z = start[0] + t * sx, start[1] + t * sy, start[2] + t * sz
+            square = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
+            if square < best:
+                best = square
+                out[i, 0], out[i, 1], out[i, 2] = x, y, z
 
 
 def neighbours(faces: Int[ndarray, "f 3"]) -> Int[ndarray, "f 3"]:
