@@ -6,6 +6,7 @@ pattern image.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +17,7 @@ from sl_nerfstudio.evaluation.holes import Holes, find_holes
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.scan import Frame, Scan
+from sl_nerfstudio.threads import results, threads
 
 
 @dataclass(frozen=True)
@@ -117,12 +119,27 @@ def compare_captures(
     scan: Scan,
     poses: DevicePoses,
 ) -> Iterator[tuple[Frame, FrameAgreement, FramePixels]]:
-    """Figures and pixels of every frame in turn; one frame is in memory at a time."""
+    """Figures and pixels of every frame in turn; as many frames are in memory at a time as there are threads."""
     pattern = scan.read_pattern()
-    for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True):
-        pixels = frame_pixels(surface, frame, scan, pattern, T_c, T_p)
-        masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
-        yield frame, frame_agreement(frame.name, masked, pixels, holes), pixels
+    tasks = [
+        partial(_compare, surface, scan, pattern, frame, T_c, T_p)
+        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
+    ]
+    for first in range(0, len(tasks), threads()):
+        yield from results(tasks[first : first + threads()])
+
+
+def _compare(
+    surface: IndexedMesh,
+    scan: Scan,
+    pattern: Float[ndarray, "ph pw"],
+    frame: Frame,
+    T_world_camera: Float[ndarray, "4 4"],
+    T_world_projector: Float[ndarray, "4 4"],
+) -> tuple[Frame, FrameAgreement, FramePixels]:
+    pixels = frame_pixels(surface, frame, scan, pattern, T_world_camera, T_world_projector)
+    masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
+    return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
 
 
 def _known(values: Float[ndarray, "n"]) -> Float[ndarray, "m"]:

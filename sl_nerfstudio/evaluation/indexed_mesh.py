@@ -54,6 +54,7 @@ class IndexedMesh:
     def _build(self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> o3d.t.geometry.RaycastingScene:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(o3d.core.Tensor(self._inside(vertices)), o3d.core.Tensor(faces.astype(np.uint32)))
+        scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # builds the index, before threads share it
         return scene
 
     def _corners(self, face: Int[ndarray, "n"]) -> tuple[Float[ndarray, "n 3"], ...]:

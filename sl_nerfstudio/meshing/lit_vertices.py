@@ -28,6 +28,9 @@ class Occluder:
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices = ((mesh.vertices - self._centre) * self._scale).astype(np.float32)
         self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+        self._scene.cast_rays(
+            o3d.core.Tensor(np.zeros((1, 6), np.float32))
+        )  # builds the index, before threads share it
 
     def hidden(
         self, points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]
