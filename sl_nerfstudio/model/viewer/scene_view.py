@@ -6,7 +6,6 @@ import time
 from contextlib import AbstractContextManager
 
 import numpy as np
-import trimesh
 import viser
 from jaxtyping import Float, Float64, UInt8
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
@@ -138,6 +137,8 @@ class SceneView(ViewerControl):
         self.panel.show_legend(coloured)
 
     def _draw_surface(self, surface: Surface, coloured: Coloured) -> None:
+        import trimesh  # takes half a second, and only a viewer needs it
+
         mesh = trimesh.Trimesh(
             surface.mesh.vertices * VISER_NERFSTUDIO_SCALE_RATIO,
             surface.mesh.faces,
