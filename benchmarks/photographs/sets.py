@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -76,8 +77,8 @@ def _named(name: str) -> CaptureSet:
             f"--sets {name}: no set is named so; there are {', '.join(one.name for one in SETS)}; a new one is named "
             "SCENE-BACKGROUND-APPEARANCE-SEED, with -shuffled at the end if its order is random"
         )
-    scene, background, appearance, seed, shuffled = found.groups()
-    return CaptureSet(scene, background, appearance, int(seed), shuffled is not None)
+    background, appearance = cast(Background, found[2]), cast(AppearanceKind, found[3])
+    return CaptureSet(found[1], background, appearance, int(found[4]), found[5] is not None)
 
 
 def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> Path:
