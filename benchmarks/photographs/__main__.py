@@ -31,7 +31,8 @@ class Config:
     """Which sets are measured, and where their captures are kept."""
 
     sets: tuple[str, ...] = ()
-    """parts of the names of sets, for example "chair" or "realistic"; default: all sets"""
+    """parts of the names of sets, for example "chair" or "realistic"; default: all sets. A full name that is not among
+    them, like "head-walls-hard-701-shuffled", is a new one: captures on which nothing was tuned."""
     frames: int = 24
     """captures of each set"""
     resolution: int = 600

@@ -1,9 +1,11 @@
 """The sets of captures: scenes, appearances and surroundings that no network was trained on."""
 
 import os
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
 from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.scenes.library import BUILT_IN
 from sl_nerfstudio.synthesis.scenes.surroundings import Background
 from sl_nerfstudio.synthesis.synthesise import synthesise
 
@@ -54,12 +57,28 @@ SETS = (
 )
 
 
+_NAME = re.compile(r"(.+)-(none|table|walls)-(plain|realistic|hard)-(\d+)(-shuffled)?")
+
+
 def chosen_sets(parts: tuple[str, ...]) -> list[CaptureSet]:
-    """The sets whose names contain one of the parts. Raises UserError if a part fits none."""
-    for part in parts:
-        if not any(part in one.name for one in SETS):
-            raise UserError(f"--sets {part}: no set is named so; there are {', '.join(one.name for one in SETS)}")
-    return [one for one in SETS if not parts or any(part in one.name for part in parts)]
+    """The sets whose names contain one of the parts, and new ones that are named in full.
+
+    Raises UserError if a part fits none and is no name of a set.
+    """
+    new = [_named(part) for part in parts if not any(part in one.name for one in SETS)]
+    return [one for one in SETS if not parts or any(part in one.name for part in parts)] + new
+
+
+def _named(name: str) -> CaptureSet:
+    """A set that is not among those of the benchmark, for example "frog-table-plain-801-shuffled"."""
+    found = _NAME.fullmatch(name)
+    if found is None or found[1] not in BUILT_IN:
+        raise UserError(
+            f"--sets {name}: no set is named so; there are {', '.join(one.name for one in SETS)}; a new one is named "
+            "SCENE-BACKGROUND-APPEARANCE-SEED, with -shuffled at the end if its order is random"
+        )
+    background, appearance = cast(Background, found[2]), cast(AppearanceKind, found[3])
+    return CaptureSet(found[1], background, appearance, int(found[4]), found[5] is not None)
 
 
 def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> Path:

@@ -25,6 +25,7 @@ from sl_nerfstudio.verdict.scan_agreement import compare_frames
 from sl_nerfstudio.verdict.settings import VerdictSettings
 
 _ROUNDS = 4
+_INCLUSIONS = 3  # times that frames left out are tried
 _FEWEST = 2  # frames of a scan
 
 
@@ -45,24 +46,41 @@ def adjust_consistent(
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
-    Frames that were left out come in if they can be placed against the adjusted ones and agree with them.
+    Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
+    again as long as frames come in, because each shows more of the surface to the rest.
 
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
+    for _ in range(_INCLUSIONS):
+        more = _with_agreeing(clouds, found, log, settings)
+        if more is None:
+            break
+        known = found.registration.registered
+        found = _without_contradictions(clouds, more, log, settings)
+        if not (found.registration.registered & ~known).any():
+            break
+    return found
+
+
+def _with_agreeing(
+    clouds: Sequence[FrameCloud],
+    found: ConsistentFrames,
+    log: Callable[[str], None],
+    settings: RegisteredFramesSettings | None,
+) -> ConsistentFrames | None:
+    """All frames adjusted again with those left out that can be placed and then agree; None if there are none."""
     more = _with_left_out(clouds, found)
-    new = np.flatnonzero(more.registered & ~found.registration.registered)
-    names = [registration.names[k] for k in new]
-    if not names:
-        return found
-    log(f"placed against the adjusted frames: {', '.join(names)}; adjusting again with them")
+    new: list[int] = np.flatnonzero(more.registered & ~found.registration.registered).tolist()
+    if not new:
+        return None
+    names = ", ".join(found.registration.names[k] for k in new)
+    log(f"placed against the adjusted frames: {names}; adjusting again with them")
     with_more = _adjusted(clouds, more, settings)
-    doubtful = [k for k in new if not _agrees_well(with_more, int(k))]
-    if len(doubtful) == len(names):
-        return found
-    if doubtful:
-        with_more = _adjusted(clouds, without_groups(more, [[int(k)] for k in doubtful]), settings)
-    return _without_contradictions(clouds, with_more, log, settings)
+    doubtful = [k for k in new if not _agrees_well(with_more, k)]
+    if len(doubtful) == len(new):
+        return None
+    return _adjusted(clouds, without_groups(more, [[k] for k in doubtful]), settings) if doubtful else with_more
 
 
 def registered_only(

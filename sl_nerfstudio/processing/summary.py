@@ -83,7 +83,7 @@ def summarise(
         verdict=judge_scan(
             ScanFacts(
                 tuple(map(_facts, frames)),
-                tuple(PairFacts(e.frames, e.used) for e in records),
+                tuple(PairFacts(e.frames, e.used, e.overlap * e.fitness**2) for e in records),
                 cross,
                 bool(wrong),
                 adjusted=not config.no_adjust,

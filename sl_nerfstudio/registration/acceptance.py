@@ -136,7 +136,8 @@ def _exclusion(
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
     partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
-    joining = [e for e, _ in across if is_accepted(e, settings)]
+    # where no two frames could be joined, every pair of the frame might have joined it
+    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e, settings)]
     slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
     return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 

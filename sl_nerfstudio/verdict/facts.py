@@ -25,6 +25,7 @@ class PairFacts:
 
     frames: tuple[str, str]
     used: bool  # False: contradicted by other pairs
+    support: float = 1.0  # how much their surfaces share, and how little of that contradicts: from 0 to 1
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """The verdict on a scan: the worst of everything that is known of it, not an average."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups, bridges
-from sl_nerfstudio.verdict.facts import ScanFacts
+from sl_nerfstudio.verdict.facts import PairFacts, ScanFacts
 from sl_nerfstudio.verdict.settings import VerdictSettings
 from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, listed, worst
 
@@ -77,11 +77,8 @@ def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[R
     pairs, names = facts.pairs or (), [f.name for f in facts.in_scan]
     inside = [p for p in pairs if set(p.frames) <= set(names)]
     used = [p.frames for p in inside if p.used]
-    doubtful = [
-        name
-        for name in names
-        if sum(name in p.frames and not p.used for p in inside) > sum(name in edge for edge in used)
-    ]
+    # frames from opposite sides are compared, too, where no order is known, and fit somewhere, though not well
+    doubtful = [name for name in names if _support(name, inside, False) > _support(name, inside, True)]
     if doubtful:
         yield Reason(
             _share_band(len(doubtful), len(names), settings),
@@ -96,6 +93,11 @@ def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[R
             f"only the pair {names[a]} and {names[b]} connects {listed([names[k] for k in part])} to the other frames; "
             "no other pair confirms it",
         )
+
+
+def _support(name: str, pairs: Iterable[PairFacts], used: bool) -> float:
+    """Of the pairs of a frame that are used, or are not, together."""
+    return math.fsum(p.support for p in pairs if name in p.frames and p.used == used)
 
 
 def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement, settings: VerdictSettings) -> Iterator[Reason]:

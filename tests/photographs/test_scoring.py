@@ -163,3 +163,10 @@ def test_the_sets_cover_what_they_should():
     assert [one.scene for one in chosen_sets(("medal",))] == ["medal"] and chosen_sets(()) == list(SETS)
     with pytest.raises(UserError, match="--sets teapot: no set is named so"):
         chosen_sets(("frog", "teapot"))
+    names = ("cone-and-cylinder-walls-hard-9", "head-none-plain-10-shuffled")
+    new = chosen_sets(("medal", *names))[1:]  # those of the benchmark come first
+    assert tuple(one.name for one in new) == names
+    assert new[0] == CaptureSet("cone-and-cylinder", "walls", "hard", 9) and not new[1].unordered
+    for wrong in ("teapot-none-plain-1", "head-none-plain", "head-nowhere-plain-1", "head-none-plain-1-sorted"):
+        with pytest.raises(UserError, match="SCENE-BACKGROUND-APPEARANCE-SEED"):
+            chosen_sets((wrong,))

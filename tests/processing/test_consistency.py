@@ -81,6 +81,23 @@ def test_a_frame_that_was_put_elsewhere_is_put_right_or_named_and_the_others_sta
     }  # fmt: skip
 
 
+def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
+    """Each that comes in may be what the next one needs: trying ends when nothing is left out."""
+    true, calls = registration_of(RIG.T_world_camera.numpy()), []
+
+    def one_at_a_time(clouds, registration, poses):
+        lost = np.flatnonzero(~registration.registered)
+        calls.append(lost.tolist())
+        return without_groups(true, [[int(k)] for k in lost[1:]]) if len(lost) else registration
+
+    monkeypatch.setattr(consistency, "include_left_out", one_at_a_time)
+    log = []
+    found = adjust_consistent(clouds, without_groups(true, [[1], [MOVED]]), log.append)
+    assert calls == [[1, MOVED], [MOVED]] and found.registration.registered.all()
+    assert found.registration.exclusions == () and np.isfinite(found.adjusted.poses.baseline).all()
+    assert log == [f"placed against the adjusted frames: {NAMES[k]}; adjusting again with them" for k in (1, MOVED)]
+
+
 def test_a_frame_of_another_object_is_taken_out_by_name(clouds):
     """It cannot be placed anew, either."""
     stranger = stranger_of(clouds[MOVED])

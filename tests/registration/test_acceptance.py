@@ -59,6 +59,13 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(clouds):
     assert off < 0.03 * np.linalg.norm(T[0, :3, 3]) / unit
 
 
+def test_where_nothing_is_joined_because_everything_slips_every_frame_says_so():
+    """Two frames of a vase: to capture more of the same would not help."""
+    found = register(rendered("vase", (4, 5)).clouds)
+    assert not found.registered.any()
+    assert found.exclusions == tuple(SeparateComponent(name, (name,), True, None) for name in found.names)
+
+
 def test_a_frame_without_surface_shares_none(clouds):
     few = {k: getattr(clouds[2], k)[::50] for k in ("uv_camera", "points", "sigma_noise", "pose_errors")}
     found = register([*clouds[:2], replace(clouds[2], **few)])

@@ -68,6 +68,15 @@ def test_pairs_that_contradict_others_and_pairs_on_which_everything_hangs():
     assert any("only the pair f05 and f06 connects" in r and "no other pair confirms it" in r for r in verdict.reasons)
 
 
+@pytest.mark.parametrize(("rejected", "doubtful"), [(7, False), (9, True)])
+def test_pairs_that_contradict_count_by_how_well_they_fit(rejected, doubtful):
+    """Four pairs of f05 are used. Frames from the other side of an object fit it half as well, and say nothing true."""
+    others = [k for k in range(N) if k != 5]
+    false = tuple(PairFacts((NAMES[5], NAMES[k]), False, 0.5) for k in others[:rejected])
+    found = judge_scan(scan(pairs=(*CHAIN, *false))).reasons
+    assert any("most pairs with other frames" in reason for reason in found) == doubtful
+
+
 def test_frames_that_agree_less_well_and_parts_that_share_nothing():
     cross = ring(np.ones((N, N)))
     frames = tuple(replace(f, excess=2.2 if k == 4 else 1.0) for k, f in enumerate(cross.frames))
