@@ -40,11 +40,21 @@ class CrossValidation:
     difference: float  # mean of the paired differences of squared robust residuals, after minus before, px^2
     standard_error: float  # of that mean; infinite for fewer than two blocks
     standard_errors: float  # by which the difference must be below zero
+    least_gain: float  # share of the old poses' mean square by which it must be below zero as well
 
     @property
     def better(self) -> bool:
-        """Whether to keep the new poses: they are better by more than chance."""
-        return self.difference < -self.standard_errors * self.standard_error
+        """Whether to keep the new poses: they are better by more than chance, and by more than decoding is biased."""
+        return self.difference < -self._margin
+
+    @property
+    def worse(self) -> bool:
+        """The same the other way round."""
+        return self.difference > self._margin
+
+    @property
+    def _margin(self) -> float:
+        return max(self.standard_errors * self.standard_error, self.least_gain * self.before_px**2)
 
 
 @one_library_thread()
@@ -77,7 +87,7 @@ def cross_validate(
     losses = [_robust_squares(rig, anchors, rows, maps, width) for rig, anchors in sides]
     difference, error = mean_and_error(losses[1] - losses[0], block)
     first, second = (float(loss.mean().sqrt()) for loss in losses)
-    return CrossValidation(first, second, difference, error, s.standard_errors)
+    return CrossValidation(first, second, difference, error, s.standard_errors, s.least_gain)
 
 
 def _robust_squares(

@@ -101,7 +101,7 @@ class RelocalisationSettings:
     """Steps between new choices of which pixels the other frames see."""
     inlier_noises: float = 5.0
     """Largest residual that supports a pose, as a multiple of the noise."""
-    least_gain: float = 0.02
+    least_gain: float = 0.01
     """Share of supporting residuals that a new pose must add to replace the old one."""
     sigmas: float = 4.0
     """A frame is lost if its support is this many robust standard deviations below the median frame's."""
@@ -125,6 +125,9 @@ class CrossValidationSettings:
     """Smallest width of that kernel, in pattern pixels: looking up between pixels is never perfect."""
     standard_errors: float = 2.0
     """Standard errors by which the mean paired difference must be below zero for the change to be kept."""
+    least_gain: float = 0.01
+    """Share of the mean robust square by which it must be below zero as well if poses are to be kept: held-out pixels
+    share systematic errors of decoding with those that were adjusted, which standard errors do not show."""
 
 
 @dataclass(frozen=True)

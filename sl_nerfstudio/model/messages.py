@@ -15,7 +15,7 @@ def poses_message(found: ScanAdjustment) -> str:
     if found.adjusted:
         return f"Poses adjusted: {_comparison(found.cross_validation)}."
     return (
-        "Poses NOT changed, because adjusting them did not help beyond chance: "
+        "Poses NOT changed, because adjusting them hardly helped: "
         f"{_comparison(found.cross_validation)}. The starting poses are kept."
     )
 

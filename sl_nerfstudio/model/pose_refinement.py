@@ -26,7 +26,7 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.held_out import BLOCK
 from sl_nerfstudio.dataparser.samples import PixelSamples
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.geometry.se3 import inverse, log_se3
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 from sl_nerfstudio.scan import Scan, measured_length
@@ -122,8 +122,9 @@ def adjust_scan(
         return ScanAdjustment(
             found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics, found.unplaced
         )
-    joint = joint_of_prior(stated, start)
-    return ScanAdjustment(start, stated.sigma, joint, decision, found.noise_px, found.intrinsics, found.unplaced)
+    nothing_learnt = decision.worse or refine == "off"
+    sigma, joint = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
+    return ScanAdjustment(start, sigma, joint, decision, found.noise_px, found.intrinsics, found.unplaced)
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,19 @@ class Found:
     noise_px: float
     intrinsics: SelfCalibration | None
     unplaced: tuple[int, ...]  # frames that do not agree with the others
+
+
+def _known_by_both(start: Rig, found: Found) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint joint"]]:
+    """Uncertainty of starting poses with which the captures agree as well as with the adjusted ones.
+
+    They may be wrong by as much as the adjusted ones, and by as much as the two differ.
+    """
+    pairs = (start.T_world_camera, found.rig.T_world_camera), (start.T_camera_projector, found.rig.T_camera_projector)
+    apart = torch.stack([log_se3(a @ inverse(b)) for a, b in pairs])
+    joint = found.joint.clone()
+    poses = apart.numel()
+    joint[:poses, :poses] += torch.outer(apart.flatten(), apart.flatten())
+    return (found.sigma**2 + apart.transpose(0, 1).flatten(1) ** 2).sqrt(), joint
 
 
 def adjusted(

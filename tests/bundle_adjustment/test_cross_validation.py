@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.cross_validation import HeldOutPixels, cross_validate, mean_and_error
+from sl_nerfstudio.bundle_adjustment.cross_validation import (
+    CrossValidation,
+    HeldOutPixels,
+    cross_validate,
+    mean_and_error,
+)
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 
 from .analytic import ExactMaps, decoded_at, disturbed, rig_of
@@ -81,6 +86,13 @@ def test_a_difference_within_its_standard_error_decides_nothing(true, maps, held
     found = [cross_validate(true, nudge, noisy, maps, NOISE) for nudge in nudges]
     assert {f.difference < 0 for f in found} == {True, False}  # a comparison without a margin would keep some
     assert not any(f.better for f in found)
+
+
+def test_a_gain_that_biased_decoding_could_explain_decides_nothing():
+    """Beyond chance by ten standard errors, but by less than a hundredth of the mean square."""
+    common = {"standard_error": 0.00005, "standard_errors": 2.0, "least_gain": 0.01}
+    assert not CrossValidation(before_px=0.3, after_px=0.2992, difference=-0.0005, **common).better
+    assert CrossValidation(before_px=0.3, after_px=0.298, difference=-0.0012, **common).better
 
 
 def test_the_standard_error_is_that_of_independent_blocks():

@@ -181,6 +181,15 @@ def test_poses_that_do_not_improve_are_kept_bit_for_bit(scan, true):
     assert poses_message(found).startswith("Poses NOT changed")
 
 
+def test_poses_that_are_right_are_kept_and_known_as_well_as_the_captures_tell(scan):
+    found = adjust_scan(scan, S_SCENE_WORLD, build_samples(scan), "free", PriorConfig(), QUICK)
+    rig, prior = scene_rig(scan, S_SCENE_WORLD), pose_prior(scan, S_SCENE_WORLD, PriorConfig())
+    assert not found.adjusted and torch.equal(found.rig.T_world_camera, rig.T_world_camera)
+    assert (found.sigma < 0.5 * prior.sigma).all()
+    frames = found.joint.diagonal()[: 6 * FRAMES].sqrt().reshape(FRAMES, 6)
+    assert (frames < 0.5 * prior.sigma[:, :6]).all()
+
+
 def test_the_prior_is_the_stated_one_else_the_default(scan, true):
     stated = PoseSigma(
         camera_translation=2.0, camera_rotation_deg=1.5, relative_translation=0.0, relative_rotation_deg=0.1
