@@ -49,6 +49,18 @@ def test_errors_of_the_network_are_removed(pixels, blur, noise, bound):
     assert np.median(agreement) > (0.9 if noise < 0.02 else 0.6)
 
 
+def test_waves_two_periods_long_are_recovered_from_their_mean():
+    """A single fit averages over about a period, and finds less than half of them."""
+    flat = surface(14)
+    wave = 1.2 * np.sin(np.arange(160) * np.pi / 14).astype(np.float32)
+    truth = flat + wave[:, None, None]
+    image = photograph(truth, 0.8, 0.005, np.random.default_rng(0))
+    grids = draw_sharpnesses(GRID.render(), 20.0)
+    out, _ = fit_densely(image, flat, np.ones(image.shape, np.float32), grids, 14.0)
+    found = (out - flat)[20:-20, 20:-20].mean((1, 2)) @ wave[20:-20] / (wave[20:-20] @ wave[20:-20])
+    assert 0.75 < found < 1.1
+
+
 def test_a_dark_photograph_gives_the_same_as_a_bright_one():
     """Lit twice as much on one side as on the other, and exposed with a fifth of the light."""
     truth = surface(14)

@@ -25,7 +25,7 @@ _LEAST_AREA = 1.0  # smaller regions are left out, periods squared
 _FINEST = 12.0  # pixels per period: finer captures are averaged first
 _LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
-_ROUNDS = 4
+_ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
 _SMOOTHING = 0.35  # window in which coordinates are taken to be linear, periods
 _LARGEST_SHIFT = 0.12  # periods, of all rounds together
 
