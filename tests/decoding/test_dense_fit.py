@@ -58,7 +58,7 @@ def test_waves_two_periods_long_are_recovered_from_their_mean():
     grids = draw_sharpnesses(GRID.render(), 20.0)
     out, _ = fit_densely(image, flat, np.ones(image.shape, np.float32), grids, 14.0)
     found = (out - flat)[20:-20, 20:-20].mean((1, 2)) @ wave[20:-20] / (wave[20:-20] @ wave[20:-20])
-    assert 0.75 < found < 1.1
+    assert 0.7 < found < 1.1
 
 
 def test_a_dark_photograph_gives_the_same_as_a_bright_one():
