@@ -17,6 +17,7 @@ from sl_nerfstudio.verdict.settings import VerdictSettings
 from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, worst
 
 ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
+GOOD_ACCURACY, ACCEPTABLE_ACCURACY = 0.25, 1.0  # percent of the size
 _ORDER: dict[str, int] = {"good": 0, "unknown": 1, "acceptable": 1, "poor": 2}
 
 
@@ -43,11 +44,13 @@ def judge(
     steps: TrainedSteps | None = None,
     capture: NextView | None = None,
     unplaced: Sequence[str] = (),
+    length_sigma: float | None = None,
 ) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
     `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
-    `unplaced`: frames that the training could not place; a surface that they took part in is poor.
+    `unplaced`: frames that the training could not place; a surface that they took part in is poor. `length_sigma`: 1
+    sigma of distances across the surface, as a share of them (`lengths.typical_sigma`), None if it is not known.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -80,6 +83,7 @@ def judge(
         _geometry(evaluation),
         *([] if evaluation.completeness is None else completeness_figures(evaluation.completeness, evaluation.units)),
         *([] if steps is None else [training_figure(steps)]),
+        *([] if length_sigma is None else [_lengths(length_sigma)]),
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
@@ -187,6 +191,16 @@ def _geometry(evaluation: Evaluation) -> JudgedFigure:
         f"{fit.depth_per_px:.3g} {evaluation.units} of depth; where that is a lot, a low residual proves little.",
         "hold the projector farther from the camera in the next scan, or keep the calibrated relative pose "
         "(refine-poses known-rig)",
+    )  # fmt: skip
+
+
+def _lengths(sigma: float) -> JudgedFigure:
+    """As limits of the accuracy: a surface that may be off by that much is no better than one that is."""
+    return judged(
+        "Sigma of lengths", 100 * sigma, "{:.2f} %", GOOD_ACCURACY, ACCEPTABLE_ACCURACY, "≤ {} %",
+        "Stated 1 sigma of distances across the surface, as a share of them (median); from poses, intrinsics, noise.",
+        "state how well the intrinsics are known (--pipeline.model.prior.intrinsics), or add frames that overlap "
+        "with the others from other directions",
     )  # fmt: skip
 
 
