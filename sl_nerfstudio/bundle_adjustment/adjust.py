@@ -15,11 +15,26 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import Evidence, gauge_free, pose_covariance
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters, RefinePoses, free_parameters
+from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
+    departure_of,
+    drawn_start,
+    farthest_frame,
+    shake,
+    widened,
+)
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
 from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
-from sl_nerfstudio.bundle_adjustment.residuals import Observations, Residuals, linearise, residuals_of, viewing_cosines
+from sl_nerfstudio.bundle_adjustment.residuals import (
+    Anchors,
+    Observations,
+    Residuals,
+    linearise,
+    residuals_of,
+    viewing_cosines,
+)
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of, noise_ratios
 from sl_nerfstudio.bundle_adjustment.self_calibration import (
@@ -33,6 +48,7 @@ from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread
 
 _NO_GATE = float("inf")  # pixels: no residual is too large to be used
+_FRAMES_MOVE = ("free", "rigid-rig", "known-rig")
 
 
 @dataclass(frozen=True)
@@ -93,6 +109,7 @@ class _Problem:
     settings: AdjustmentSettings
     generator: torch.Generator
     partners: Bool[Tensor, "frames frames"]
+    anchors: Anchors  # where they are with the starting poses
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor."""
@@ -173,17 +190,32 @@ def adjust(
     The gauge stays where the prior puts it; `gauge.restore` sets the scale afterwards. Frames that share nothing with
     others do not move.
     """
+    problem = _problem(start, maps, prior, settings)
+    first = _search(problem, refine)
+    if first is None:
+        return _unmoved(start, prior, free_parameters(refine, start), settings)
+    found, before = first
+    return _with_other_minima(problem, refine, found, _result(problem, refine, found, before))
+
+
+def _problem(start: Rig, maps: CoordinateMaps, prior: PosePrior, settings: AdjustmentSettings) -> _Problem:
+    """A search from `start`, to which the prior belongs."""
     generator = torch.Generator().manual_seed(settings.seed)
     per_frame = min(settings.anchors_per_frame, settings.max_anchors // start.frames)
     per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
     anchors = place_anchors(start, maps, per_frame, generator)
     together = partners(start, anchors, maps, settings.partners, settings.least_cosine, generator)
-    problem = _Problem(start, maps, prior, settings, generator, together)
-    state = LMState(start, anchors, settings.steps.damping)
+    return _Problem(start, maps, prior, settings, generator, together, anchors)
+
+
+def _search(problem: _Problem, refine: RefinePoses) -> tuple[_Progress, float] | None:
+    """All stages, and the median residual at the start; None if there is nothing to search."""
+    start, settings = problem.start, problem.settings
+    state = LMState(start, problem.anchors, settings.steps.damping)
     rows = problem.observe(state)
-    r = residuals_of(start, anchors, rows, maps)
+    r = residuals_of(start, state.anchors, rows, problem.maps)
     if settings.max_iterations < 1 or not r.cross_valid.any():
-        return _unmoved(start, prior, free_parameters(refine, start), settings)
+        return None
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
     widths = torch.full((start.frames,), float("inf"), dtype=torch.float64)
     found = _Progress(state, rows, widths, max(before, settings.kernel.noise_floor_px), 0)
@@ -192,12 +224,52 @@ def adjust(
         found = _run(problem, stage, found)
     found = _relocalised(problem, refine, rough[-1], found)
     found = _run(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
-    return _result(problem, refine, found, before)
+    return found, before
+
+
+def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment) -> Adjustment:
+    """The result; where it is one of several, its covariance covers those that other searches find."""
+    s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
+    asked = s.searches > 0 and refine in _FRAMES_MOVE and result.rig.frames <= s.most_frames
+    if not asked or _leads_back(problem, refine, found, result, generator):
+        return result
+    departures, limits = [], s.worse * _misfits(problem.maps, found)
+    for _ in range(s.searches):
+        start = drawn_start(result.rig, problem.prior, refine == "free", generator)
+        other = _search(_problem(start, problem.maps, problem.prior, problem.settings), refine)
+        if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
+            departures.append(departure_of(other[0].state.rig, result.rig))
+    return replace(result, joint=widened(result.joint, departures))
+
+
+def _misfits(maps: CoordinateMaps, found: _Progress) -> Float[Tensor, "frames"]:
+    """Median residual of each frame's look-ups."""
+    state = found.state
+    r = residuals_of(state.rig, state.anchors, found.rows, maps)
+    return frame_medians(r, found.pairs, state.rig.frames)
+
+
+def _leads_back(
+    problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment, generator: torch.Generator
+) -> bool:
+    """Whether some steps lead back to the result from poses beside it."""
+    s, state = problem.settings.other_minima, found.state
+    delta, rho = shake(result.joint, s.shake_sigmas, generator).reshape(2, -1, 6)
+    linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
+    kernel = _kernel(state, found.rows, found.widths, linear.residuals, problem)
+    equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
+    depth = state.anchors.depth + equations.depth_step(torch.cat([delta, rho], 1))
+    steps = problem.settings.steps
+    depth = depth.clamp(steps.least_depth * state.anchors.depth, steps.most_depth * state.anchors.depth)
+    beside = replace(state, rig=state.rig.moved(delta, rho), anchors=state.anchors.at(depth))
+    back = _run(problem, _Stage(refine, False, s.shake_steps), replace(found, state=beside))
+    left = farthest_frame(result.joint, departure_of(back.state.rig, state.rig))
+    return left <= s.most_left * s.shake_sigmas
 
 
 def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _Progress) -> _Progress:
     """Place lost frames again and adjust everything with them, until no frame moves any more."""
-    if refine not in ("free", "rigid-rig", "known-rig"):
+    if refine not in _FRAMES_MOVE:
         return found
     for _ in range(problem.settings.relocalisation.rounds):
         rig = relocalise(

@@ -6,6 +6,11 @@ gradient is summed over blocks of each image, and the spread of those sums provi
 cluster-robust "sandwich": Liang and Zeger, Biometrika 1986). The larger of the two is reported. The intrinsics are
 uncertain, too (`self_calibration`).
 
+What dependent residuals say counts less against the prior, too: all is computed once with the noise of one look-up, and
+again with noise that is larger by the median factor between both estimates (a tempered likelihood: Ribatet, Cooley and
+Davison, Statistica Sinica 2012). Otherwise prior and data together would know less than the prior alone. What the
+captures say about the intrinsics is reported with the first.
+
 Two things make a normal matrix too large. Weights of a robust kernel are not its second derivative
 (`Kernel.curvature`). And derivatives by the poses hold slopes of the decoded maps, whose errors add up in it as
 squares: along directions of which residuals know little, they outweigh what is there ("errors in variables"). So its
@@ -81,45 +86,82 @@ def pose_covariance(
     if free.count == 0:
         poses_exact = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
         return PoseCovariance(torch.block_diag(poses_exact, (prior.intrinsics_sigma**2).diag()), None)
-    poses_H, poses_g = prior_equations(prior, start, e.rig)
-    weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
-    prior_H = noise**2 * poses_H, noise**2 * weight
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
     known = normal_equations(e.smooth, e.rows, *weights)
-    known.H_common.diagonal().add_(prior_H[1])
-    change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
-    g = torch.cat([(equations.g + noise**2 * poses_g).flatten(), equations.g_common + noise**2 * weight * change])
-    G = _gauge(e.rig, len(g))
-    C = _expanded_inverse(free, known, prior_H[0])
-    _remove_gauge(C, G)
-    formal = C.T.contiguous()
-    _remove_gauge(formal, G)
-    squares, blocks = _spread(e, equations.depths, weights, C)
-    free_blocks = max(blocks - free.count - UNKNOWNS, blocks / 4)  # degrees of freedom left after the fit of the poses
-    curvature = max(e.kernel.curvature(e.linear.residuals), e.least_curvature)
-    robust = blocks / max(free_blocks, 1.0) / curvature**2 * squares + noise**2 * _quadratic(C, *prior_H)
-    formal *= noise**2
-    larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
+    problem = _Linear(e, free, weights, equations, known, _prior_terms(prior, start, e.rig))
+    formal, larger, step = problem.second_moments(noise)
+    own = slice(12 * n, None)
+    calibration = SelfCalibration(step[own].clone(), torch.outer(larger[own], larger[own]) * formal[own, own])
+    moves = formal.diagonal()[: 12 * n] > 0
+    dependence = float(larger[: 12 * n][moves].median()) if moves.any() else 1.0
+    formal, larger, step = problem.second_moments(dependence * noise)
     formal *= larger
     formal *= larger[:, None]
-    step = -C @ g
-    intrinsics = slice(12 * n, None)
-    calibration = SelfCalibration(step[intrinsics].clone(), formal[intrinsics, intrinsics].clone())
     formal.addr_(step, step)
     return PoseCovariance(matrix_by_kind(formal, n), calibration)
 
 
+@dataclass(frozen=True)
+class _PriorTerms:
+    """What the prior adds to the normal equations, for a noise of one pixel."""
+
+    frames_H: Float[Tensor, "frames 12 12"]
+    common_H: Float[Tensor, "common"]  # diagonal
+    g: Float[Tensor, "unknowns"]
+
+
+def _prior_terms(prior: PosePrior, start: Rig, rig: Rig) -> _PriorTerms:
+    H, g = prior_equations(prior, start, rig)
+    weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
+    change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
+    return _PriorTerms(H, weight, torch.cat([g.flatten(), weight * change]))
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The adjustment at its result, as a linear problem."""
+
+    evidence: Evidence
+    free: FreeParameters
+    weights: tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]
+    equations: NormalEquations
+    known: NormalEquations  # with derivatives of wide windows
+    prior: _PriorTerms
+
+    def second_moments(
+        self, noise: float
+    ) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"], Float[Tensor, "unknowns"]]:
+        """Covariance for independent residuals, the factor by which each sigma is really larger, and the step left."""
+        e, prior, count = self.evidence, self.prior, self.free.count
+        prior_H = noise**2 * prior.frames_H, noise**2 * prior.common_H
+        g = torch.cat([self.equations.g.flatten(), self.equations.g_common]) + noise**2 * prior.g
+        G = _gauge(e.rig, len(g))
+        C = _expanded_inverse(self.free, self.known, prior_H)
+        _remove_gauge(C, G)
+        formal = C.T.contiguous()
+        _remove_gauge(formal, G)
+        squares, blocks = _spread(e, self.equations.depths, self.weights, C)
+        free_blocks = max(blocks - count - UNKNOWNS, blocks / 4)  # degrees of freedom left after the fit of the poses
+        curvature = max(e.kernel.curvature(e.linear.residuals), e.least_curvature)
+        robust = blocks / max(free_blocks, 1.0) / curvature**2 * squares + noise**2 * _quadratic(C, *prior_H)
+        formal *= noise**2
+        larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
+        return formal, larger, -C @ g
+
+
 def _expanded_inverse(
-    free: FreeParameters, equations: NormalEquations, prior: Float[Tensor, "frames 12 12"]
+    free: FreeParameters,
+    equations: NormalEquations,
+    prior: tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "common"]],
 ) -> Float[Tensor, "unknowns unknowns"]:
     """The inverse of the normal matrix of the free parameters and the intrinsics, as increments of all frames."""
     count, common = free.count, UNKNOWNS
     H = torch.zeros(count + common, count + common, dtype=torch.float64)
-    H[:count, :count] = free.matrix(equations.matrix(prior))
+    H[:count, :count] = free.matrix(equations.matrix(prior[0]))
     H[:count, count:] = free.vector(equations.border)
     H[count:, :count] = H[:count, count:].T
-    H[count:, count:] = equations.H_common
+    H[count:, count:] = equations.H_common + prior[1].diag()
     inverse_H = inverted(H)
     if free.own.shape[2] == 12:
         return inverse_H

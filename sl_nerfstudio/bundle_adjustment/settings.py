@@ -112,6 +112,24 @@ class RelocalisationSettings:
 
 
 @dataclass(frozen=True)
+class OtherMinimaSettings:
+    """The question whether other poses agree as well with the captures, and how far away they are."""
+
+    shake_sigmas: float = 2.0
+    """Distance from the result, in its sigma, from which further steps should lead back."""
+    shake_steps: int = 6
+    """Most of those steps."""
+    most_left: float = 0.35
+    """Share of that distance that may be left in any frame."""
+    searches: int = 3
+    """Searches from other starting poses if more is left; 0: never any."""
+    most_frames: int = 100
+    """Frames beyond which the question is not asked: it takes time, and many frames hold each other."""
+    worse: float = 1.4
+    """Median residual of any frame, relative to the result's, beyond which such a search has lost that frame."""
+
+
+@dataclass(frozen=True)
 class CrossValidationSettings:
     """The decision whether adjusted poses (or intrinsics) are kept, based on held-out pixels."""
 
@@ -182,6 +200,8 @@ class AdjustmentSettings:
     """Levenberg-Marquardt steps."""
     relocalisation: RelocalisationSettings = field(default_factory=RelocalisationSettings)
     """Search for frames that ended in a wrong minimum."""
+    other_minima: OtherMinimaSettings = field(default_factory=OtherMinimaSettings)
+    """Other poses that agree as well."""
     cross_validation: CrossValidationSettings = field(default_factory=CrossValidationSettings)
     """Decision between the result and the starting poses."""
     self_calibration: SelfCalibrationSettings = field(default_factory=SelfCalibrationSettings)

@@ -68,7 +68,7 @@ def _evaluate(config: EvalConfig) -> None:
     from sl_nerfstudio.evaluation.evaluate import evaluate
     from sl_nerfstudio.evaluation.inputs import read_inputs
     from sl_nerfstudio.evaluation.judgement import judge
-    from sl_nerfstudio.evaluation.lengths import measure_lengths
+    from sl_nerfstudio.evaluation.lengths import measure_lengths, typical_sigma
     from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
     from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
     from sl_nerfstudio.evaluation.result_json import to_json
@@ -86,7 +86,8 @@ def _evaluate(config: EvalConfig) -> None:
     )  # fmt: skip
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
     capture = _next_capture(evaluation, inputs)
-    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced)
+    sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma)
     results: dict[Path, str] = {}
     if config.json:
         document = to_json(evaluation, judgement.verdict, capture, lengths)

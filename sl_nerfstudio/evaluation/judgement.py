@@ -43,11 +43,13 @@ def judge(
     steps: TrainedSteps | None = None,
     capture: NextView | None = None,
     unplaced: Sequence[str] = (),
+    length_sigma: float | None = None,
 ) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
     `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
-    `unplaced`: frames that the training could not place; a surface that they took part in is poor.
+    `unplaced`: frames that the training could not place; a surface that they took part in is poor. `length_sigma`: 1
+    sigma of distances across the surface, as a share of them (`lengths.typical_sigma`), None if it is not known.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -80,6 +82,7 @@ def judge(
         _geometry(evaluation),
         *([] if evaluation.completeness is None else completeness_figures(evaluation.completeness, evaluation.units)),
         *([] if steps is None else [training_figure(steps)]),
+        *([] if length_sigma is None else [_lengths(length_sigma)]),
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
@@ -187,6 +190,16 @@ def _geometry(evaluation: Evaluation) -> JudgedFigure:
         f"{fit.depth_per_px:.3g} {evaluation.units} of depth; where that is a lot, a low residual proves little.",
         "hold the projector farther from the camera in the next scan, or keep the calibrated relative pose "
         "(refine-poses known-rig)",
+    )  # fmt: skip
+
+
+def _lengths(sigma: float) -> JudgedFigure:
+    """Intrinsics that nobody has stated are good to 0.5 %: no scan needs to know its lengths better than those."""
+    return judged(
+        "Sigma of lengths", 100 * sigma, "{:.2f} %", 0.5, 2.0, "≤ {} %",
+        "Stated 1 sigma of distances across the surface, as a share of them (median); from poses, intrinsics, noise.",
+        "state how well the intrinsics are known (--pipeline.model.prior.intrinsics), or add frames that overlap "
+        "with the others from other directions",
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.scan import Scan
 
 _OFF_SURFACE = 0.02  # of the mesh's diagonal: a point that is farther away was not meant to be on this mesh
+_TYPICAL, _LONG = 400, 0.3  # how many distances say what is typical, and the shortest one, of the mesh's diagonal
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = rf"{_NUMBER},{_NUMBER},{_NUMBER}"
 
@@ -123,6 +124,22 @@ def measure_lengths(
         )
         for k, pair in enumerate(pairs)
     ]
+
+
+def typical_sigma(
+    mesh: Mesh, quality: VertexQuality | None, scan: Scan, poses: DevicePoses, joint: JointCovariance | None
+) -> float | None:
+    """Median 1 sigma of distances across the surface, as a share of their length; None if it is not known."""
+    seen = np.flatnonzero(quality.views > 0) if quality is not None else np.empty(0)
+    if quality is None or joint is None or len(seen) < 2:
+        return None
+    ends = np.random.default_rng(0).choice(seen, (_TYPICAL, 2))
+    length = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
+    long = length > _LONG * IndexedMesh(mesh).diagonal
+    if not long.any():
+        return None
+    found = length_sigma(mesh, quality.sigma_independent, ends[long], scan, poses, joint)
+    return _known(float(np.nanmedian(np.hypot(found.shared, found.independent) / length[long])))
 
 
 def _triple(p: Float[ndarray, "3"]) -> tuple[float, float, float]:

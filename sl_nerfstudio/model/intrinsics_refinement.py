@@ -47,12 +47,13 @@ def refine_intrinsics(
     """
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples, settings)
     s = settings.self_calibration
+    once = replace(settings, other_minima=replace(settings.other_minima, searches=0))  # poses are adjusted again later
 
     def adjusted_with(change: IntrinsicsChange) -> Found:
         scan = loaded.scan.with_intrinsics_change(change)
         start = scene_rig(scan, loaded.S_scene_world)
         known = pose_prior(scan, loaded.S_scene_world, prior)
-        return adjusted(scan, loaded.S_scene_world, start, maps, refine, known, settings)
+        return adjusted(scan, loaded.S_scene_world, start, maps, refine, known, once)
 
     before = adjusted_with(stated)
     if before.intrinsics is None or not before.intrinsics.contradicts(s):

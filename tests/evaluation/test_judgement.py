@@ -34,6 +34,13 @@ def test_a_frame_that_training_could_not_place_makes_the_scan_poor() -> None:
     assert verdict.band == "poor" and verdict.reasons[0].startswith("frame_00001: could not be placed")
 
 
+@pytest.mark.parametrize(("sigma", "band"), [(0.002, "good"), (0.008, "acceptable"), (0.05, "poor")])
+def test_lengths_that_are_badly_known_are_no_good_scan(sigma: float, band: str) -> None:
+    verdict = judge(GOOD, length_sigma=sigma)
+    assert verdict.verdict.band == band
+    assert [f.text for f in verdict.figures if f.name == "Sigma of lengths"] == [f"{100 * sigma:.2f} %"]
+
+
 def _with(**changes) -> dict:
     """Five good frames and one that is not."""
     return {"frames": (*[FRAME] * 5, replace(FRAME, name="frame_00007", **changes))}

@@ -1,5 +1,6 @@
 """Distances between points: their errors against differences of triangulated points, and what is said of bad input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.lengths import PointPair, measure_lengths, parse_pair, read_pairs
+from sl_nerfstudio.evaluation.lengths import PointPair, measure_lengths, parse_pair, read_pairs, typical_sigma
 from sl_nerfstudio.geometry.se3 import exp_se3
 from sl_nerfstudio.meshing.length_uncertainty import point_rows
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
@@ -106,6 +107,21 @@ def test_a_length_has_the_uncertainty_of_its_ends(scan, rows):
     for known in ((None, joint), (quality(), None)):
         (unknown,) = measure_lengths([pair], mesh, known[0], scan, scan.poses, known[1])
         assert unknown.sigma is None and unknown.length == length.length
+
+
+def test_what_is_typical_of_lengths_is_their_growth(scan):
+    """If all poses grow by a common, unknown factor, every length is as uncertain as the factor."""
+    mesh, known = FacetedScan().truth(), quality()
+    growth = np.zeros((2, FRAMES, 6))
+    growth[0, :, :3] = scan.poses.T_world_camera[:, :3, 3]
+    growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
+    step = 0.01 * np.r_[growth.ravel(), np.zeros(6)]
+    exact = replace(known, sigma_independent=np.zeros(len(mesh.vertices)))
+    joint = JointCovariance(np.outer(step, step))
+    assert typical_sigma(mesh, exact, scan, scan.poses, joint) == pytest.approx(0.01, rel=1e-6)
+    unseen = replace(known, views=np.zeros_like(known.views))
+    for quality_, joint_ in ((None, joint), (known, None), (unseen, joint)):
+        assert typical_sigma(mesh, quality_, scan, scan.poses, joint_) is None
 
 
 def test_pairs_are_read_as_they_are_written(tmp_path):

@@ -1,0 +1,78 @@
+"""Other poses that agree with the captures as well: where nothing holds a frame, the objective has many minima.
+
+On a surface that slides along itself (a vase about its axis, parallel planes) errors of the look-ups make small
+minima wherever a frame may be, and the curvature of one of them says little about how far the others are. Whether a
+result is one of many shows when it is shaken: steps lead it back, or they do not. If they do not, searches from other
+starting poses, drawn within their stated uncertainty, show how far the minima spread. (Randomised maximum likelihood:
+Chen and Oliver, Mathematical Geosciences, 2012; the data stay as they are.)
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, gauge_directions, restore
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior
+from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
+from sl_nerfstudio.geometry.se3 import exp_se3, exp_so3, inverse, log_se3
+
+
+def shake(joint: Float[Tensor, "joint joint"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:
+    """A random increment (delta, rho) of some sigmas of the poses, the intrinsics staying as they are."""
+    variance, axes = torch.linalg.eigh(_given_intrinsics(joint))
+    draw = torch.randn(len(variance), generator=generator, dtype=torch.float64)
+    return axes @ (sigmas * variance.clamp_min(0).sqrt() * draw)
+
+
+def farthest_frame(joint: Float[Tensor, "joint joint"], departure: Float[Tensor, "unknowns"]) -> float:
+    """Increment of the frame that departs most, in sigma of the poses given the intrinsics (RMS over its six)."""
+    sigma = _given_intrinsics(joint).diagonal().clamp_min(0).sqrt()
+    ratio = torch.where(sigma > 0, departure / sigma, torch.zeros_like(sigma))
+    return float(ratio[: len(ratio) // 2].reshape(-1, 6).pow(2).mean(1).max().sqrt())
+
+
+def departure_of(other: Rig, rig: Rig) -> Float[Tensor, "unknowns"]:
+    """Increments (delta, rho) from `rig` to `other`, without motion and growth of the scene as a whole."""
+    there = restore(rig, other, baseline_scale(rig, other, None))
+    pairs = (
+        (there.T_world_camera, rig.T_world_camera),
+        (there.T_camera_projector, rig.T_camera_projector),
+    )
+    step = torch.cat([log_se3(theirs @ inverse(mine)).reshape(-1) for theirs, mine in pairs])
+    G = gauge_directions(rig)
+    return step - G @ torch.linalg.solve(G.T @ G, G.T @ step)
+
+
+def drawn_start(rig: Rig, prior: PosePrior, with_projectors: bool, generator: torch.Generator) -> Rig:
+    """Starting poses as uncertain as the stated ones, about `rig`; projectors stay in their frames, or move as well."""
+    draw = torch.randn(rig.frames, 12, generator=generator, dtype=torch.float64) * prior.sigma
+    frames = replace(rig, T_world_camera=exp_se3(draw[:, :6]) @ rig.T_world_camera)
+    if not with_projectors:
+        return frames
+    T = rig.T_camera_projector.clone()
+    T[:, :3, :3] = exp_so3(draw[:, 9:]) @ T[:, :3, :3]
+    T[:, :3, 3] += draw[:, 6:9]
+    return replace(frames, T_camera_projector=T)
+
+
+def widened(
+    joint: Float[Tensor, "joint joint"], departures: Sequence[Float[Tensor, "unknowns"]]
+) -> Float[Tensor, "joint joint"]:
+    """The covariance with the mean square of what other searches found, none of them better than the others."""
+    out, k = joint.clone(), len(joint) - UNKNOWNS
+    for departure in departures:
+        out[:k, :k].addr_(departure, departure, alpha=1 / len(departures))
+    return out
+
+
+def _given_intrinsics(joint: Float[Tensor, "joint joint"]) -> Float[Tensor, "unknowns unknowns"]:
+    k = len(joint) - UNKNOWNS
+    common = joint[k:, k:]
+    scale = common.diagonal().clamp_min(1e-30).sqrt()
+    inner = torch.linalg.pinv(common / torch.outer(scale, scale), hermitian=True)
+    border = joint[:k, k:] / scale
+    return joint[:k, :k] - border @ inner @ border.T

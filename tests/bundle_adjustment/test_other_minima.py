@@ -1,0 +1,113 @@
+"""Where captures do not hold the frames, stated sigma covers how far other minima are; elsewhere nothing changes."""
+
+from dataclasses import replace
+from math import radians
+
+import pytest
+import torch
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.adjust import adjust
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
+    departure_of,
+    drawn_start,
+    farthest_frame,
+    shake,
+    widened,
+)
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, OtherMinimaSettings
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
+
+from . import analytic
+from .analytic import disturbed, images_of, rig_of
+
+FRAMES, SIZE = 4, 100
+SIGMAS = (0.03, radians(1.0), 0.003, radians(0.1))
+PRIOR = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in SIGMAS), intrinsics=0.0)
+SETTINGS = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_iterations=30)
+ONE_SEARCH = replace(SETTINGS, other_minima=OtherMinimaSettings(searches=0))
+
+
+def noisy_maps(seed: int, noise: float, size: int = SIZE) -> CoordinateMaps:
+    """Of the scene as it is now."""
+    generator = torch.Generator().manual_seed(seed)
+    images = images_of(rig_of(FRAMES, size), size)
+    return CoordinateMaps.of([image + noise * torch.randn(size, size, 2, generator=generator) for image in images])
+
+
+def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monkeypatch):
+    monkeypatch.setattr(analytic, "BALLS", ())
+    true = rig_of(FRAMES, SIZE)
+    start, maps, rms = disturbed(true, 0), noisy_maps(0, 0.02), []
+    for settings in (ONE_SEARCH, SETTINGS):
+        found = adjust(start, maps, PRIOR, "known-rig", settings)
+        error = departure_of(true, found.rig)[: 6 * FRAMES]
+        rms.append(float((error / found.covariance.diagonal()[: 6 * FRAMES].sqrt()).pow(2).mean().sqrt()))
+    one, several = rms
+    assert several < 1.5 < one
+
+
+def test_a_scene_that_holds_its_frames_is_searched_once():
+    size = 240
+    start, maps = disturbed(rig_of(FRAMES, size), 1), noisy_maps(1, 0.3, size)
+    one, several = (
+        adjust(start, maps, PRIOR, "known-rig", replace(s, anchors_per_frame=300)) for s in (ONE_SEARCH, SETTINGS)
+    )
+    assert torch.equal(one.joint, several.joint)
+    assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera)
+
+
+def random_joint(seed: int) -> Tensor:
+    A = torch.randn(12 * FRAMES + 6, 80, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return A @ A.T / 80
+
+
+def test_a_shake_has_the_covariance_of_the_poses_given_the_intrinsics():
+    joint, generator, k = random_joint(0), torch.Generator().manual_seed(1), 12 * FRAMES
+    draws = torch.stack([shake(joint, 2.0, generator) for _ in range(1000)])
+    wanted = torch.linalg.inv(torch.linalg.inv(joint)[:k, :k])  # precision of the poses alone
+    assert float(((draws.T @ draws / 1000 / 4 - wanted) / wanted.diagonal().max()).abs().max()) < 0.2
+
+
+def test_intrinsics_that_are_exact_change_nothing():
+    joint, k = random_joint(0), 12 * FRAMES
+    joint[k:], joint[:, k:] = 0, 0
+    alone = shake(joint, 1.0, torch.Generator().manual_seed(2))
+    assert alone.isfinite().all() and float(alone.abs().max()) > 0.1
+    assert farthest_frame(joint, torch.zeros(k, dtype=torch.float64)) == 0
+    one = torch.zeros(k, dtype=torch.float64)
+    one[6:12] = 3 * joint.diagonal()[6:12].sqrt()
+    assert farthest_frame(joint, one) == pytest.approx(3)
+
+
+def test_moving_and_scaling_all_frames_is_no_departure():
+    rig = rig_of(FRAMES, SIZE)
+    motion = exp_se3(torch.tensor([0.2, -0.1, 0.3, 0.5, -0.4, 0.3], dtype=torch.float64))
+    moved = replace(rig.scaled(1.7), T_world_camera=motion @ rig.scaled(1.7).T_world_camera)
+    assert float(departure_of(moved, rig).abs().max()) < 1e-9
+    own = torch.zeros(FRAMES, 6, dtype=torch.float64)
+    own[2, 4] = 1e-3
+    assert float(departure_of(rig.moved(own, 0 * own), rig).norm()) > 5e-4
+
+
+@pytest.mark.parametrize("with_projectors", [False, True])
+def test_drawn_starts_scatter_as_the_prior_states(with_projectors):
+    rig, generator = rig_of(FRAMES, SIZE), torch.Generator().manual_seed(0)
+    starts = [drawn_start(rig, PRIOR, with_projectors, generator) for _ in range(300)]
+    delta = torch.stack([log_se3(s.T_world_camera @ inverse(rig.T_world_camera)) for s in starts])
+    T, there = rig.T_camera_projector, torch.stack([s.T_camera_projector for s in starts])
+    shift = there[..., :3, 3] - T[:, :3, 3]
+    turn = log_so3(there[..., :3, :3] @ T[:, :3, :3].transpose(1, 2))
+    found = [part.pow(2).mean().sqrt() for part in (delta[..., :3], delta[..., 3:], shift, turn)]
+    wanted = [s if with_projectors or k < 2 else 0 for k, s in enumerate(SIGMAS)]
+    assert torch.stack(found).tolist() == pytest.approx(wanted, rel=0.1, abs=1e-12)
+
+
+def test_widening_adds_the_mean_square_to_poses_alone():
+    joint, k = random_joint(3), 12 * FRAMES
+    a, b = torch.randn(2, k, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    more = widened(joint, [a, b]) - joint
+    assert torch.allclose(more[:k, :k], (torch.outer(a, a) + torch.outer(b, b)) / 2) and not more[k:].any()
+    assert torch.equal(widened(joint, []), joint)
