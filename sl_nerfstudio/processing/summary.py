@@ -86,6 +86,7 @@ def summarise(
                 tuple(PairFacts(e.frames, e.used, e.overlap * e.fitness**2) for e in records),
                 cross,
                 bool(wrong),
+                () if registration is None else registration.turns_deg,
                 adjusted=not config.no_adjust,
             )
         ),

@@ -25,6 +25,7 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     Uncertainty,
 )
+from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
 
@@ -62,6 +63,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
+        symmetric_turns_deg(graph.sides, edges, solution, settings),
         ordered,
     )  # fmt: skip
 

@@ -111,6 +111,7 @@ class Registration:
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
     uncertainties: tuple[Uncertainty, ...]
     separate: tuple[SeparatePoses, ...] = ()  # of the other components
+    turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that pairs contradict each other
     ordered: bool = True  # frames follow each other in the order of capture; False: stated, or found not to be so
 
 

@@ -310,6 +310,22 @@ class KnownLengthSettings:
 
 
 @dataclass(frozen=True)
+class SymmetrySettings:
+    """When a surface looks the same after a turn."""
+
+    same_rotation_deg: float = 8.0
+    """rotation between two turns, in degrees, below which they are one"""
+    largest_log_scale: float = 0.05
+    """logarithm of the scale of a turn, which is 0 but for the errors of the pairs"""
+    least_agreeing: float = 0.5
+    """points that must agree after the turn, as a share of those that agree before it"""
+    neighbours: int = 6
+    """frames with which each one is compared after the turn"""
+    most_compared: int = 12
+    """turns that are tried"""
+
+
+@dataclass(frozen=True)
 class RegistrationSettings:
     """All settings of registration."""
 
@@ -331,6 +347,8 @@ class RegistrationSettings:
     """all accepted pairs together"""
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
     """which frames are registered"""
+    symmetry: SymmetrySettings = field(default_factory=SymmetrySettings)
+    """whether the surface looks the same after a turn"""
 
 
 FRAME_CLOUD_DEFAULTS = FrameCloudSettings()

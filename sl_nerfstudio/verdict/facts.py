@@ -36,6 +36,7 @@ class ScanFacts:
     pairs: tuple[PairFacts, ...] | None = None  # of registration
     cross: CrossFrameAgreement | None = None  # of the frames in the scan, in their order
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
+    turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property

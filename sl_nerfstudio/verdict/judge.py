@@ -22,6 +22,8 @@ def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         return
     yield from _left_out(facts, settings)
     yield from _undecided(facts, settings)
+    if facts.turns_deg:
+        yield Reason("poor", symmetry_sentence(facts.turns_deg))
     if facts.pairs is not None:
         yield from _weak_connections(facts, settings)
     if facts.cross is not None:
@@ -70,6 +72,16 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     if names:
         band = _share_band(len(names), len(facts.in_scan), settings)
         yield Reason(band, f"{listed(names)}: the pose is undecided; another one fits nearly as well")
+
+
+def symmetry_sentence(turns_deg: Sequence[float]) -> str:
+    """That the surface looks the same after turns, and what it means."""
+    angles = listed([f"{angle:.0f}" for angle in turns_deg])
+    return (
+        f"the object looks the same after a turn by {angles} degrees, and pairs of frames contradict each other by it: "
+        "frames may be placed at another side than they show. The surface is right if the object really is that "
+        "symmetric; for the poses, put something beside it that looks different from all sides"
+    )
 
 
 def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:

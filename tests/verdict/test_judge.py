@@ -52,6 +52,12 @@ def test_one_frame_is_enough_and_many_make_it_poor(change, one, words):
     assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
 
 
+def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
+    verdict = judge_scan(scan(turns_deg=(60.0, 119.8)))
+    assert verdict.band == "poor"
+    assert verdict.reasons[0].startswith("the object looks the same after a turn by 60, 120 degrees, and pairs of")
+
+
 def test_a_group_of_its_own_is_named():
     verdict = judge_scan(scan({k: {"in_scan": False, "component": 1} for k in (2, 3, 4)}))
     assert verdict.band == "acceptable"

@@ -1,0 +1,94 @@
+"""Turns after which the surface looks the same, so that pairs of frames contradict each other (a nut, a gear, a box).
+
+Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say different
+things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the surface to
+where it contradicts; a symmetry does not.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
+from sl_nerfstudio.registration.pairs.edge_weights import quality
+from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.registration.settings import EdgeSettings, RegistrationSettings
+
+
+def symmetric_turns_deg(
+    sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+) -> tuple[float, ...]:
+    """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is."""
+    s, nodes = settings.symmetry, solution.S_world_camera
+    fitness = [e.fitness for e, used in zip(edges, solution.consistent, strict=True) if used]
+    said = _distinct(edges, solution, settings)[: s.most_compared]
+    if not fitness or not said:
+        return ()
+    usual = float(np.quantile(fitness, settings.edge.good_quantile))
+    misfit = settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
+    agreeing, _ = _moved(sides, nodes, Similarity.identity(), settings)
+    turns = []
+    for turn in said:
+        same, contradicting = _moved(sides, nodes, turn, settings)
+        if same > s.least_agreeing * agreeing and contradicting < misfit * (same + contradicting):
+            turns.append(_angle_deg(turn))
+    return tuple(sorted(turns))
+
+
+def _distinct(
+    edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+) -> list[Similarity]:
+    """Clearly different turns of the world; those that the best pairs say come first."""
+    s, found = settings.symmetry, list[Similarity]()
+    for turn in _said(edges, solution, settings.edge):
+        known = (Similarity.identity(), *found, *(T.inverse() for T in found))
+        if abs(np.log(turn.scale)) < s.largest_log_scale and all(
+            _angle_deg(turn @ T.inverse()) > s.same_rotation_deg for T in known
+        ):
+            found.append(turn)
+    return found
+
+
+def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: EdgeSettings) -> Iterator[Similarity]:
+    """By which motions of the world pairs, or their rivals, differ from the solution."""
+    nodes = solution.S_world_camera
+    placed = [
+        (e, used)
+        for e, used in zip(edges, solution.consistent, strict=True)
+        if nodes[e.source] is not None and nodes[e.target] is not None
+    ]
+    for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0], settings))):
+        target, source = node_at(nodes, e.target), node_at(nodes, e.source).inverse()
+        results = [*([] if used else [e.S_target_source]), *(rival.S_target_source for rival in e.rivals)]
+        yield from (target @ S @ source for S in results)
+
+
+def _moved(
+    sides: Sequence[Side], nodes: Nodes, turn: Similarity, settings: RegistrationSettings
+) -> tuple[float, float]:
+    """Points that agree with the registered frames, and that contradict them, if the surface of each is moved."""
+    agreeing = contradicting = 0.0
+    least_cosine = np.cos(np.radians(settings.selection.largest_view_angle_deg))
+    width = Tolerance(0.0, settings.assembly.tolerance_sigmas)
+    frames = [k for k, S in enumerate(nodes) if S is not None]
+    sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
+    for i in frames:
+        moved = turn @ node_at(nodes, i)
+        cosine = sight @ moved.R[:, 2]
+        for k in np.argsort(-cosine, kind="stable")[: settings.symmetry.neighbours].tolist():
+            j = frames[k]
+            if j != i and cosine[k] > least_cosine:
+                S, pair = Hypotheses.of(node_at(nodes, j).inverse() @ moved), settings.pair
+                found = agreement(sides[i], sides[j], S, width, width, pair.agreement)
+                agreeing += float(found.agreeing[0])
+                contradicting += float(found.in_front[0] + pair.agreement.behind * found.behind[0])
+    return agreeing, contradicting
+
+
+def _angle_deg(S: Similarity) -> float:
+    return float(np.degrees(Rotation.from_matrix(S.R).magnitude()))

@@ -1,0 +1,91 @@
+"""Objects that look the same after a turn: named where pairs of frames contradict each other by it, and only there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
+from sl_nerfstudio.registration.pairs.surface_agreement import Side
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
+from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
+from tests.registration.graph_edges import edge
+from tests.registration.shaped_clouds import rendered
+
+FRAMES = 8  # all the way around
+
+
+class Scan:
+    """Frames at their true places, with right pairs of neighbours."""
+
+    def __init__(self, scene: str) -> None:
+        made = rendered(scene, tuple(range(FRAMES)), FRAMES, 90)
+        rng = np.random.default_rng(0)
+        self.nodes = made.S_world_camera
+        self.sides = [Side.sampled(build_surface_map(c), 400, rng) for c in made.clouds]
+        self.pairs = [self.pair(k, (k + 1) % FRAMES) for k in range(FRAMES)]
+
+    def turned(self, i: int, j: int, degrees: float, scale: float = 1.0) -> Similarity:
+        """What a pair says that takes one side of the object for another: it is turned about the vertical axis."""
+        turn = Similarity(scale, Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
+        return self.nodes[j].inverse() @ turn @ self.nodes[i]
+
+    def pair(self, i: int, j: int, rivals: tuple[Rival, ...] = ()) -> PairMatch:
+        return edge(self.nodes, i, j, rivals=rivals)
+
+    def turns(self, *others: PairMatch, used: bool = False) -> tuple[float, ...]:
+        edges = [*self.pairs, *others]
+        consistent = np.array([True] * len(self.pairs) + [used] * len(others))
+        return symmetric_turns_deg(
+            self.sides, edges, PoseGraphSolution(list(self.nodes), consistent), REGISTRATION_DEFAULTS
+        )
+
+
+def contradicting(scan: Scan, degrees: float, scale: float = 1.0) -> PairMatch:
+    right = scan.pair(0, 2)
+    return PairMatch(**{**vars(right), "S_target_source": scan.turned(0, 2, degrees, scale)})
+
+
+@pytest.fixture(scope="module")
+def nut(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    path: Path = tmp_path_factory.mktemp("meshes") / "nut.ply"
+    trimesh.creation.cylinder(30, 25, sections=6).export(path)
+    return Scan(str(path))
+
+
+@pytest.fixture(scope="module")
+def frog() -> Scan:
+    return Scan("frog")
+
+
+def test_a_nut_looks_the_same_after_a_sixth_of_a_turn(nut: Scan) -> None:
+    assert nut.turns(contradicting(nut, 60.0)) == pytest.approx((60.0,), abs=0.1)
+    assert nut.turns(contradicting(nut, 60.0), contradicting(nut, 120.0)) == pytest.approx((60.0, 120.0), abs=0.1)
+
+
+def test_a_rival_says_it_as_well(nut: Scan) -> None:
+    doubtful = nut.pair(0, 2, (Rival(nut.turned(0, 2, -60.0), 0.9),))
+    assert nut.turns(doubtful, used=True) == pytest.approx((60.0,), abs=0.1)
+
+
+def test_pairs_that_agree_with_each_other_leave_no_doubt(nut: Scan) -> None:
+    assert nut.turns() == ()
+
+
+@pytest.mark.parametrize("degrees", [30.0, 45.0, 90.0])
+def test_a_pair_that_fits_by_accident_is_no_symmetry(nut: Scan, degrees: float) -> None:
+    assert nut.turns(contradicting(nut, degrees)) == ()
+
+
+def test_a_symmetry_does_not_change_the_size(nut: Scan) -> None:
+    assert nut.turns(contradicting(nut, 60.0, 1.2)) == ()
+
+
+@pytest.mark.parametrize("degrees", [60.0, 180.0])
+def test_a_frog_has_no_symmetry(frog: Scan, degrees: float) -> None:
+    assert frog.turns(contradicting(frog, degrees)) == ()
