@@ -81,7 +81,7 @@ def _moved(
     sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
     for i in frames:
         moved = turn @ node_at(nodes, i)
-        cosine: Float64[ndarray, "frames"] = sight @ moved.R[:, 2]
+        cosine: Float64[ndarray, "m"] = sight @ moved.R[:, 2]
         for k in np.argsort(-cosine, kind="stable")[: settings.symmetry.neighbours].tolist():
             j = frames[k]
             if j != i and cosine[k] > least_cosine:
