@@ -8,8 +8,6 @@ where it contradicts; a symmetry does not.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -81,7 +79,7 @@ def _moved(
     sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
     for i in frames:
         moved = turn @ node_at(nodes, i)
-        cosine: Float64[ndarray, "m"] = sight @ moved.R[:, 2]
+        cosine = np.asarray(sight @ moved.R[:, 2], dtype=np.float64)
         for k in np.argsort(-cosine, kind="stable")[: settings.symmetry.neighbours].tolist():
             j = frames[k]
             if j != i and cosine[k] > least_cosine:
