@@ -61,5 +61,9 @@ def _read_document(path: Path) -> dict[str, Any]:
             "give the pattern.json that sl-pattern or sl-synth wrote"
         )
     if document.get("sl_pattern") != FORMAT:
-        raise UserError(f"{path}: sl_pattern is {document.get('sl_pattern')!r}, this version reads {FORMAT}")
+        found = f"is {document['sl_pattern']!r}" if "sl_pattern" in document else "is missing"
+        raise UserError(
+            f"{path}: sl_pattern, the version of the file's format, {found}; this version reads {FORMAT}\n"
+            f'    remedy: write the file again with sl-pattern; in one written by hand, add "sl_pattern": {FORMAT}'
+        )
     return document

@@ -70,7 +70,7 @@ def test_a_description_and_its_picture_are_the_same_pattern(grid, path, tmp_path
     [
         ({"kind": "dots"}, 'this describes no pattern: "kind" must be one of "grid", "gray-code"'),
         ({"kind": ["grid"]}, "this describes no pattern"),
-        ({"sl_pattern": 2}, "sl_pattern is 2, this version reads 1"),
+        ({"sl_pattern": 2}, "sl_pattern, the version of the file's format, is 2; this version reads 1"),
         ({"period": None}, "contradicts itself"),
         ({"codes": [[0, 1], [2]]}, "contradicts itself"),
         ({"codes": [[9] * 10] * 7}, "codes must be rows of whole numbers from 0 to 4"),
@@ -82,6 +82,14 @@ def test_faulty_descriptions(path, change, message):
     with pytest.raises(UserError, match=message) as caught:
         read_layout(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_description_by_hand_without_its_version(path):
+    document = json.loads(path.read_text())
+    del document["sl_pattern"]
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match='is missing; this version reads 1\n.*add "sl_pattern": 1'):
+        read_layout(path)
 
 
 def test_a_missing_field(path):
