@@ -2,7 +2,8 @@
 
 Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say different
 things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the surface to
-where it contradicts; a symmetry does not.
+where it contradicts; a symmetry does not. Nor does a short way about the axis of something nearly round, a medal: but
+half of that way contradicts less still, so surfaces do tell. Half the turn of a nut contradicts more.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,9 +36,19 @@ def symmetric_turns_deg(
     turns = []
     for turn in said:
         same, contradicting = _moved(sides, nodes, turn, settings)
-        if same > s.least_agreeing * agreeing and contradicting < misfit * (same + contradicting):
+        if same < s.least_agreeing * agreeing or contradicting > misfit * (same + contradicting):
+            continue
+        same_half, contradicting_half = _moved(sides, nodes, _half(turn), settings)
+        if contradicting * same_half < contradicting_half * same:
             turns.append(_angle_deg(turn))
     return tuple(sorted(turns))
+
+
+def _half(turn: Similarity) -> Similarity:
+    """The turn that gives `turn` if it is made twice: about the same axis, by half the angle."""
+    scale = turn.scale**0.5
+    R = Rotation.from_rotvec(Rotation.from_matrix(turn.R).as_rotvec() / 2).as_matrix()
+    return Similarity(scale, R, np.linalg.solve(np.eye(3) + scale * R, turn.t))
 
 
 def _distinct(

@@ -13,7 +13,7 @@ from sl_nerfstudio.registration.pairs.surface_agreement import Side
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
+from sl_nerfstudio.registration.symmetry import _half, symmetric_turns_deg
 from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 
@@ -89,3 +89,23 @@ def test_a_symmetry_does_not_change_the_size(nut: Scan) -> None:
 @pytest.mark.parametrize("degrees", [60.0, 180.0])
 def test_a_frog_has_no_symmetry(frog: Scan, degrees: float) -> None:
     assert frog.turns(contradicting(frog, degrees)) == ()
+
+
+def test_half_of_a_turn_made_twice_is_the_turn() -> None:
+    rng = np.random.default_rng(1)
+    for degrees in (12.0, 90.0, 179.9):
+        axis = rng.standard_normal(3)
+        R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+        turn = Similarity(1.03, R, rng.standard_normal(3))
+        half = _half(turn)
+        twice = half @ half
+        np.testing.assert_allclose(twice.R, turn.R, atol=1e-12)
+        np.testing.assert_allclose(twice.t, turn.t, atol=1e-12)
+        assert twice.scale == pytest.approx(1.03)
+        assert Rotation.from_matrix(half.R).magnitude() == pytest.approx(np.radians(degrees / 2))
+
+
+@pytest.mark.parametrize("degrees", [10.0, 16.0])
+def test_a_medal_that_slides_a_little_is_not_symmetric(degrees: float) -> None:
+    medal = Scan("medal")
+    assert medal.turns(contradicting(medal, degrees)) == ()
