@@ -31,8 +31,9 @@ def symmetric_turns_deg(
     if not fitness or not said:
         return ()
     usual = float(np.quantile(fitness, settings.edge.good_quantile))
-    misfit = settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
-    agreeing, _ = _moved(sides, nodes, Similarity.identity(), settings)
+    agreeing, as_it_is = _moved(sides, nodes, Similarity.identity(), settings)
+    by_errors = as_it_is / (agreeing + as_it_is) if agreeing else 0.0
+    misfit = by_errors + max(settings.assembly.least_misfit, 1 - usual)  # of pairs, which are never exact
     turns = []
     for turn in said:
         same, contradicting = _moved(sides, nodes, turn, settings)

@@ -88,7 +88,7 @@ def test_a_description_by_hand_without_its_version(path):
     document = json.loads(path.read_text())
     del document["sl_pattern"]
     path.write_text(json.dumps(document))
-    with pytest.raises(UserError, match='is missing; this version reads 1\n.*add "sl_pattern": 1'):
+    with pytest.raises(UserError, match=r'is missing; this version reads 1\n.*add "sl_pattern": 1'):
         read_layout(path)
 
 
