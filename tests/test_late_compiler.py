@@ -1,11 +1,12 @@
-"""An export loads a run without torch's compiler; what was decorated with it still works."""
+"""An export loads a run, and training imports nerfstudio, without torch's compiler; what needs it still works."""
 
 import subprocess
 import sys
 
+import pytest
 import torch
 
-from sl_nerfstudio.runs.late_compiler import compiler_on_demand
+from sl_nerfstudio.late_compiler import compiler_on_demand
 
 CODE = """
 import sys
@@ -40,3 +41,28 @@ def test_a_function_is_compiled_when_it_is_called_first(monkeypatch):
     assert [twice(2.0), twice(3.0)] == [4.0, 6.0]
     assert asked == [{"dynamic": True}]
     assert twice.__doc__ == "Doubles."
+
+
+TRAINING = """
+import sys
+sys.argv = ["/somewhere/ns-train", {method!r}]
+import pytest
+import torch
+real = torch.compile
+import nerfstudio.scripts.train
+weight = torch.nn.Parameter(torch.ones(3))
+optimizer = torch.optim.Adam([weight], fused=True)
+optimizer.zero_grad()
+weight.sum().backward()
+optimizer.step()
+torch.manual_seed(0)
+print("torch._dynamo.eval_frame" in sys.modules, torch.compile is real, round(float(weight[0]), 6))
+print(torch._dynamo.config.suppress_errors, "torch._dynamo.eval_frame" in sys.modules)
+"""
+
+
+@pytest.mark.parametrize(("method", "compiler"), [("sl-neus", False), ("sl-neus-paper", False), ("splatfacto", True)])
+def test_training_by_this_package_goes_without_the_compiler_until_somebody_asks(tmp_path, method, compiler):
+    command = [sys.executable, "-W", "ignore", "-c", TRAINING.format(method=method)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.splitlines()[-2:] == [f"{compiler} True 0.999", "False True"]
