@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial, wraps
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 
+_OURS = __name__.partition(".")[0]
 _COMPILER, _ASKED = "torch._dynamo", "is_compile_supported"
 _importing = ExitStack()
 
@@ -41,10 +43,30 @@ def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
 def begin_imports(command: list[str]) -> None:
     """To be called by what nerfstudio imports first of this package, with the command line.
 
-    If that trains one of this package's methods, nothing in the process needs the compiler.
+    If that trains one of this package's methods, or loads a run of one, nothing in the process needs the compiler.
     """
-    if Path(command[0]).stem == "ns-train" and any(word.startswith("sl-neus") for word in command[1:2]):
+    if _trains_or_loads(command):
         _importing.enter_context(compiler_on_demand(stays_out=True))
+
+
+def _trains_or_loads(command: list[str]) -> bool:
+    name, words = Path(command[0]).stem, command[1:]
+    if not name.startswith("ns-"):
+        return False
+    if name == "ns-train" and any(word.startswith("sl-neus") for word in words[:1]):
+        return True
+    given = [after for word, after in pairwise([*words, ""]) if word == "--load-config"]
+    given += [word.partition("=")[2] for word in words if word.startswith("--load-config=")]
+    return any(_begins_with(Path(path), f"{_OURS}.") for path in given)
+
+
+def _begins_with(path: Path, name: str) -> bool:
+    """Whether the first line of a file has a name; False if it cannot be read."""
+    try:
+        with path.open(errors="replace") as file:
+            return name in file.readline(1000)
+    except OSError:
+        return False
 
 
 def end_imports() -> None:

@@ -43,9 +43,9 @@ def test_a_function_is_compiled_when_it_is_called_first(monkeypatch):
     assert twice.__doc__ == "Doubles."
 
 
-TRAINING = """
+COMMAND = """
 import sys
-sys.argv = ["/somewhere/ns-train", {method!r}]
+sys.argv = {command}
 import pytest
 import torch
 real = torch.compile
@@ -61,8 +61,23 @@ print(torch._dynamo.config.suppress_errors, "torch._dynamo.eval_frame" in sys.mo
 """
 
 
-@pytest.mark.parametrize(("method", "compiler"), [("sl-neus", False), ("sl-neus-paper", False), ("splatfacto", True)])
-def test_training_by_this_package_goes_without_the_compiler_until_somebody_asks(tmp_path, method, compiler):
-    command = [sys.executable, "-W", "ignore", "-c", TRAINING.format(method=method)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("command", "compiler"),
+    [
+        (["/bin/ns-train", "sl-neus"], False),
+        (["ns-train", "sl-neus-paper"], False),
+        (["ns-train", "splatfacto"], True),
+        (["ns-export", "poisson", "--load-config", "ours.yml"], False),
+        (["ns-viewer", "--load-config=ours.yml"], False),
+        (["ns-viewer", "--load-config", "other.yml"], True),
+        (["ns-viewer", "--load-config", "missing.yml"], True),
+        (["ns-viewer", "--load-config"], True),
+        (["pytest", "--load-config", "ours.yml"], True),
+    ],
+)
+def test_commands_of_this_package_go_without_the_compiler_until_somebody_asks(tmp_path, command, compiler):
+    (tmp_path / "ours.yml").write_text("!!python/object:sl_nerfstudio.model.trainer.SLTrainerConfig\n")
+    (tmp_path / "other.yml").write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig\n")
+    code = [sys.executable, "-W", "ignore", "-c", COMMAND.format(command=command)]
+    done = subprocess.run(code, capture_output=True, text=True, check=True, cwd=tmp_path)
     assert done.stdout.splitlines()[-2:] == [f"{compiler} True 0.999", "False True"]
