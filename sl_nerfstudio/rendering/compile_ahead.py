@@ -16,6 +16,7 @@ from sl_nerfstudio.field.row_adam import RowAdam
 from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
 from sl_nerfstudio.field.table_gradient import TableGradient
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.rendering.compiled_measuring import measured
 from sl_nerfstudio.rendering.compiled_rendering import first_crossings, least_values, render_rays
 from sl_nerfstudio.threads import threads
 
@@ -57,5 +58,6 @@ def compile_step() -> None:
         interval = torch.zeros(2, 2, 2), rays, rays, one, one, 2
         first_crossings(*interval)
         least_values(*interval)
-        device = Device(model="OPENCV", w=2, h=2, fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0)
-        render_rays(torch.ones(1, 2), torch.ones(1, 2), rays, rays, T, Intrinsics.of(device), torch.ones(2, 2), 1.0)
+        device = Intrinsics.of(Device(w=2, h=2, fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0))
+        measured((rays, rays), T, rays, one > 0, device, 1.0, 1.0, 1.0)
+        render_rays(torch.ones(1, 2), torch.ones(1, 2), rays, rays, T, device, torch.ones(2, 2), 1.0)
