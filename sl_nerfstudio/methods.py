@@ -7,6 +7,7 @@ from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, Mac
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
+from sl_nerfstudio.late_compiler import end_imports
 from sl_nerfstudio.model.config import SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
@@ -17,6 +18,7 @@ from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 # modules for the source of the import system's own frames: 6 s of every ns-* command. Here is where these belong.
 for _name in ("importlib._bootstrap", "importlib._bootstrap_external"):
     inspect.modulesbyfile.setdefault(f"<frozen {_name}>", _name)
+end_imports()
 
 
 def _trainer(method_name: str, model: SLModelConfig, rays: int, optimizers: dict[str, Any]) -> SLTrainerConfig:

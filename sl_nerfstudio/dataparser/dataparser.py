@@ -1,5 +1,6 @@
 """`sl-data`: a scan folder as nerfstudio's dataparser. Must not import datamanagers, trainer or methods."""
 
+import sys
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,6 +18,7 @@ from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.late_compiler import begin_imports
 from sl_nerfstudio.scan import Scan, read_scan
 from sl_nerfstudio.scan.intrinsics import device_problems
 
@@ -24,6 +26,7 @@ from sl_nerfstudio.scan.intrinsics import device_problems
 # module before those parts.
 warnings.filterwarnings("ignore", r"`torch\.cuda\.amp\.", FutureWarning, module="nerfstudio")
 warnings.filterwarnings("ignore", "Using a non-tuple sequence for multidimensional indexing", module="nerfstudio")
+begin_imports(sys.argv)
 
 
 @dataclass

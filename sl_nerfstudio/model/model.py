@@ -205,14 +205,18 @@ class SLModel(Model):
     def anneal(self, step: int) -> None:
         """Set sharpness and level of detail for a step; called before each step, and when a checkpoint is loaded."""
         c = self.config
-        self.step_now.fill_(step)
-        self._set_scalars(step)
-        self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
+        self._set_step(step)
         uses_cache = self.training and c.sampling.strategy == "surface" and self._renders(step)
         if uses_cache and (not self.cache.is_filled or step % _REFRESH_EVERY == 0):
             self.cache.refresh(self.field)
         if self.training:  # training continues with the saved cache, so that a resumed run equals an uninterrupted one
             self._cache_is_old = False
+
+    def _set_step(self, step: int) -> None:
+        c = self.config
+        self.step_now.fill_(step)
+        self._set_scalars(step)
+        self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
 
     def _set_scalars(self, step: int) -> None:
         """What steps read on their device, and what the host knows of it."""
@@ -224,7 +228,7 @@ class SLModel(Model):
 
     def update_to_step(self, step: int) -> None:
         """Called by nerfstudio before weights are loaded: sets the levels to those of the checkpoint's step."""
-        self.anneal(max(step, 0))  # -1: the poses are adjusted, no step has been taken
+        self._set_step(max(step, 0))  # -1: the poses are adjusted, no step has been taken
         self._cache_is_old = True
 
     @property

@@ -161,7 +161,11 @@ class SLPipeline(VanillaPipeline):
                 save_image(image.permute(2, 0, 1).cpu(), folder / f"{name}_{key}.png")
 
     def _seed_step(self, step: int) -> None:
-        torch.manual_seed((self._seed * 1_000_003 + step) % 2**63)
+        seed = (self._seed * 1_000_003 + step) % 2**63
+        if torch.device(self.device).type == "cpu":
+            torch.default_generator.manual_seed(seed)  # without a note, for each step, to seed a GPU if one is used
+        else:
+            torch.manual_seed(seed)
 
     def _update_viewer(self, step: int) -> None:
         self.scene_view.update()

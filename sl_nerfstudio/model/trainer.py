@@ -33,6 +33,7 @@ from sl_nerfstudio.model.training.loop import SLTrainer
 from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
 from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
 from sl_nerfstudio.progress import phase
+from sl_nerfstudio.rendering import compile_ahead
 from sl_nerfstudio.scan import require_valid
 
 _TAKEN: dict[Path, RunFolder] = {}
@@ -91,6 +92,8 @@ class SLTrainerConfig(TrainerConfig):
         root = self._scan_root()
         self._require_flags()
         _require_devices(self.machine)
+        if self.machine.device_type == "cpu":
+            compile_ahead.start()
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
         with phase("check") as check:

@@ -2,7 +2,8 @@
 
 Two tables count, for each of the 5^9 possible windows, how often it occurs upright and how often in the pattern turned
 by 90, 180 or 270 degrees. The conflicts of a window are the occurrences in the Hamming balls around it. Cells of
-windows with conflicts get the symbol that leaves the fewest conflicts (min-conflicts heuristic).
+windows with conflicts get the symbol that leaves the fewest conflicts (min-conflicts heuristic). Constants that are
+passed on are `np.int64(1)` rather than 1: for each such constant, numba would compile the called function anew.
 """
 
 import numpy as np
@@ -64,7 +65,7 @@ def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
 def _conflicts(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> int:
     """Occurrences near the window at (row, column), not counting the window itself."""
     change = np.empty((_CELLS, _SYMBOLS - 1), dtype=np.int64)
-    key, power = 0, 1
+    key, power = np.int64(0), np.int64(1)
     for cell in range(_CELLS - 1, -1, -1):
         digit = codes[row + cell // 3, column + cell % 3]
         key += digit * power
@@ -81,7 +82,7 @@ def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: i
     tables = np.zeros((2, _SYMBOLS**_CELLS), dtype=np.int32)
     for row in range(rows):
         for column in range(columns):
-            _count(tables, codes, row, column, 1)
+            _count(tables, codes, row, column, np.int64(1))
     clean, place = 0, 0
     while clean < rows * columns:
         if _conflicts(tables, codes, place // columns, place % columns, radius, turned_radius) == 0:
@@ -99,7 +100,7 @@ def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: i
 @compiled
 def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> None:
     """Re-sample the one cell of a window that leaves the fewest conflicts in all windows around that cell."""
-    best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(_SYMBOLS), 2**30
+    best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(_SYMBOLS), np.int64(2**30)
     start = np.random.randint(_CELLS * _SYMBOLS)
     if np.random.random() < _RANDOM_MOVES:  # escapes from cycles
         _replace(tables, codes, row + best_cell // 3, column + best_cell % 3, best_symbol)
@@ -108,7 +109,7 @@ def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius:
         choice = (start + step) % (_CELLS * _SYMBOLS)
         cell, symbol = choice // _SYMBOLS, choice % _SYMBOLS
         i, j = row + cell // 3, column + cell % 3
-        old = codes[i, j]
+        old = np.int64(codes[i, j])
         if symbol == old:
             continue
         _replace(tables, codes, i, j, symbol)

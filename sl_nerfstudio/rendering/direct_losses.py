@@ -14,6 +14,7 @@ from sl_nerfstudio.field.signed_distance import SignedDistance
 from sl_nerfstudio.geometry.devices import Intrinsics, project_jacobian, unproject
 from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
+from sl_nerfstudio.rendering.compiled_measuring import compiled_measures, measured
 from sl_nerfstudio.rendering.losses import behind_loss, eikonal_loss, facing_loss, free_space_loss, surface_loss
 from sl_nerfstudio.rendering.ray_samples import sphere_interval
 from sl_nerfstudio.rendering.settings import LossConfig
@@ -120,7 +121,11 @@ def _measured(
     o, d, T_scene_projector = rays.origins, rays.directions, rays.T_scene_projector
     # a ray without coordinates gets those of the pattern's middle: NaN would spoil the gradients of all
     uv = torch.where(decoded[:, None], rays.uv_projector, projector.params[2:4])
-    d_projector = rotate(T_scene_projector, unproject(projector, uv))
+    directions = unproject(projector, uv)
+    if compiled_measures(o, d, T_scene_projector, directions):
+        px, px_per_length = float(noise.px), float(noise.px_per_length)
+        return measured((o, d), T_scene_projector, directions, decoded, projector, px, px_per_length, _GATE)
+    d_projector = rotate(T_scene_projector, directions)
     o_projector = T_scene_projector[:, :3, 3]
     depth, depth_projector = closest_approach(o, d, o_projector, d_projector)
     with torch.no_grad():

@@ -19,9 +19,9 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.late_compiler import compiler_on_demand
 from sl_nerfstudio.model.training.checkpoints import checkpoints_in, read_checkpoint
 from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
-from sl_nerfstudio.runs.late_compiler import compiler_on_demand
 from sl_nerfstudio.scan import Scan
 
 _SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible

@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
@@ -19,6 +20,7 @@ from sl_nerfstudio.scan.file_error import FileError, check_file, read_bytes, unr
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
 _EXIF_ORIENTATION = 0x0112
+_OPENING = Lock()  # what Python warns of is set for all threads
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 89_000_000  # just below the size at which Pillow warns of decompression bombs
 _OTHER_KINDS = {
@@ -129,7 +131,7 @@ def encode_png(image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> b
 def _open(path: Path, stream: BufferedReader | BytesIO) -> ImageFile:
     """The image with its header read, but not its pixels."""
     try:
-        with warnings.catch_warnings():
+        with _OPENING, warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             return Image.open(stream, formats=FORMATS)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:

@@ -24,7 +24,14 @@ class Faults:
 
     def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
         """Add a problem, once. `file` is relative to the folder; `key` is a field in it."""
-        fault = Fault(file, frame, key, problem.problem, problem.cause, problem.remedy)
+        self._add(Fault(file, frame, key, problem.problem, problem.cause, problem.remedy))
+
+    def take(self, others: "Faults") -> None:
+        """Add those of another collection, once."""
+        for fault in others.found:
+            self._add(fault)
+
+    def _add(self, fault: Fault) -> None:
         if fault not in self._known:
             self._known.add(fault)
             self.found.append(fault)

@@ -75,6 +75,18 @@ def test_medians_are_of_the_residuals_that_involve_a_frame():
     assert torch.isinf(found[3])
 
 
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=40), st.integers(0, 1000))
+def test_medians_are_those_of_torch_also_with_equal_values(values, seed):
+    """Each row involves frames 0 and 1, half of them in the other order."""
+    size = torch.tensor(values, dtype=torch.float64)
+    valid = torch.rand(len(values), generator=torch.Generator().manual_seed(seed)) < 0.8
+    rows = torch.stack([size, torch.zeros_like(size)], -1)
+    turned = torch.arange(len(values)) % 2
+    found = frame_medians(Residuals(torch.zeros(1, 2).double(), rows, valid), torch.stack([turned, 1 - turned]), 2)
+    expected = size[valid].median() if valid.any() else torch.tensor(float("inf")).double()
+    assert (found == expected).all()
+
+
 def column(value: float) -> torch.Tensor:
     return torch.tensor([value], dtype=torch.float64)
 

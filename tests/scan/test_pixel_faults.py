@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from numpy import ndarray
 from PIL import Image
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, edit_coords, only_fault, poses, write_sphere
@@ -284,3 +285,16 @@ def test_the_factory_is_right(sphere: Path) -> None:
     fit = check_folder(sphere).fit
     assert fit is not None
     assert fit.typical_px < 1e-4
+
+
+def test_faults_come_in_the_order_of_the_frames_however_many_threads_there_are(sphere: Path) -> None:
+    for name in NAMES[1:]:
+        edit_coords(sphere, name, lambda coords: coords * NAN)
+    found = []
+    before = torch.get_num_threads()
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        found.append(check_scan(sphere))
+    torch.set_num_threads(before)
+    assert found[0] == found[1]
+    assert [fault.frame for fault in found[0]] == list(NAMES[1:])

@@ -5,6 +5,8 @@ cameras in their projectors, and parameters and model codes of cameras and proje
 empty: then none are computed.
 """
 
+import numpy as np
+
 from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.compiled_view import view_of
 from sl_nerfstudio.geometry.rigid import moved, row_times_rotation
@@ -38,7 +40,7 @@ def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, 
         if derivatives:
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
                 a, b, d = row_times_rotation(row[0], row[1], row[2], T)
-                _by_increment(by_pose[k, c], 0, -1.0, a, b, d, x, y, z)
+                _by_increment(by_pose[k, c], np.int64(0), -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * ray[0] + b * ray[1] + d * ray[2]
 
 
@@ -76,10 +78,10 @@ def cross_residuals(
             dz = R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2]
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
                 a, b, d = row_times_rotation(row[0], row[1], row[2], T)
-                _by_increment(by_pose[k, c], 12, -1.0, a, b, d, xj, yj, zj)
+                _by_increment(by_pose[k, c], np.int64(12), -1.0, a, b, d, xj, yj, zj)
                 du, dv = seen_by_pixel[k, c, 0], seen_by_pixel[k, c, 1]
                 a, b, d = a - du * cux - dv * cvx, b - du * cuy - dv * cvy, d - du * cuz - dv * cvz
                 a, b, d = row_times_rotation(a, b, d, T_camera_world[j])
-                _by_increment(by_pose[k, c], 0, 1.0, a, b, d, x, y, z)
-                _by_increment(by_pose[k, c], 6, -1.0, a, b, d, x, y, z)
+                _by_increment(by_pose[k, c], np.int64(0), 1.0, a, b, d, x, y, z)
+                _by_increment(by_pose[k, c], np.int64(6), -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * dx + b * dy + d * dz

@@ -53,6 +53,12 @@ def kernel(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
+def needs_compiling(kernel: Any) -> bool:
+    """Whether a kernel's code is not on disk, but will be once it was called."""
+    kept = getattr(kernel._cache, "_cache_file", None)  # None if there is no folder to write to
+    return kept is not None and not kept._load_index()
+
+
 @lru_cache(maxsize=1)
 def _sources() -> str:
     """Digest of all sources of the compiled kernels."""

@@ -25,6 +25,7 @@ from sl_nerfstudio.model.training.run_folder import PARTIAL, go_on_command
 from sl_nerfstudio.model.training.shared_training import greatest, several, share_state, shared_optimizers
 from sl_nerfstudio.model.training.step_graph import CudaRecorder, DeviceRates, NotRecordedError, Recorder, StepGraph
 from sl_nerfstudio.progress import Phase, phase
+from sl_nerfstudio.rendering import compile_ahead
 from sl_nerfstudio.threads import one_library_thread
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ class SLTrainer(Trainer):
         if self._start_step == 0 and self.config.load_checkpoint is None and comms.is_main_process():
             with self.train_lock:
                 self._adjust_poses()
+        compile_ahead.finish()
         if several():
             share_state(self._model)
             self._model.load_state_dict(self._model.state_dict())  # modules look again at what the host must know

@@ -1,4 +1,4 @@
-"""The pixels of a scan: coordinates, masks, pattern images. One frame in memory at a time."""
+"""The pixels of a scan: coordinates, masks, pattern images; one frame after another."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

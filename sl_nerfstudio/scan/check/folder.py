@@ -1,15 +1,23 @@
 """The full check of a scan folder: everything `read_scan` checks, every pixel, and whether all of it fits together."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial as bound
 from pathlib import Path
 
 import numpy as np
 
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan.check.content import FrameContent, check_content, check_pattern, duplicate_problems, read_shown
+from sl_nerfstudio.scan.check.content import (
+    FrameContent,
+    PatternImage,
+    check_content,
+    check_pattern,
+    duplicate_problems,
+    read_shown,
+)
 from sl_nerfstudio.scan.check.conventions import convention_problems
 from sl_nerfstudio.scan.check.image_problems import MatchedFrame, image_problems
 from sl_nerfstudio.scan.check.interpretations import GeometricFit, fit_geometry
@@ -22,6 +30,7 @@ from sl_nerfstudio.scan.partial_scan import PartialScan, read_partial_scan
 from sl_nerfstudio.scan.pose_files import GROUND_TRUTH, read_ground_truth
 from sl_nerfstudio.scan.problem import Faults
 from sl_nerfstudio.scan.types import UNITS, Scan
+from sl_nerfstudio.threads import results, threads
 
 
 @dataclass(frozen=True)
@@ -35,14 +44,14 @@ class FolderCheck:
 
 
 def check_folder(root: Path) -> FolderCheck:
-    """Check a whole folder, with a progress bar; faults are returned, not raised. One frame is in memory at a time."""
+    """Check a whole folder, with a progress bar; faults are returned, not raised. Memory holds a frame a thread."""
     root = Path(os.path.realpath(root))
     faults = Faults()
     partial = read_partial_scan(root, faults)
     good = check_headers(partial, faults)
     pattern = check_pattern(partial, good, faults)
     frames = list({frame.name: frame for frame in reversed(partial.frames)}.values())[::-1]  # a name twice is a fault
-    contents = [check_content(frame, partial, pattern, good, faults) for frame in track(frames, "Checking the scan")]
+    contents = list(track(_contents(frames, partial, pattern, good, faults), "Checking the scan", len(frames)))
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
     for problem in shift_problems([content.shift for content in contents]):
@@ -60,6 +69,24 @@ def check_folder(root: Path) -> FolderCheck:
         return FolderCheck(tuple(found), None, None, tuple(contents))
     usable = [c.correspondences for c in contents if c.correspondences is not None]
     return FolderCheck((), scan, fit_geometry(usable, scan.projector), tuple(contents))
+
+
+def _contents(
+    frames: Sequence[PartialFrame],
+    partial: PartialScan,
+    pattern: PatternImage | None,
+    good: set[Path],
+    faults: Faults,
+) -> Iterator[FrameContent]:
+    """In threads; the faults come in the order of the frames, whichever was done first."""
+    together = threads()
+    for first in range(0, len(frames), together):
+        group = frames[first : first + together]
+        own = [Faults() for _ in group]
+        pairs = zip(group, own, strict=True)
+        yield from results([bound(check_content, frame, partial, pattern, good, f) for frame, f in pairs])
+        for some in own:
+            faults.take(some)
 
 
 def check_scan(root: Path) -> list[Fault]:
