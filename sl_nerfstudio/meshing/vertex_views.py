@@ -139,33 +139,29 @@ def _views_of(
     size = np.linalg.norm(residual, axis=1)
     known = np.isfinite(size)
     usual = float(np.median(size[known])) if known.any() else 0.0
-    good = known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX))
-    view = SurfaceView(**{name: value[torch.from_numpy(good)] for name, value in vars(view).items()})
+    good = np.flatnonzero(known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX)))
     residual = residual[good]
-    noise = _spread(_across(view, residual))
-    arrays = [getattr(view, name).numpy() for name in ("slope", "pixels_per_area", "ray_angle")]
-    slope, pixels_per_area, ray_angle = arrays
-    ratio = _window_ratio(coords, view, noise)
+    slope, pixels_per_area, ray_angle = (x.numpy()[good] for x in (view.slope, view.pixels_per_area, view.ray_angle))
+    noise = _spread(_across(slope, residual))
+    ratio = _window_ratio(coords, view, good, noise)
     return FrameViews(seen[good], slope, residual, pixels_per_area, ray_angle, noise, ratio)
 
 
-def _across(view: SurfaceView, residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
+def _across(slope: Float[ndarray, "m 2"], residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
     """The component of residuals that no motion of the surface changes: noise, and errors of the poses."""
-    a = view.slope.numpy()
-    return (a[:, 0] * residual[:, 1] - a[:, 1] * residual[:, 0]) / np.linalg.norm(a, axis=1)
+    return (slope[:, 0] * residual[:, 1] - slope[:, 1] * residual[:, 0]) / np.linalg.norm(slope, axis=1)
 
 
 def _spread(values: Float[ndarray, "n"]) -> float:
     return float(np.median(np.abs(values))) * MAD_TO_SIGMA if len(values) >= _FEWEST else float("nan")
 
 
-def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, noise: float) -> float:
-    """Variance of look-ups, which average a window, over that of single pixels."""
-    some = evenly_spaced(len(view.uv_camera), min(_LOOKED_UP, len(view.uv_camera)))
-    part = SurfaceView(**{name: value[some] for name, value in vars(view).items()})
+def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int64[ndarray, "m"], noise: float) -> float:
+    """Variance of look-ups, which average a window, over that of single pixels; of the points that are good."""
+    some = good[evenly_spaced(len(good), min(_LOOKED_UP, len(good)))]
     maps = CoordinateMaps.of([torch.from_numpy(coords)])
-    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), part.uv_camera)
-    across = _across(part, (part.uv_projector - seen.uv_projector).numpy())
+    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), view.uv_camera[some])
+    across = _across(view.slope.numpy()[some], (view.uv_projector[some] - seen.uv_projector).numpy())
     return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
 
 
