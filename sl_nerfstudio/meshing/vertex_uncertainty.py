@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import is_exact
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.spacing import evenly_spaced
@@ -68,6 +69,8 @@ def _shared_variance(
     points = mesh.vertices - mesh.vertices[seen].mean(0)
     rigid = np.concatenate([normals, np.cross(points, normals)], 1)
     devices = _all_devices(scan, poses)
+    kind = np.float64 if is_exact(len(joint.factor)) else np.float32  # random draws are off by more than rounding is
+    factor = joint.factor.astype(kind, copy=False)
 
     def moved(part: Int64[ndarray, "n"]) -> Float[ndarray, "n k"]:
         """Changes of some vertices by the columns of the factor."""
@@ -75,7 +78,7 @@ def _shared_variance(
         frames = np.flatnonzero(confirmed.any(0))
         rows = _rows(mesh.vertices[part], normals[part], devices[frames], confirmed[:, frames])
         columns = np.concatenate([_columns(frames, len(scan.frames)), np.arange(-UNKNOWNS, 0)])
-        return rows @ joint.factor[columns]
+        return rows.astype(kind, copy=False) @ factor[columns]
 
     some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
     of_some = np.concatenate(results([partial(moved, part) for part in _portions(some)]))

@@ -99,6 +99,14 @@ def test_frames_that_confirm_too_little_have_the_noise_of_the_others():
     assert np.isnan(sum_views([few], 4).variance[[1, 2]]).all()
 
 
+def test_random_draws_are_multiplied_with_fewer_digits(scan: Scan, monkeypatch: pytest.MonkeyPatch):
+    exact = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    found = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
+    assert not np.array_equal(found.sigma, exact.sigma, equal_nan=True)
+    np.testing.assert_allclose(found.sigma, exact.sigma, rtol=1e-4)
+
+
 def test_sigma_is_what_the_covariance_says_of_the_surface_less_its_motion(scan: Scan, sums: VertexSums):
     """The whole matrix of derivatives at once, and the motion that fits it best."""
     mesh, joint, seen = hill(), random_joint(), np.flatnonzero(sums.number)
