@@ -31,7 +31,7 @@ class Row:
     resolution: int
     stage: str
     seconds: float
-    cpu_seconds: float | None  # of all threads and processes; None where the stage is a part of a process
+    cpu_seconds: float | None  # of all threads and processes; None in rows of an earlier version
     peak_gb: float  # resident memory of the largest process, libraries included
 
 
@@ -53,6 +53,11 @@ class Case:
     def run(self) -> Path:
         """The training run."""
         return self.folder / "runs" / "run" / "sl-neus" / "a"
+
+    @property
+    def mesh(self) -> Path:
+        """The exported surface."""
+        return self.folder / "mesh.ply"
 
     @property
     def synth(self) -> tuple[str, ...]:
@@ -88,12 +93,11 @@ def checked(case: Case) -> list[Row]:
 
 
 def parts_of_training(case: Case) -> list[Row]:
-    """Reading, adjustment, and one step with all poses, in one process: its memory is that of the largest part."""
-    found = measure(case.scan, case.steps)
-    parts = {"read": found["read_seconds"], "adjust": found["adjust_seconds"], "step": found["step_ms"] / 1000}
+    """Reading, adjustment, and one step with all poses, in one process; each with its own peak of memory."""
+    found = measure(case.scan, case.steps, with_check=False)
     return [
-        Row(case.frames, case.resolution, f"training: {name}", seconds, None, found["peak_gb"])
-        for name, seconds in parts.items()
+        Row(case.frames, case.resolution, f"training: {name}", part.seconds, part.cpu_seconds, part.peak_gb)
+        for name, part in found.items()
     ]
 
 
@@ -105,10 +109,16 @@ def trained(case: Case) -> list[Row]:
 
 
 def exported(case: Case) -> list[Row]:
-    """The trimmed mesh with the uncertainty of its vertices."""
-    mesh = case.folder / "mesh.ply"
-    return [case.command("sl-export", mesh, "sl-export", "--load-config", str(case.run / "config.yml"),
-                         "--output", str(mesh))]  # fmt: skip
+    """The trimmed mesh with the uncertainty of its vertices, and the refined poses with their covariance."""
+    return [case.command("sl-export", case.mesh, "sl-export", "--load-config", str(case.run / "config.yml"),
+                         "--output", str(case.mesh), "--poses", str(case.folder / "refined"))]  # fmt: skip
+
+
+def evaluated(case: Case) -> list[Row]:
+    """Mesh and poses against the truth, with the report."""
+    files = ("--mesh", str(case.mesh), "--data", str(case.scan), "--poses", str(case.folder / "refined"))
+    report = case.folder / "report.html"
+    return [case.command("sl-eval", report, "sl-eval", *files, "--report", str(report))]
 
 
 def processed(case: Case) -> list[Row]:
@@ -123,7 +133,7 @@ def processed(case: Case) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown: a line for each stage, a column for each number of frames."""
+    """Markdown: a line for each stage, a column for each number of frames; processor time where it was measured."""
     counts = sorted({row.frames for row in rows})
     found = {(row.stage, row.frames): row for row in rows}
     lines = ["| stage | " + " | ".join(f"{n} frames" for n in counts) + " |", "|---" * (len(counts) + 1) + "|"]
@@ -136,13 +146,14 @@ def table(rows: list[Row]) -> str:
 def _cell(row: Row | None) -> str:
     if row is None:
         return ""
-    seconds = f"{1000 * row.seconds:.0f} ms" if row.seconds < 1 else f"{row.seconds:.0f} s"
+    taken = row.seconds if row.cpu_seconds is None else row.cpu_seconds
+    seconds = f"{1000 * taken:.0f} ms" if taken < 1 else f"{taken:.0f} s"
     return f"{seconds}, {row.peak_gb:.1f} GB"
 
 
-STAGES = (made, checked, parts_of_training, trained, exported)
+STAGES = (made, checked, parts_of_training, trained, exported, evaluated)
 FIRST = {made: "sl-synth", checked: "sl-check", parts_of_training: "training: read", trained: "ns-train, 300 steps",
-         exported: "sl-export", processed: "sl-process"}  # fmt: skip
+         exported: "sl-export", evaluated: "sl-eval", processed: "sl-process"}  # fmt: skip
 
 
 def main() -> None:

@@ -9,17 +9,16 @@ cost as much as real ones.
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
-import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.common.machine import write_rows
+from benchmarks.common.parts import Part, measured
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.writing import ScanWriter
@@ -78,52 +77,61 @@ def make_scan(source: Path, frames: int, factor: int, to: Path) -> None:
             )
 
 
-def measure_here(scan: Path, steps: int) -> dict[str, float]:
-    """Check, read, adjust and train a scan in this process."""
+def measure_here(scan: Path, steps: int, with_check: bool = True) -> dict[str, dict[str, float]]:
+    """Check, read, adjust and train a scan in this process: what each part took; of the steps, the median."""
     from sl_nerfstudio.dataparser.dataparser import load_scan
     from sl_nerfstudio.methods import sl_neus
     from sl_nerfstudio.scan import check_scan
 
-    times = [time.monotonic()]
-    faults = check_scan(scan)
-    if faults:
-        raise SystemExit("\n".join(map(str, faults)))
-    times.append(time.monotonic())
-    load_scan(scan)
-    times.append(time.monotonic())
+    parts: dict[str, Part] = {}
+    if with_check:
+        faults, parts["check"] = measured(lambda: check_scan(scan))
+        if faults:
+            raise SystemExit("\n".join(map(str, faults)))
+    _, parts["read"] = measured(lambda: load_scan(scan))
     with tempfile.TemporaryDirectory() as folder:
         config = replace(sl_neus.config, output_dir=Path(folder), max_num_iterations=1000)
         config.pipeline.datamanager.data = scan
         config.pipeline.model.warm_start = 0.0  # type: ignore[attr-defined]  # rendering from the first step on
         config.set_timestamp()
         trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        begin = time.monotonic()
-        trainer.pipeline.model.start(trainer.pipeline.datamanager.samples)
-        adjust = time.monotonic() - begin
+        _, parts["set up"] = measured(trainer.setup)
+        model, samples = trainer.pipeline.model, trainer.pipeline.datamanager.samples
+        _, parts["adjust"] = measured(lambda: model.adjust_poses(samples))
+        _, parts["measure noise"] = measured(lambda: model.measure_noise(samples))
         each = []
         for step in range(1, steps + 1):
-            trainer.pipeline.model.anneal(step)
-            begin = time.monotonic()
-            trainer.train_iteration(step)
-            each.append(time.monotonic() - begin)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-    return {
-        "peak_gb": peak,
-        "check_seconds": times[1] - times[0],
-        "read_seconds": times[2] - times[1],
-        "adjust_seconds": adjust,
-        "step_ms": float(np.median(each[len(each) // 3 :]) * 1000),
-    }
+            model.anneal(step)
+            _, taken = measured(lambda step=step: trainer.train_iteration(step))
+            each.append(taken)
+        late = each[len(each) // 3 :]
+        seconds, cpu = (float(np.median([getattr(p, name) for p in late])) for name in ("seconds", "cpu_seconds"))
+        parts["step"] = Part(seconds, cpu, max(p.peak_gb for p in late))
+    return {name: asdict(part) for name, part in parts.items()}
 
 
-def measure(scan: Path, steps: int) -> dict[str, float]:
-    """The same in a fresh process, so that its peak memory is measured alone."""
+def measure(scan: Path, steps: int, with_check: bool = True) -> dict[str, Part]:
+    """The same in a fresh process, so that its memory is measured alone."""
     command = [sys.executable, "-m", "benchmarks.resources", "--scan", str(scan), "--steps", str(steps)]
+    command += [] if with_check else ["--no-check"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stdout + done.stderr)
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    return {name: Part(**part) for name, part in found.items()}
+
+
+def row_of(frames: int, size: int, parts: dict[str, Part]) -> Row:
+    """The figures of one scan."""
+    return Row(
+        frames=frames,
+        size=size,
+        peak_gb=max(part.peak_gb for part in parts.values()),
+        check_seconds=parts["check"].seconds,
+        read_seconds=parts["read"].seconds,
+        adjust_seconds=parts["adjust"].seconds,
+        step_ms=1000 * parts["step"].seconds,
+    )
 
 
 def main() -> None:
@@ -135,9 +143,10 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("outputs/resources"), help="folder of the scans, made once")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/resources.json"))
     parser.add_argument("--scan", type=Path, help="only measure this scan, in this process, and print the figures")
+    parser.add_argument("--no-check", action="store_true", help="with --scan: without the check")
     options = parser.parse_args()
     if options.scan:
-        print(json.dumps(measure_here(options.scan, options.steps)))
+        print(json.dumps(measure_here(options.scan, options.steps, not options.no_check)))
         return
     source = options.folder / "source"
     if not source.exists():
@@ -148,7 +157,7 @@ def main() -> None:
             scan = options.folder / f"{frames}x{size}"
             if not scan.exists():
                 make_scan(source, frames, size // BASE, scan)
-            rows.append(Row(frames, size, **measure(scan, options.steps)))
+            rows.append(row_of(frames, size, measure(scan, options.steps)))
             print(rows[-1], flush=True)
     write_rows(options.output, rows)
 

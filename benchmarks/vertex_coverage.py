@@ -149,9 +149,9 @@ def measure(case: Case, folder: Path) -> Row:
 def _with_exact_intrinsics(inputs: EvaluationInputs, quality: VertexQuality) -> np.ndarray:
     """Sigma of each vertex under the covariance of the poses given the intrinsics."""
     assert inputs.joint is not None
-    C, k = inputs.joint.matrix, len(inputs.joint.matrix) - UNKNOWNS
-    given = np.zeros_like(C)
-    given[:k, :k] = C[:k, :k] - C[:k, k:] @ np.linalg.solve(C[k:, k:], C[k:, :k])
+    given, common = inputs.joint.factor.copy(), inputs.joint.factor[-UNKNOWNS:]
+    given -= (given @ common.T) @ np.linalg.solve(common @ common.T, common)
+    given[-UNKNOWNS:] = 0
     found = vertex_uncertainty(inputs.mesh, inputs.scan, inputs.poses, JointCovariance(given), 1.0)
     shared = found.sigma**2 - found.sigma_independent**2
     return np.sqrt(quality.sigma_independent**2 + shared)

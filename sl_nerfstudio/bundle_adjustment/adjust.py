@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.covariance import Evidence, gauge_free, pose_covariance
+from sl_nerfstudio.bundle_adjustment.covariance import gauge_free, pose_covariance
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters, RefinePoses, free_parameters
+from sl_nerfstudio.bundle_adjustment.joint_covariance.evidence import Evidence
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     departure_of,
     drawn_start,
@@ -56,7 +57,7 @@ class Adjustment:
     """What the bundle adjustment found."""
 
     rig: Rig
-    joint: Float[Tensor, "joint joint"]  # covariance of (delta, rho, intrinsics), gauge projected out
+    factor: Float[Tensor, "joint k"]  # of the covariance of (delta, rho, intrinsics) without the gauge
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
     noise_px: float  # estimated noise of one look-up, projector pixels
     iterations: int
@@ -67,12 +68,12 @@ class Adjustment:
     @property
     def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
         """That of (delta, rho) alone."""
-        return self.joint[:-UNKNOWNS, :-UNKNOWNS]
+        return self.factor[:-UNKNOWNS] @ self.factor[:-UNKNOWNS].T
 
     @property
     def sigma(self) -> Float[Tensor, "frames 12"]:
         """1 sigma of each frame's delta and rho: translation xyz, rotation xyz each."""
-        sigma = self.covariance.diagonal().clamp_min(0).sqrt()
+        sigma = self.factor[:-UNKNOWNS].norm(dim=1)
         return sigma.reshape(2, self.rig.frames, 6).transpose(0, 1).flatten(1)
 
 
@@ -239,7 +240,7 @@ def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress,
         other = _search(_problem(start, problem.maps, problem.prior, problem.settings), refine)
         if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
             departures.append(departure_of(other[0].state.rig, result.rig))
-    return replace(result, joint=widened(result.joint, departures))
+    return replace(result, factor=widened(result.factor, departures))
 
 
 def _misfits(maps: CoordinateMaps, found: _Progress) -> Float[Tensor, "frames"]:
@@ -254,7 +255,7 @@ def _leads_back(
 ) -> bool:
     """Whether some steps lead back to the result from poses beside it."""
     s, state = problem.settings.other_minima, found.state
-    delta, rho = shake(result.joint, s.shake_sigmas, generator).reshape(2, -1, 6)
+    delta, rho = shake(result.factor, s.shake_sigmas, generator).reshape(2, -1, 6)
     linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
     kernel = _kernel(state, found.rows, found.widths, linear.residuals, problem)
     equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
@@ -263,7 +264,7 @@ def _leads_back(
     depth = depth.clamp(steps.least_depth * state.anchors.depth, steps.most_depth * state.anchors.depth)
     beside = replace(state, rig=state.rig.moved(delta, rho), anchors=state.anchors.at(depth))
     back = _run(problem, _Stage(refine, False, s.shake_steps), replace(found, state=beside))
-    left = farthest_frame(result.joint, departure_of(back.state.rig, state.rig))
+    left = farthest_frame(result.factor, departure_of(back.state.rig, state.rig))
     return left <= s.most_left * s.shake_sigmas
 
 
@@ -300,7 +301,7 @@ def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: fl
     known = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(
         rig=state.rig,
-        joint=known.joint,
+        factor=known.factor,
         intrinsics=known.intrinsics,
         noise_px=found.noise,
         iterations=found.iterations,
@@ -315,5 +316,5 @@ def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters, settings: Adjus
     H, _ = prior_equations(prior, start, start)
     nan = float("nan")
     noise = settings.kernel.noise_floor_px
-    joint = torch.block_diag(gauge_free(start, free, H), (prior.intrinsics_sigma**2).diag())
-    return Adjustment(start, joint, None, noise, 0, nan, nan, ())
+    factor = torch.block_diag(gauge_free(start, free, H), prior.intrinsics_sigma.diag())
+    return Adjustment(start, factor, None, noise, 0, nan, nan, ())

@@ -18,59 +18,33 @@ slopes are those of wide windows.
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64
 from numpy import ndarray
-from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
-from sl_nerfstudio.bundle_adjustment.loops.normal_equations import block_sums
-from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, NormalEquations, normal_equations
+from sl_nerfstudio.bundle_adjustment.joint_covariance.cholesky import Cholesky
+from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import is_exact, unit_columns
+from sl_nerfstudio.bundle_adjustment.joint_covariance.evidence import BlockGradients, Evidence, block_gradients
+from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, array, pixels_of_rows
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, matrix_by_kind
-from sl_nerfstudio.geometry.devices import project
-from sl_nerfstudio.threads import results
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 _EXACT = 1e-9  # used for an uncertainty of zero
-_FRAMES_AT_ONCE = 16  # whose blocks are summed together: bounds memory
-_ROWS_AT_ONCE = 512  # of a matrix that are mirrored together
-_MOST_BLOCKS, _PROBES = 4096, 512  # blocks of images of which each counts by itself; sums of more
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Residuals at the result, with their weights and derivatives (including those by the intrinsics)."""
-
-    rig: Rig
-    anchors: Anchors
-    rows: Observations
-    linear: Linearisation
-    smooth: Linearisation  # the same with derivatives of wide windows, where there are any
-    kernel: Kernel
-    image_blocks: int  # along each side of the decoded part of an image
-    least_curvature: float  # of the kernel
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks of all images."""
-        return self.rig.frames * self.image_blocks**2
+_PRIOR_SEED = 1  # of its random columns, where there are any: they are independent of others
 
 
 @dataclass(frozen=True)
 class PoseCovariance:
     """Covariance of the poses at the result, and the self-calibration of the intrinsics."""
 
-    joint: Float[Tensor, "joint joint"]  # of (delta, rho, intrinsics); the gauge is projected out
+    factor: Float[Tensor, "joint k"]  # of that of (delta, rho, intrinsics); the gauge is projected out
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
 
 
@@ -84,22 +58,21 @@ def pose_covariance(
     """
     e, n = evidence, evidence.rig.frames
     if free.count == 0:
-        poses_exact = torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-        return PoseCovariance(torch.block_diag(poses_exact, (prior.intrinsics_sigma**2).diag()), None)
+        poses_exact = torch.zeros(12 * n, UNKNOWNS, dtype=torch.float64)
+        return PoseCovariance(torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None)
     weights = e.kernel.weights(e.linear.residuals)
     equations = normal_equations(e.linear, e.rows, *weights)
     known = normal_equations(e.smooth, e.rows, *weights)
-    problem = _Linear(e, free, weights, equations, known, _prior_terms(prior, start, e.rig))
-    formal, larger, step = problem.second_moments(noise)
-    own = slice(12 * n, None)
-    calibration = SelfCalibration(step[own].clone(), torch.outer(larger[own], larger[own]) * formal[own, own])
-    moves = formal.diagonal()[: 12 * n] > 0
-    dependence = float(larger[: 12 * n][moves].median()) if moves.any() else 1.0
-    formal, larger, step = problem.second_moments(dependence * noise)
-    formal *= larger
-    formal *= larger[:, None]
-    formal.addr_(step, step)
-    return PoseCovariance(matrix_by_kind(formal, n), calibration)
+    gradients = block_gradients(e, equations.depths, weights)
+    problem = _Linear(e, free, equations, known, gradients, _prior_terms(prior, start, e.rig))
+    found, own = problem.second_moments(noise), slice(12 * n, None)
+    of_intrinsics = found.larger[own, None] * found.formal[own]
+    calibration = SelfCalibration(found.step[own].clone(), of_intrinsics @ of_intrinsics.T)
+    moves = (found.formal[: 12 * n] != 0).any(1)
+    dependence = float(found.larger[: 12 * n][moves].median()) if moves.any() else 1.0
+    found = problem.second_moments(dependence * noise)
+    factor = torch.cat([found.larger[:, None] * found.formal, found.step[:, None]], 1)
+    return PoseCovariance(_by_kind(factor, n), calibration)
 
 
 @dataclass(frozen=True)
@@ -110,6 +83,13 @@ class _PriorTerms:
     common_H: Float[Tensor, "common"]  # diagonal
     g: Float[Tensor, "unknowns"]
 
+    def root(self) -> Float[Tensor, "unknowns c"]:
+        """A factor of the information: `H` is it times its transpose, or on average is."""
+        n, rows = len(self.frames_H), len(self.g)
+        unit = unit_columns(rows, rows, _PRIOR_SEED)
+        frames = torch.linalg.cholesky(self.frames_H) @ unit[: 12 * n].reshape(n, 12, -1)
+        return torch.cat([frames.flatten(0, 1), self.common_H.sqrt()[:, None] * unit[12 * n :]])
+
 
 def _prior_terms(prior: PosePrior, start: Rig, rig: Rig) -> _PriorTerms:
     H, g = prior_equations(prior, start, rig)
@@ -119,152 +99,66 @@ def _prior_terms(prior: PosePrior, start: Rig, rig: Rig) -> _PriorTerms:
 
 
 @dataclass(frozen=True)
+class _Moments:
+    """Errors at the result; unknowns are those of the frames one after the other, then the intrinsics."""
+
+    formal: Float[Tensor, "unknowns c"]  # factor of the covariance for independent residuals
+    larger: Float[Tensor, "unknowns"]  # factor by which each sigma is really larger
+    step: Float[Tensor, "unknowns"]  # that is left
+
+
+@dataclass(frozen=True)
 class _Linear:
     """The adjustment at its result, as a linear problem."""
 
     evidence: Evidence
     free: FreeParameters
-    weights: tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]
     equations: NormalEquations
     known: NormalEquations  # with derivatives of wide windows
+    gradients: BlockGradients
     prior: _PriorTerms
 
-    def second_moments(
-        self, noise: float
-    ) -> tuple[Float[Tensor, "unknowns unknowns"], Float[Tensor, "unknowns"], Float[Tensor, "unknowns"]]:
-        """Covariance for independent residuals, the factor by which each sigma is really larger, and the step left."""
-        e, prior, count = self.evidence, self.prior, self.free.count
+    def second_moments(self, noise: float) -> _Moments:
+        """For a noise of one look-up."""
+        e, prior, free, gradients = self.evidence, self.prior, self.free, self.gradients
         prior_H = noise**2 * prior.frames_H, noise**2 * prior.common_H
         g = torch.cat([self.equations.g.flatten(), self.equations.g_common]) + noise**2 * prior.g
         G = _gauge(e.rig, len(g))
-        C = _expanded_inverse(self.free, self.known, prior_H)
-        _remove_gauge(C, G)
-        formal = C.T.contiguous()
-        _remove_gauge(formal, G)
-        squares, blocks = _spread(e, self.equations.depths, self.weights, C)
-        free_blocks = max(blocks - count - UNKNOWNS, blocks / 4)  # degrees of freedom left after the fit of the poses
+        factor = Cholesky.in_place(free.matrix(self.known.matrix(*prior_H)))
+        rows = free.count + UNKNOWNS
+        formal = noise * _increments(free, G, factor.root(unit_columns(rows, len(g))))
+        free_blocks = max(gradients.blocks - rows, gradients.blocks / 4)  # left after the fit of the poses
         curvature = max(e.kernel.curvature(e.linear.residuals), e.least_curvature)
-        robust = blocks / max(free_blocks, 1.0) / curvature**2 * squares + noise**2 * _quadratic(C, *prior_H)
-        formal *= noise**2
-        larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
-        return formal, larger, -C @ g
+        scale = (gradients.blocks / max(free_blocks, 1.0)) ** 0.5 / curvature
+        caused = _together(scale * gradients.columns, noise**2 * prior.root())
+        moved = _increments(free, G, factor.solution(_parameters(free, torch.cat([caused, g[:, None]], 1))))
+        robust = moved[:, :-1].square().sum(1)
+        larger = (robust / formal.square().sum(1).clamp_min(1e-30)).clamp_min(1).sqrt()
+        return _Moments(formal, larger, -moved[:, -1])
 
 
-def _expanded_inverse(
-    free: FreeParameters,
-    equations: NormalEquations,
-    prior: tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "common"]],
-) -> Float[Tensor, "unknowns unknowns"]:
-    """The inverse of the normal matrix of the free parameters and the intrinsics, as increments of all frames."""
-    count, common = free.count, UNKNOWNS
-    H = torch.zeros(count + common, count + common, dtype=torch.float64)
-    H[:count, :count] = free.matrix(equations.matrix(prior[0]))
-    H[:count, count:] = free.vector(equations.border)
-    H[count:, :count] = H[:count, count:].T
-    H[count:, count:] = equations.H_common + prior[1].diag()
-    inverse_H = inverted(H)
-    if free.own.shape[2] == 12:
-        return inverse_H
-    half = _expanded(free, inverse_H)
-    return _expanded(free, half.T)
+def _together(a: Float[Tensor, "unknowns c"], b: Float[Tensor, "unknowns d"]) -> Float[Tensor, "unknowns k"]:
+    """Columns whose squares add up to those of both; of random ones, which are independent, the sums."""
+    return torch.cat([a, b], 1) if is_exact(len(a)) else a + b
 
 
-def _expanded(free: FreeParameters, x: Float[Tensor, "count c"]) -> Float[Tensor, "unknowns c"]:
-    """Sets of free parameters and intrinsics as increments of all frames and intrinsics."""
-    return torch.cat([free.steps(x[: free.count]).flatten(0, 1), x[free.count :]])
+def _increments(
+    free: FreeParameters, G: Float[Tensor, "unknowns 7"], x: Float[Tensor, "count c"]
+) -> Float[Tensor, "unknowns c"]:
+    """Parameters and intrinsics as increments of all frames and intrinsics, less motion and growth of the scene."""
+    out = torch.cat([free.steps(x[: free.count]).flatten(0, 1), x[free.count :]])
+    return out.addmm_(G, torch.linalg.solve(G.T @ G, G.T) @ out, alpha=-1)
 
 
-def _quadratic(
-    C: Float[Tensor, "unknowns unknowns"], frames_H: Float[Tensor, "frames 12 12"], common: Float[Tensor, "common"]
-) -> Float[Tensor, "unknowns"]:
-    """The diagonal of `C H C^T` for a matrix of blocks of frames and a diagonal."""
-    total = C[:, 12 * len(frames_H) :].square() @ common
-    for k, H in enumerate(frames_H):
-        columns = C[:, 12 * k : 12 * k + 12]
-        total += ((columns @ H) * columns).sum(1)
-    return total
+def _parameters(free: FreeParameters, g: Float[Tensor, "unknowns c"]) -> Float[Tensor, "count c"]:
+    """Gradients by increments of all frames and intrinsics as gradients by free parameters and intrinsics."""
+    frames = g[: 12 * free.of].reshape(free.of, 12, -1)[free.frames]
+    return torch.cat([free.vector(frames), g[12 * free.of :]])
 
 
-def _spread(
-    e: Evidence, depths: DepthCouplings, weights: tuple[Tensor, Tensor], C: Float[Tensor, "unknowns unknowns"]
-) -> tuple[Float[Tensor, "unknowns"], int]:
-    """Variances that the gradients of all blocks of images cause through `C`, and the number of blocks with any.
-
-    The squares of many blocks are replaced by those of sums with random signs, whose expectation is the same: with
-    `_PROBES` sums, the sigma that follows is off by about 3 %.
-    """
-    own_block, cross_block = _blocks_of(e)
-    frames = range(0, e.rig.frames, _FRAMES_AT_ONCE)
-    groups = Groups.of(array(own_block), e.blocks), Groups.of(array(cross_block), e.blocks)
-    if e.blocks <= _MOST_BLOCKS:
-        parts = results([partial(_spread_of, e, depths, weights, groups, C, first) for first in frames])
-        return torch.stack([squares for squares, _ in parts]).sum(0), sum(blocks for _, blocks in parts)
-    generator, blocks = torch.Generator().manual_seed(0), 0
-    probes = torch.zeros(_PROBES, len(C), dtype=torch.float64)
-    for first in frames:
-        gradient = _block_gradients(e, depths, weights, groups, len(C), first)
-        signs = 2 * torch.randint(2, (_PROBES, len(gradient)), generator=generator).double() - 1
-        probes.addmm_(signs, gradient)
-        blocks += int((gradient != 0).any(1).sum())
-    return (probes @ C.T).square().sum(0) / _PROBES, blocks
-
-
-def _spread_of(
-    e: Evidence,
-    depths: DepthCouplings,
-    weights: tuple[Tensor, Tensor],
-    groups: tuple[Groups, Groups],
-    C: Float[Tensor, "unknowns unknowns"],
-    first: int,
-) -> tuple[Float[Tensor, "unknowns"], int]:
-    """Variances by the blocks of some frames' images, and their number."""
-    gradient = _block_gradients(e, depths, weights, groups, len(C), first)
-    return (gradient @ C.T).square().sum(0), int((gradient != 0).any(1).sum())
-
-
-def _block_gradients(
-    e: Evidence,
-    depths: DepthCouplings,
-    weights: tuple[Tensor, Tensor],
-    groups: tuple[Groups, Groups],
-    unknowns: int,
-    first: int,
-) -> Float[Tensor, "blocks unknowns"]:
-    """The gradient from each block of some frames' images."""
-    per_frame, r = e.image_blocks**2, e.linear.residuals
-    blocks = np.arange(first * per_frame, min(first + _FRAMES_AT_ONCE, e.rig.frames) * per_frame)
-    own, cross = (
-        (array(w[:, None] * value), array(J), array(by_depth))
-        for w, value, J, by_depth in (
-            (weights[0], r.own, e.linear.own, e.linear.own_depth),
-            (weights[1], r.cross, e.linear.cross, e.linear.cross_depth),
-        )
-    )
-    sums = np.zeros((len(blocks), unknowns))
-    block_sums(
-        blocks, tuple(part for g in (*groups, depths.rows) for part in (g.first, g.entries)),
-        (array(e.rows.anchor), depths.frame, depths.viewer), own, cross, depths.arrays, sums,
-    )  # fmt: skip
-    return torch.from_numpy(sums)
-
-
-def _blocks_of(e: Evidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
-    """The block that holds an anchor in its own image, and the block of the other image in which it is looked up."""
-    rig = e.rig
-    at = project(rig.camera[e.anchors.frame], e.anchors.d_camera)[0]
-    seen_at, _ = pixels_of_rows(rig, e.anchors, e.rows)
-    low, high = torch.zeros(rig.frames, 2).double(), torch.ones(rig.frames, 2).double()
-    for k in range(rig.frames):
-        mine = at[e.anchors.frame == k]
-        if len(mine):
-            low[k], high[k] = mine.amin(0), mine.amax(0)
-
-    def block(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
-        share = (uv - low[frame]) / (high - low).clamp_min(1e-9)[frame]
-        cell = (share * e.image_blocks).nan_to_num().clamp(0, e.image_blocks - 1).long()
-        return (frame * e.image_blocks + cell[:, 0]) * e.image_blocks + cell[:, 1]
-
-    return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
+def _by_kind(x: Float[Tensor, "unknowns c"], frames: int) -> Float[Tensor, "unknowns c"]:
+    """Rows in the order of `by_kind`; those after the frames' unknowns stay where they are."""
+    return torch.cat([by_kind(x[: 12 * frames].reshape(frames, 12, -1)), x[12 * frames :]])
 
 
 def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndarray, "frames 4"]:
@@ -273,20 +167,14 @@ def frame_sigmas(sigma: Float[Tensor, "frames 12"], unit: float) -> Float64[ndar
     return parts * np.array([unit, 180 / np.pi, unit, 180 / np.pi])
 
 
-def gauge_free(rig: Rig, free: FreeParameters, H: Float[Tensor, "frames 12 12"]) -> Float[Tensor, "unknowns unknowns"]:
-    """`1 / H` for information about each frame alone, along the free parameters, with the gauge projected out."""
+def gauge_free(rig: Rig, free: FreeParameters, H: Float[Tensor, "frames 12 12"]) -> Float[Tensor, "unknowns c"]:
+    """A factor of `1 / H` for information about each frame alone, along the free parameters, without the gauge."""
     n = rig.frames
     if free.count == 0:
-        return torch.zeros(12 * n, 12 * n, dtype=torch.float64)
-    dense = torch.zeros(n, 12, n, 12, dtype=torch.float64)
-    each = torch.arange(n)
-    dense[each, :, each] = H
-    half = free.steps(inverted(free.matrix(dense))).flatten(0, 1)
-    C, G = free.steps(half.T).flatten(0, 1), _gauge(rig, 12 * n)
-    _remove_gauge(C, G)
-    C = C.T.contiguous()
-    _remove_gauge(C, G)
-    return matrix_by_kind(C, n)
+        return torch.zeros(12 * n, 1, dtype=torch.float64)
+    factor = Cholesky.in_place(free.matrix(torch.block_diag(*H)))
+    root = factor.root(unit_columns(free.count, 12 * n + UNKNOWNS))
+    return _by_kind(_increments(free, _gauge(rig, 12 * n), root), n)
 
 
 def _gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns 7"]:
@@ -294,27 +182,3 @@ def _gauge(rig: Rig, unknowns: int) -> Float[Tensor, "unknowns 7"]:
     G = torch.zeros(unknowns, 7, dtype=torch.float64)
     G[: 12 * rig.frames] = by_frame(gauge_directions(rig)).flatten(0, 1)
     return G
-
-
-def _remove_gauge(x: Float[Tensor, "unknowns c"], G: Float[Tensor, "unknowns 7"]) -> None:
-    """Take motion and growth of the whole scene out of steps (in columns), in place."""
-    x.addmm_(G, torch.linalg.solve(G.T @ G, G.T) @ x, alpha=-1)
-
-
-def inverted(H: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
-    """The inverse of a symmetric positive definite matrix, in its place: large ones are in memory once.
-
-    Raises ArithmeticError if rounding has left it not positive definite.
-    """
-    transposed = H.numpy().T  # LAPACK stores columns one after the other: its upper triangle is the lower one here
-    potrf, potri = get_lapack_funcs(("potrf", "potri"), (transposed,))
-    factor, failed = potrf(transposed, lower=0, overwrite_a=1, clean=0)
-    if failed:
-        raise ArithmeticError(f"the leading minor of order {failed} is not positive")
-    out = torch.from_numpy(potri(factor, lower=0, overwrite_c=1)[0].T)
-    for first in range(0, len(out), _ROWS_AT_ONCE):
-        rows, below = slice(first, first + _ROWS_AT_ONCE), slice(first + _ROWS_AT_ONCE, None)
-        lower = out[rows, rows].tril()
-        out[rows, rows] = lower + lower.tril(-1).T
-        out[rows, below] = out[below, rows].T
-    return out

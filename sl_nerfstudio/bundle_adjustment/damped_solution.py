@@ -24,7 +24,7 @@ def damped_solver(
     """For the normal equations and prior of the frames that move; the damping is a share of the diagonal."""
     g = free.vector(equations.g + prior[1])
     if len(free.frames) <= settings.factorised_frames:
-        return _Factorised(free.matrix(equations.matrix(prior[0])), g).solve
+        return _Factorised(free.matrix(equations.matrix(prior[0], g.new_zeros(0))), g).solve
     return _Iterative.of(equations, prior[0], free, g, settings).solve
 
 
@@ -67,8 +67,7 @@ class _Iterative:
         own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
         none = _Iterative(equations, prior, free, g, own, torch.zeros(0, 0, dtype=g.dtype), settings)
         first = own.shape[0] * own.shape[2]
-        units = torch.eye(free.count, dtype=g.dtype)[first:]
-        columns = [none.product(unit)[first:] for unit in units]
+        columns = [none.product(_unit(free.count, k, g.dtype))[first:] for k in range(first, free.count)]
         shared = torch.stack(columns) if columns else none.shared
         return _Iterative(equations, prior, free, g, own, shared, settings)
 
@@ -103,6 +102,12 @@ class _Iterative:
             rz, before = float(r @ z), rz
             p = z + rz / before * p
         return x
+
+
+def _unit(count: int, k: int, dtype: torch.dtype) -> Float[Tensor, "count"]:
+    out = torch.zeros(count, dtype=dtype)
+    out[k] = 1
+    return out
 
 
 def _damped_factor(blocks: Float[Tensor, "m k k"], damping: float) -> Float[Tensor, "m k k"] | None:

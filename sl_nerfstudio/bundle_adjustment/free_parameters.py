@@ -53,13 +53,15 @@ class FreeParameters:
         shared = (self.shared.transpose(1, 2) @ columns).sum(0)
         return torch.cat([mine.flatten(0, 1), shared]).reshape(self.count, *g.shape[2:])
 
-    def matrix(self, H: Float[Tensor, "m 12 m 12"]) -> Float[Tensor, "count count"]:
-        """The same for both sides of a normal matrix."""
-        m = len(H)
+    def matrix(self, H: Float[Tensor, "unknowns unknowns"]) -> Float[Tensor, "parameters parameters"]:
+        """The same for both sides of a normal matrix; unknowns after those of the frames stay. It may be `H` itself."""
         if self.own.shape[2] == 12 and not self.shared.shape[2]:
-            return H.reshape(12 * m, 12 * m)
-        half = self.vector(H.reshape(m, 12, 12 * m))
-        return self.vector(half.T.reshape(m, 12, -1))
+            return H
+        return self._rows(self._rows(H).T)
+
+    def _rows(self, H: Float[Tensor, "unknowns c"]) -> Float[Tensor, "parameters c"]:
+        m = len(self.own)
+        return torch.cat([self.vector(H[: 12 * m].reshape(m, 12, -1)), H[12 * m :]])
 
 
 def free_parameters(refine: RefinePoses, rig: Rig) -> FreeParameters:

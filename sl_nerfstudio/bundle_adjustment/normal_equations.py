@@ -78,17 +78,25 @@ class NormalEquations:
     cross: Sums
     depths: DepthCouplings
 
-    def matrix(self, prior: Float[Tensor, "m 12 12"]) -> Float[Tensor, "m 12 m 12"]:
-        """The whole normal matrix, with information about each frame alone added."""
-        m, frames = len(self.chosen), len(self.groups[0]) - 1
+    def matrix(
+        self, prior: Float[Tensor, "m 12 12"], common: Float[Tensor, "common"]
+    ) -> Float[Tensor, "unknowns unknowns"]:
+        """The whole normal matrix, unknowns common to all frames last.
+
+        Information about each frame alone is added, and `common` to the diagonal of the others.
+        """
+        m, frames, more = len(self.chosen), len(self.groups[0]) - 1, len(common)
         slot = np.full(frames, -1)
         slot[self.chosen] = np.arange(m)
-        H = np.zeros((12 * m, 12 * m))
+        H = np.zeros((12 * m + more, 12 * m + more))
         pair_sums(m, self.chosen, slot, self.groups, self.rows, self.cross, self.depths.arrays, H)
         mirror(m, H)
-        out = torch.from_numpy(H).reshape(m, 12, m, 12)
-        each = torch.arange(m)
-        out[each, :, each] = self.H + prior
+        out, first = torch.from_numpy(H), 12 * m
+        for k, block in enumerate(self.H + prior):
+            out[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] = block
+        out[:first, first:] = self.border.flatten(0, 1)
+        out[first:, :first] = out[:first, first:].T
+        out[first:, first:] = self.H_common + common.diag()
         return out
 
     def times(self, step: Float[Tensor, "frames 12"]) -> Float[Tensor, "frames 12"]:

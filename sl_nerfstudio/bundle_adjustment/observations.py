@@ -103,7 +103,9 @@ def partners(
     for part in _portions(len(some.frame), n):
         mine = some.chosen(part)
         visible = _visible(rig, mine, maps, (float("inf"), least_cosine), every_other(n))
-        np.add.at(shared, array(mine.frame), visible.T)
+        frame = array(mine.frame)  # ascends
+        starts = np.flatnonzero(np.diff(frame, prepend=-1))
+        shared[frame[starts]] += np.add.reduceat(visible, starts, axis=1, dtype=np.float64).T
     overlap = torch.from_numpy(shared + shared.T >= _LEAST_SHARED)
     rank = torch.where(overlap, torch.rand(n, n, generator=generator), torch.inf)
     half = (most + 1) // 2

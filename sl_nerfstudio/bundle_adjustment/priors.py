@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.unknowns import matrix_by_kind
 from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
 from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
 
@@ -77,16 +76,6 @@ def prior_equations(
     H[:, 6:, 6:] = JtW @ J
     g_relative = (JtW @ _relative_departure(start, rig)[..., None]).squeeze(-1)
     return H, torch.cat([w_frame * _frame_departure(start, rig), g_relative], 1)
-
-
-def prior_covariance(prior: PosePrior, start: Rig) -> Float[Tensor, "unknowns unknowns"]:
-    """Covariance of delta of all frames, then rho of all frames, before any residual is computed."""
-    H, _ = prior_equations(prior, start, start)
-    n = start.frames
-    out = torch.zeros(n, 12, n, 12, dtype=torch.float64)
-    each = torch.arange(n)
-    out[each, :, each] = torch.linalg.inv(H)
-    return matrix_by_kind(out.reshape(12 * n, 12 * n), n)
 
 
 def _frame_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:

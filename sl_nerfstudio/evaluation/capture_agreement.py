@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.frame_pixels import FramePixels, frame_pixels
+from sl_nerfstudio.evaluation.frame_pixels import FramePixels, frame_pixels, most_pixels
 from sl_nerfstudio.evaluation.holes import Holes, find_holes
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.device_poses import DevicePoses
@@ -137,7 +137,8 @@ def _compare(
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
 ) -> tuple[Frame, FrameAgreement, FramePixels]:
-    pixels = frame_pixels(surface, frame, scan, pattern, T_world_camera, T_world_projector)
+    most = most_pixels(len(scan.frames))
+    pixels = frame_pixels(surface, frame, scan, pattern, T_world_camera, T_world_projector, most)
     masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
     return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
 

@@ -23,6 +23,7 @@ from sl_nerfstudio.scan import Frame, Scan
 _SIGMAS = 4.0  # within which predicted and decoded coordinates agree; chance alone exceeds it once in 3000 pixels
 _FOOTPRINT = 0.25  # camera pixels: error that no calibration is assumed to be free of, 1 sigma, as between frames
 MAX_PIXELS = 250_000  # of a frame; larger frames are evaluated on a regular grid of their pixels
+_ALL_PIXELS = 30_000_000  # of all frames: bounds memory and time where there are many
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ class FramePixels:
     def coordinate(self) -> Float[ndarray, "n"]:
         """Distance of predicted from decoded coordinates, pattern pixels."""
         return np.linalg.norm(self.offset, axis=1)
+
+
+def most_pixels(frames: int) -> int:
+    """Pixels of each of so many frames that are evaluated at most."""
+    return min(MAX_PIXELS, max(_ALL_PIXELS // frames, 1))
 
 
 def frame_pixels(

@@ -1,4 +1,4 @@
-"""Arrays that grow piece by piece: in memory, or in a temporary file once they are large.
+"""Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.
 
 The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends it.
 The operating system keeps in memory what is used of it.
@@ -7,6 +7,7 @@ The operating system keeps in memory what is used of it.
 import math
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
@@ -15,6 +16,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 
+_ALIGNMENT = 64  # bytes, of arrays in a file
 _SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
@@ -60,12 +62,37 @@ class GrowingArray:
             for piece in self._pieces:
                 self._file.write(piece.tobytes())
         except OSError as error:
-            raise UserError(
-                f"{tempfile.gettempdir()}: cannot write a temporary file ({error.strerror})\n"
-                f"    cause:  the scan is too large for the memory, and {self._bytes / 2**30:.1f} GB do not fit there\n"
-                "    remedy: set TMPDIR to a folder on a disk with more space"
-            ) from error
+            raise _no_space(error, self._bytes) from error
         self._pieces = []
+
+
+def in_file(arrays: Sequence[ndarray]) -> list[ndarray]:
+    """The same arrays, mapped into memory from one temporary file. Raises UserError if the disk is full."""
+    firsts, end = [], 0
+    for array in arrays:
+        firsts.append(end)
+        end += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
+    try:
+        with tempfile.TemporaryFile() as file:
+            for first, array in zip(firsts, arrays, strict=True):
+                file.seek(first)
+                file.write(np.ascontiguousarray(array).data)
+            file.truncate(max(end, 1))  # nothing can be mapped from an empty file
+            mapped = np.asarray(np.memmap(file, np.uint8, "r+"))
+    except OSError as error:
+        raise _no_space(error, end) from error
+    return [
+        mapped[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+        for first, array in zip(firsts, arrays, strict=True)
+    ]
+
+
+def _no_space(error: OSError, size: int) -> UserError:
+    return UserError(
+        f"{tempfile.gettempdir()}: cannot write a temporary file ({error.strerror})\n"
+        f"    cause:  the scan is too large for the memory, and {size / 2**30:.1f} GB do not fit there\n"
+        "    remedy: set TMPDIR to a folder on a disk with more space"
+    )
 
 
 def _memory(limit: Path) -> int:

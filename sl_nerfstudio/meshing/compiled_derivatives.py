@@ -1,4 +1,4 @@
-"""One point of a surface as one frame sees it, and the derivatives of its residual, for compiled loops.
+"""One point of a surface as one frame sees it, and the derivatives of its residual, in compiled loops.
 
 Formulas and conventions are those of `surface_derivatives`, which wraps these loops for arrays.
 """
@@ -82,3 +82,28 @@ def derive_residual(devices, point, normal, view, by):
         by[i, 13], by[i, 14] = -across * camera[0], -down * camera[0]
         by[i, 15] = view[UV_PROJECTOR + i] - projector[2 + i]
         by[i, 16], by[i, 17] = projector[0] * (i == 0), projector[0] * (i == 1)
+
+
+@compiled
+def write_rows(confirmed, devices, points, normals, out):
+    """Fill `out` (v, 12 frames + 6), which must be zero: by delta of some frames, their rho, and the intrinsics.
+
+    `confirmed` (v, frames) says which of those frames confirm which vertices. A vertex moves by minus the weighted mean
+    of its frames' pulls, each the product of a residual's slope and derivatives.
+    """
+    view, by, frames = np.empty(VIEW), np.empty((2, 18)), len(devices)
+    for v in range(len(points)):
+        total = 0.0
+        for k in range(frames):
+            if not confirmed[v, k]:
+                continue
+            view_point(devices[k], points[v], normals[v], view)
+            derive_residual(devices[k], points[v], normals[v], view, by)
+            s, t, w = view[SLOPE], view[SLOPE + 1], view[AREA]
+            total += w * (s * s + t * t)
+            for i in range(6):
+                out[v, 6 * k + i] -= w * (s * by[0, i] + t * by[1, i])
+                out[v, 6 * (frames + k) + i] -= w * (s * by[0, 6 + i] + t * by[1, 6 + i])
+                out[v, 12 * frames + i] -= w * (s * by[0, 12 + i] + t * by[1, 12 + i])
+        for i in range(out.shape[1]):
+            out[v, i] /= total

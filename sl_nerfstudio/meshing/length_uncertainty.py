@@ -14,7 +14,6 @@ from jaxtyping import Float, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.surface_derivatives import point_equations
@@ -42,34 +41,35 @@ def length_sigma(
     """Uncertainty of the distances between pairs of vertices."""
     chosen, index = np.unique(ends, return_inverse=True)
     index = index.reshape(ends.shape)
-    rows = point_rows(mesh, scan, poses, collect_views(mesh, scan, poses, chosen), chosen)
+    views = collect_views(mesh, scan, poses, chosen)
+    moved = point_changes(mesh, scan, poses, views, chosen, joint.factor)
     along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
     with np.errstate(invalid="ignore", divide="ignore"):
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    row = np.einsum("ni,nij->nj", along, rows[index[:, 1]] - rows[index[:, 0]])
+    change = np.einsum("ni,nik->nk", along, moved[index[:, 1]] - moved[index[:, 0]])
     across = np.einsum("ni,nei->ne", along, mesh.vertex_normals()[ends])
-    return LengthSigma(
-        np.sqrt(np.maximum(np.einsum("ni,ni->n", row @ joint.matrix, row), 0.0)),
-        np.sqrt(((across * sigma_independent[ends]) ** 2).sum(1)),
-    )
+    return LengthSigma(np.sqrt((change**2).sum(1)), np.sqrt(((across * sigma_independent[ends]) ** 2).sum(1)))
 
 
-def point_rows(
-    mesh: Mesh, scan: Scan, poses: DevicePoses, views: VertexViews, chosen: Int64[ndarray, "c"]
-) -> Float[ndarray, "c 3 joint"]:
-    """Derivatives of points by (delta, rho, intrinsics); NaN where no frame confirms the vertex."""
+def point_changes(
+    mesh: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    views: VertexViews,
+    chosen: Int64[ndarray, "c"],
+    steps: Float[ndarray, "joint k"],
+) -> Float[ndarray, "c 3 k"]:
+    """Changes of points by some steps of (delta, rho, intrinsics); NaN where no frame confirms the vertex."""
     n, p = len(scan.frames), torch.from_numpy(mesh.vertices)
     normal = np.zeros((len(chosen), 3, 3))
-    right = np.zeros((len(chosen), 3, 12 * n + UNKNOWNS))
+    right = np.zeros((len(chosen), 3, steps.shape[1]))
     for k in np.unique(views.frame).tolist():
         vertex = views.vertex[views.frame == k]
         at = np.searchsorted(chosen, vertex)
         A, B = (x.numpy() for x in point_equations(devices_of(scan, poses, k), p[vertex]))
         normal[at] += A.transpose(0, 2, 1) @ A
-        pull = A.transpose(0, 2, 1) @ B
-        columns = columns_of(k, n)
-        right[at[:, None, None], np.arange(3)[:, None], columns] += pull[..., :12]
-        right[at, :, 12 * n :] += pull[..., 12:]
+        mine = np.concatenate([steps[columns_of(k, n)], steps[12 * n :]])
+        right[at] += (A.transpose(0, 2, 1) @ B) @ mine
     seen = np.isin(chosen, views.vertex)
     out = np.full_like(right, np.nan)
     out[seen] = -np.linalg.solve(normal[seen], right[seen])

@@ -12,7 +12,7 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.vertex_views import VertexViews
+from sl_nerfstudio.meshing.vertex_sums import VertexSums
 
 AVERAGED_CELLS = 2.0
 """Area over which the field averages, in squares of its finest cells; measured with several draws of noise (1.4 to 3.8
@@ -20,22 +20,16 @@ in benchmarks/log.md)."""
 _MOST_ROUNDS = 60  # of smoothing, for meshes that are much finer than the field
 
 
-def independent_variance(mesh: Mesh, views: VertexViews, averaged_area: float) -> Float[ndarray, "v"]:
+def independent_variance(mesh: Mesh, sums: VertexSums, averaged_area: float) -> Float[ndarray, "v"]:
     """Variance of each vertex along its normal, from what its own neighbourhood was decoded as; NaN without views."""
-    count = len(mesh.vertices)
-    usual = np.nanmedian(views.noise_px) if np.isfinite(views.noise_px).any() else np.nan
-    noise = np.where(np.isfinite(views.noise_px), views.noise_px, usual)[views.frame]
-    weight = views.pixels_per_area * (views.slope**2).sum(1)
-    total = np.bincount(views.vertex, weight, count).astype(float)
+    total = sums.weight
     seen = total > 0
     if not seen.any():
-        return np.full(count, np.nan)
-    spread = np.bincount(views.vertex, weight * noise**2, count)
+        return np.full(len(total), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        from_noise = views.correlation * spread / averaged_area / total**2
-        pull = views.pixels_per_area * (views.slope * views.residual).sum(1)
+        from_noise = sums.correlation * sums.variance / averaged_area / total**2
         smooth = Smoothing(mesh, averaged_area)
-        misfit = smooth(np.bincount(views.vertex, pull, count)) / smooth(total)
+        misfit = smooth(sums.pull) / smooth(total)
         from_misfit = smooth(np.where(seen, misfit**2, 0.0)) / smooth(seen.astype(float))
     return np.where(seen, np.fmax(from_noise, from_misfit), np.nan)
 

@@ -1,6 +1,7 @@
 """For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -41,10 +42,14 @@ class VertexViews:
 
 
 @dataclass(frozen=True)
-class _FrameViews:
+class FrameViews:
     """The same of one frame."""
 
-    columns: dict[str, ndarray]  # those of VertexViews with an entry for each pair, except `frame`
+    vertex: Int64[ndarray, "m"]  # ascending
+    slope: Float[ndarray, "m 2"]
+    residual: Float[ndarray, "m 2"]
+    pixels_per_area: Float[ndarray, "m"]
+    ray_angle: Float[ndarray, "m"]
     noise_px: float
     window_ratio: float  # variance of a window's value over that of a pixel; NaN if unknown
 
@@ -59,6 +64,22 @@ def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
     )
 
 
+def views_by_frame(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None, task: str
+) -> Iterator[FrameViews]:
+    """Of each frame in order, what it confirms of a mesh, or of the `chosen` vertices; `task` names the progress.
+
+    As many frames are in memory at a time as there are threads.
+    """
+    chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
+    points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
+    occluder, all_frames = Occluder(mesh), list(enumerate(scan.frames))
+    for first in track(range(0, len(all_frames), threads()), task):
+        frames = all_frames[first : first + threads()]
+        for found in results([partial(_views_of, points, normals, occluder, f, scan, poses, k) for k, f in frames]):
+            yield replace(found, vertex=chosen[found.vertex])
+
+
 def collect_views(
     mesh: Mesh,
     scan: Scan,
@@ -66,37 +87,35 @@ def collect_views(
     chosen: Int64[ndarray, "c"] | None = None,
     task: str = "uncertainty of the surface",
 ) -> VertexViews:
-    """All frames that see, light and confirm each vertex (or each of the `chosen` ones).
+    """All frames that see, light and confirm each vertex (or each of the `chosen` ones), which takes memory for each.
 
     A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
-    predicts; `task` names the progress. As many frames' images are in memory at a time as there are threads.
+    predicts.
     """
-    chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
-    points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
-    occluder = Occluder(mesh)
-    found: list[_FrameViews] = []
-    for first in track(range(0, len(scan.frames), threads()), task):
-        frames = list(enumerate(scan.frames))[first : first + threads()]
-        found += results([partial(_views_of, points, normals, occluder, frame, scan, poses, k) for k, frame in frames])
-    vertex = np.concatenate([f.columns["vertex"] for f in found])
+    found = list(views_by_frame(mesh, scan, poses, chosen, task))
+    vertex = np.concatenate([f.vertex for f in found])
     order = np.argsort(vertex, kind="stable")
-    frame = np.repeat(np.arange(len(found)), [len(f.columns["vertex"]) for f in found])
-    ratios = np.array([f.window_ratio for f in found])
-    usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
+    frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
 
     def joined(name: str) -> ndarray:
-        return np.concatenate([f.columns.pop(name) for f in found])[order]
+        return np.concatenate([getattr(f, name) for f in found])[order]
 
     return VertexViews(
-        vertex=chosen[vertex[order]],
+        vertex=vertex[order],
         frame=frame[order],
         slope=joined("slope"),
         residual=joined("residual"),
         pixels_per_area=joined("pixels_per_area"),
         ray_angle=joined("ray_angle"),
         noise_px=np.array([f.noise_px for f in found]),
-        correlation=max(1.0, window_pixels() * usual),
+        correlation=correlation_of([f.window_ratio for f in found]),
     )
+
+
+def correlation_of(window_ratios: Sequence[float]) -> float:
+    """How many neighbouring pixels share an error, from what windows gain in each frame (NaN: unknown)."""
+    known = [ratio for ratio in window_ratios if np.isfinite(ratio)]
+    return max(1.0, window_pixels() * float(np.median(known))) if known else 1.0
 
 
 def _views_of(
@@ -107,7 +126,7 @@ def _views_of(
     scan: Scan,
     poses: DevicePoses,
     k: int,
-) -> _FrameViews:
+) -> FrameViews:
     seen = lit_vertices(
         points, normals, occluder, frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k]
     ).vertex
@@ -120,32 +139,29 @@ def _views_of(
     size = np.linalg.norm(residual, axis=1)
     known = np.isfinite(size)
     usual = float(np.median(size[known])) if known.any() else 0.0
-    good = known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX))
-    view = SurfaceView(**{name: value[torch.from_numpy(good)] for name, value in vars(view).items()})
+    good = np.flatnonzero(known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX)))
     residual = residual[good]
-    noise = _spread(_across(view, residual))
-    columns = {"vertex": seen[good], "residual": residual}
-    columns |= {name: getattr(view, name).numpy() for name in ("slope", "pixels_per_area", "ray_angle")}
-    return _FrameViews(columns, noise, _window_ratio(coords, view, noise))
+    slope, pixels_per_area, ray_angle = (x.numpy()[good] for x in (view.slope, view.pixels_per_area, view.ray_angle))
+    noise = _spread(_across(slope, residual))
+    ratio = _window_ratio(coords, view, good, noise)
+    return FrameViews(seen[good], slope, residual, pixels_per_area, ray_angle, noise, ratio)
 
 
-def _across(view: SurfaceView, residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
+def _across(slope: Float[ndarray, "m 2"], residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
     """The component of residuals that no motion of the surface changes: noise, and errors of the poses."""
-    a = view.slope.numpy()
-    return (a[:, 0] * residual[:, 1] - a[:, 1] * residual[:, 0]) / np.linalg.norm(a, axis=1)
+    return (slope[:, 0] * residual[:, 1] - slope[:, 1] * residual[:, 0]) / np.linalg.norm(slope, axis=1)
 
 
 def _spread(values: Float[ndarray, "n"]) -> float:
     return float(np.median(np.abs(values))) * MAD_TO_SIGMA if len(values) >= _FEWEST else float("nan")
 
 
-def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, noise: float) -> float:
-    """Variance of look-ups, which average a window, over that of single pixels."""
-    some = evenly_spaced(len(view.uv_camera), min(_LOOKED_UP, len(view.uv_camera)))
-    part = SurfaceView(**{name: value[some] for name, value in vars(view).items()})
+def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int64[ndarray, "m"], noise: float) -> float:
+    """Variance of look-ups, which average a window, over that of single pixels; of the points that are good."""
+    some = good[evenly_spaced(len(good), min(_LOOKED_UP, len(good)))]
     maps = CoordinateMaps.of([torch.from_numpy(coords)])
-    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), part.uv_camera)
-    across = _across(part, (part.uv_projector - seen.uv_projector).numpy())
+    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), view.uv_camera[some])
+    across = _across(view.slope.numpy()[some], (view.uv_projector[some] - seen.uv_projector).numpy())
     return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
 
 

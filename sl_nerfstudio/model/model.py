@@ -185,7 +185,7 @@ class SLModel(Model):
         if c.adjusts_poses and len(self.scan.frames) > 1:
             found = adjust_scan(self.scan, self.S_scene_world, samples, c.refine_poses, c.prior, c.adjustment)
             rig = found.rig
-            self.device_poses.note(found.sigma, found.joint, found.intrinsics, found.unplaced)
+            self.device_poses.note(found.sigma, found.factor, found.intrinsics, found.unplaced)
             cameras = [frame.camera for frame in self.scan.frames]
             said += [poses_message(found), unplaced_message([self.scan.frames[k].name for k in found.unplaced])]
             if found.intrinsics is not None:

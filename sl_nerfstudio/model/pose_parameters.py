@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, packed, unpacked
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import as_stored, stored_columns
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse
 from sl_nerfstudio.model.settings import SLModelSettings
@@ -50,7 +51,7 @@ class PoseParameters(nn.Module):
     sigma: Tensor
     intrinsics_change: Tensor
     intrinsics_covariance: Tensor
-    joint_triangle: Tensor
+    joint_factor: Tensor
     unplaced: Tensor
 
     def __init__(
@@ -72,9 +73,10 @@ class PoseParameters(nn.Module):
         self.register_buffer("intrinsics_change", torch.full((UNKNOWNS,), float("nan"), dtype=torch.float64))
         covariance = torch.full((UNKNOWNS, UNKNOWNS), float("nan"), dtype=torch.float64)
         self.register_buffer("intrinsics_covariance", covariance)
-        # of all poses and the intrinsics, see JointCovariance: the lower triangle; NaN where not estimated
-        entries = (12 * n + UNKNOWNS) * (12 * n + UNKNOWNS + 1) // 2
-        self.register_buffer("joint_triangle", torch.full((entries,), float("nan"), dtype=torch.float64))
+        # of the covariance of all poses and the intrinsics, see JointCovariance; NaN where not estimated
+        size = 12 * n + UNKNOWNS
+        joint = torch.full((size, stored_columns(size)), float("nan"), dtype=torch.float64)
+        self.register_buffer("joint_factor", joint)
         self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
         self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
         self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
@@ -96,13 +98,13 @@ class PoseParameters(nn.Module):
     def note(
         self,
         sigma: Float[Tensor, "frames 12"],
-        joint: Float[Tensor, "joint joint"],
+        factor: Float[Tensor, "joint k"],
         intrinsics: SelfCalibration | None,
         unplaced: Sequence[int] = (),
     ) -> None:
         """Store the adjustment's results other than the poses."""
         self.sigma.copy_(sigma)
-        self.joint_triangle.copy_(packed(joint))
+        self.joint_factor.copy_(as_stored(factor))
         self.unplaced.zero_()
         self.unplaced[list(unplaced)] = True
         if intrinsics is not None:
@@ -116,9 +118,9 @@ class PoseParameters(nn.Module):
 
     def joint_covariance(self) -> JointCovariance | None:
         """The covariance of all poses and the intrinsics in the scene; None if it was not estimated."""
-        if bool(self.joint_triangle.isnan().any()):
+        if bool(self.joint_factor.isnan().any()):
             return None
-        return JointCovariance(unpacked(self.joint_triangle.cpu()).numpy())
+        return JointCovariance(self.joint_factor.cpu().numpy())
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""

@@ -21,7 +21,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import (
 )
 from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.held_out import BLOCK
 from sl_nerfstudio.dataparser.samples import PixelSamples
@@ -59,7 +59,7 @@ class ScanAdjustment:
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
-    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
+    factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
     cross_validation: CrossValidation
     noise_px: float
     intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
@@ -120,11 +120,11 @@ def adjust_scan(
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
         return ScanAdjustment(
-            found.rig, found.sigma, found.joint, decision, found.noise_px, found.intrinsics, found.unplaced
+            found.rig, found.sigma, found.factor, decision, found.noise_px, found.intrinsics, found.unplaced
         )
     nothing_learnt = decision.worse or refine == "off"
-    sigma, joint = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
-    return ScanAdjustment(start, sigma, joint, decision, found.noise_px, found.intrinsics, found.unplaced)
+    sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
+    return ScanAdjustment(start, sigma, factor, decision, found.noise_px, found.intrinsics, found.unplaced)
 
 
 @dataclass(frozen=True)
@@ -133,23 +133,22 @@ class Found:
 
     rig: Rig
     sigma: Float[Tensor, "frames 12"]
-    joint: Float[Tensor, "joint joint"]  # covariance of all poses and the intrinsics, see JointCovariance
+    factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
     noise_px: float
     intrinsics: SelfCalibration | None
     unplaced: tuple[int, ...]  # frames that do not agree with the others
 
 
-def _known_by_both(start: Rig, found: Found) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint joint"]]:
+def _known_by_both(start: Rig, found: Found) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
     """Uncertainty of starting poses with which the captures agree as well as with the adjusted ones.
 
     They may be wrong by as much as the adjusted ones, and by as much as the two differ.
     """
     pairs = (start.T_world_camera, found.rig.T_world_camera), (start.T_camera_projector, found.rig.T_camera_projector)
     apart = torch.stack([log_se3(a @ inverse(b)) for a, b in pairs])
-    joint = found.joint.clone()
-    poses = apart.numel()
-    joint[:poses, :poses] += torch.outer(apart.flatten(), apart.flatten())
-    return (found.sigma**2 + apart.transpose(0, 1).flatten(1) ** 2).sqrt(), joint
+    column = torch.nn.functional.pad(apart.flatten(), (0, UNKNOWNS))
+    sigma = (found.sigma**2 + apart.transpose(0, 1).flatten(1) ** 2).sqrt()
+    return sigma, torch.cat([found.factor, column[:, None]], 1)
 
 
 def adjusted(
@@ -164,10 +163,10 @@ def adjusted(
     """Adjust the scan's poses from `start`, and restore the scan's lengths."""
     found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
-    joint = torch.from_numpy(JointCovariance(found.joint.numpy()).mapped(_motion(found.rig, rig)).matrix)
+    factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(_motion(found.rig, rig)).factor)
     known = known_length(scan, S_scene_world, refine, rig, prior)
     return Found(
-        rig, found.sigma, with_known_length(joint, rig, known), found.noise_px, found.intrinsics, found.unplaced
+        rig, found.sigma, with_known_length(factor, rig, known), found.noise_px, found.intrinsics, found.unplaced
     )
 
 

@@ -16,6 +16,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     adjust_registered,
     keep_registered,
 )
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration, SeparatePoses
@@ -106,13 +107,13 @@ def _with_left_out(clouds: Sequence[FrameCloud], found: ConsistentFrames) -> Reg
     poses, known = found.adjusted.poses, found.registration.registered
     if known.all():
         return found.registration
-    sharper = []
+    sharper, kept = [], LargeClouds()
     for k, cloud in enumerate(clouds):
         sigma = found.adjusted.sigma[k]
         if known[k] and sigma is not None:
             direction = sigma.relative_translation / float(poses.baseline[k])
             turn = float(np.radians(sigma.relative_rotation_deg))
-            cloud = with_relative_pose(cloud, poses.T_camera_projector[k], turn, direction)
+            cloud = kept.kept(with_relative_pose(cloud, poses.T_camera_projector[k], turn, direction))
         sharper.append(cloud)
     return include_left_out(sharper, found.registration, poses)
 

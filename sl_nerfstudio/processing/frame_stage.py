@@ -11,7 +11,8 @@ from sl_nerfstudio.cores import cores
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.kept.store import Manifest
 from sl_nerfstudio.processing.workers import no_interrupts, worker_pool
 from sl_nerfstudio.progress import track
@@ -30,10 +31,10 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
     if job.masks is not None:
         settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
-    jobs = config.jobs or cores()
+    jobs, clouds = config.jobs or cores(), LargeClouds()
     with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
         for result in track(ready, "decoding and calibrating", len(todo)):
-            found[result.name] = result
+            found[result.name] = with_kept_cloud(result, clouds)
             done = "decoded before" if result.resumed else "decoded"
             status = f"failed in {result.stage}" if result.stage else done
             manifest.note(result.name, result.key, status, result.reason)

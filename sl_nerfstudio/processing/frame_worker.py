@@ -11,6 +11,7 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.kept.store import DecodedStore
 from sl_nerfstudio.processing.selection.user_masks import UserMasks
@@ -67,6 +68,11 @@ def with_clouds(results: Sequence[FrameStageResult], clouds: Sequence[FrameCloud
     """The results with other clouds of the same frames, in the order of `clouds_of`."""
     found = iter(clouds)
     return [result if result.cloud is None else replace(result, cloud=next(found)) for result in results]
+
+
+def with_kept_cloud(result: FrameStageResult, clouds: LargeClouds) -> FrameStageResult:
+    """A frame whose cloud, if it has one, is where there is room for it."""
+    return result if result.cloud is None else replace(result, cloud=clouds.kept(result.cloud))
 
 
 class FrameWorker:

@@ -8,7 +8,6 @@ stays undecided remain apart.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -76,12 +75,14 @@ class Assembly:
         self._edges = sorted(edges, key=lambda e: -quality(e, settings.edge))
         self._weight = edge_weights(self._edges, settings.edge)
         self._least_cosine = np.cos(np.radians(settings.selection.largest_view_angle_deg))
-        self._rejected: set[frozenset[frozenset[int]]] = set()
+        self._rejected: set[tuple[int, int]] = set()  # of the numbers of two components
         fitness = [e.fitness for e in edges] if fitness is None else fitness
         usual = float(np.quantile(fitness, settings.edge.good_quantile)) if len(fitness) else 1.0
         s = settings.assembly
         self._largest_misfit = s.misfit_factor * max(s.least_misfit, 1 - usual)
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
+        self._number = list(range(len(sides)))  # of each frame's component
+        self._joins = 0
 
     def grow(self) -> list[Component]:
         """Join components until no connection is decided; the largest first."""
@@ -91,15 +92,19 @@ class Assembly:
 
     def _join_next(self) -> bool:
         for edge in self._edges:
-            first, second = self._component_of(edge.target), self._component_of(edge.source)
-            if first is second or (key := frozenset((frozenset(first), frozenset(second)))) in self._rejected:
+            a, b = self._number[edge.target], self._number[edge.source]
+            if a == b or (key := (min(a, b), max(a, b))) in self._rejected:
                 continue
+            first, second = self._component_of(edge.target), self._component_of(edge.source)
             joint = self.decide(first, second)
             if joint is None:
                 self._rejected.add(key)
                 continue
             self.components = [c for c in self.components if c is not first and c is not second]
             self.components.append(self._joined(first, second, joint.S_first_second))
+            self._joins += 1
+            for k in self.components[-1]:
+                self._number[k] = len(self._sides) - 1 + self._joins
             return True
         return False
 
@@ -144,11 +149,14 @@ class Assembly:
         one pair inside is judged that looks about as much alike: frames that are farther apart share less surface, and
         more of it lies at edges.
         """
-        pairs = list(combinations(sorted(component), 2))
-        inside = np.array([_cosine(component[i], component[j]) for i, j in pairs])
+        frames = sorted(component)
+        i, j = np.triu_indices(len(frames), 1)
+        sight = np.array([component[k].R[:, 2] for k in frames])
+        inside = (sight[i] * sight[j]).sum(1)
         if not len(cosines) or not (inside > self._least_cosine).any():
             return 0.0
-        alike = [pairs[k] for k in {int(np.abs(inside - cosine).argmin()) for cosine in cosines}]
+        nearest = {int(np.abs(inside - cosine).argmin()) for cosine in cosines}
+        alike = [(frames[i[k]], frames[j[k]]) for k in nearest]
         sigmas = self._settings.assembly.tolerance_sigmas
         agreeing, contradicting = self._totals(
             self._agreement(i, j, component[i].inverse() @ component[j], sigmas) for i, j in alike
@@ -278,10 +286,11 @@ class Assembly:
     def _facing(self, first: Component, second: Component, S: Similarity) -> list[tuple[int, int]]:
         """The pairs across whose cameras look most nearly the same way."""
         s = self._settings.assembly
-        pairs = [(i, j) for i in first for j in second]
-        cosine = np.array([_cosine(first[i], S @ second[j]) for i, j in pairs])
+        here, there = list(first), list(second)
+        sight = np.array([first[i].R[:, 2] for i in here]), np.array([(S.R @ second[j].R)[:, 2] for j in there])
+        cosine = (sight[0][:, None] * sight[1]).sum(-1).ravel()
         near = np.argsort(-cosine, kind="stable")[: s.most_pairs]
-        return [pairs[k] for k in near if cosine[k] > self._least_cosine]
+        return [(here[k // len(there)], there[k % len(there)]) for k in near if cosine[k] > self._least_cosine]
 
     def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""

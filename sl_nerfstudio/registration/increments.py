@@ -12,12 +12,3 @@ def log_at(D: Similarity, centre: Float64[ndarray, "3"], radius: float) -> Float
     """Increment (v, w, l) about a pivot that is the similarity D."""
     v = (D.points(centre[None])[0] - centre) / radius
     return np.concatenate([v, Rotation.from_matrix(D.R).as_rotvec(), [np.log(D.scale)]])
-
-
-def exp_at(
-    x: Float64[ndarray, "7"], centre: Float64[ndarray, "3"], radius: float, largest_log_scale: float
-) -> Similarity:
-    """The similarity of an increment about a pivot."""
-    R = Rotation.from_rotvec(x[3:6]).as_matrix()
-    scale = float(np.exp(np.clip(x[6], -largest_log_scale, largest_log_scale)))
-    return Similarity(scale, R, centre - scale * R @ centre + radius * x[:3])

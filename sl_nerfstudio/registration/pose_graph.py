@@ -8,15 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots, adjoint, chi_square, node_at, residual
-from sl_nerfstudio.registration.increments import exp_at
+from sl_nerfstudio.registration.graph_residuals import EdgeArrays, Nodes, Pivots
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PoseGraphSettings
+from sl_nerfstudio.registration.similarities import Similarities, exps_at
 
 
 @dataclass(frozen=True)
@@ -40,55 +42,67 @@ def optimise_pose_graph(
     connected = [e for e, here in zip(edges, inside, strict=True) if here]
     chi2 = np.full(len(edges), np.inf)
     if connected:
-        nodes = _optimised(connected, nodes, pivots, next(iter(start)), weight[inside], settings)
-        chi2[inside] = chi_square(connected, nodes, pivots)
+        arrays = EdgeArrays.of(connected)
+        every = Similarities.of([S or Similarity.identity() for S in nodes])
+        root = next(iter(start))
+        free = np.array([k for k, S in enumerate(nodes) if S is not None and k != root], dtype=np.int64)
+        every = _optimised(arrays, every, pivots, free, weight[inside], settings)
+        chi2[inside] = arrays.chi_square(arrays.residuals(every, pivots))
+        nodes = [None if S is None else found for S, found in zip(nodes, every.each(), strict=True)]
     return PoseGraphSolution(nodes, chi2 < settings.rejection_factor * settings.kernel_chi2)
 
 
 def _optimised(
-    edges: Sequence[PairMatch],
-    nodes: Nodes,
+    edges: EdgeArrays,
+    nodes: Similarities,
     pivots: Pivots,
-    root: int,
+    free: Int64[ndarray, "m"],
     weight: Float64[ndarray, "edges"],
     settings: PoseGraphSettings,
-) -> Nodes:
+) -> Similarities:
     """Gauss-Newton with a kernel that narrows."""
-    free = [k for k, S in enumerate(nodes) if S is not None and k != root]
-    column = {k: 7 * c for c, k in enumerate(free)}
+    adjoints = edges.adjoints(pivots)
     width2 = settings.first_kernel_factor * settings.kernel_chi2
     for _ in range(settings.iterations):
-        H, g = _normal_equations(edges, nodes, pivots, weight, width2, column)
-        step = -np.linalg.solve(H, g) if free else np.zeros(0)
-        moved = list(nodes)
-        for k, c in column.items():
-            increment = exp_at(step[c : c + 7], pivots.centre[k], pivots.radius[k], settings.largest_log_scale_step)
-            moved[k] = node_at(nodes, k) @ increment
-        nodes = moved
-        if width2 <= settings.kernel_chi2 and (not free or np.abs(step).max() < settings.converged):
+        step = np.zeros((len(pivots), 7))
+        if len(free):
+            residuals = edges.residuals(nodes, pivots)
+            step[free] = _step(edges, adjoints, residuals, weight, width2, free, len(pivots), settings)
+        nodes = nodes @ exps_at(step, pivots.centre, pivots.radius, settings.largest_log_scale_step)
+        if width2 <= settings.kernel_chi2 and np.abs(step).max() < settings.converged:
             break
         width2 = max(settings.kernel_chi2, width2 / settings.kernel_shrinkage)
     return nodes
 
 
-def _normal_equations(
-    edges: Sequence[PairMatch],
-    nodes: Nodes,
-    pivots: Pivots,
+def _step(
+    edges: EdgeArrays,
+    adjoints: Float64[ndarray, "edges 7 7"],
+    residuals: Float64[ndarray, "edges 7"],
     weight: Float64[ndarray, "edges"],
     width2: float,
-    column: dict[int, int],
-) -> tuple[Float64[ndarray, "m m"], Float64[ndarray, "m"]]:
-    """`column`: where the seven unknowns of each free node begin."""
-    size = 7 * len(column)
-    H, g = 1e-9 * np.eye(size), np.zeros(size)
-    for edge, own in zip(edges, weight, strict=True):
-        x = residual(edge, nodes, pivots)
-        W = own * edge.information * geman_mcclure_weight(x @ edge.information @ x / width2)
-        parts = [(edge.source, adjoint(edge, pivots)), (edge.target, -np.eye(7))]
-        blocks = [(slice(column[k], column[k] + 7), J) for k, J in parts if k in column]
-        for rows, J_a in blocks:
-            g[rows] += J_a.T @ (W @ x)
-            for columns, J_b in blocks:
-                H[rows, columns] += J_a.T @ W @ J_b
-    return H, g
+    free: Int64[ndarray, "m"],
+    frames: int,
+    settings: PoseGraphSettings,
+) -> Float64[ndarray, "m 7"]:
+    """Increments of the free nodes. The matrix is sparse: a frame is linked with few others."""
+    kernel = geman_mcclure_weight(edges.chi_square(residuals) / width2)
+    W = (weight * kernel)[:, None, None] * edges.information
+    by_source = adjoints.transpose(0, 2, 1) @ W  # the derivative by the target's increment is minus one
+    blocks = [(edges.source, edges.source, by_source @ adjoints), (edges.source, edges.target, -by_source),
+              (edges.target, edges.source, -by_source.transpose(0, 2, 1)), (edges.target, edges.target, W)]  # fmt: skip
+    g, column = np.zeros((frames, 7)), np.full(frames, -1)
+    np.add.at(g, edges.source, (by_source @ residuals[..., None])[..., 0])
+    np.add.at(g, edges.target, -(W @ residuals[..., None])[..., 0])
+    column[free] = np.arange(len(free))
+    size, each = 7 * len(free), np.arange(7)
+    rows, columns, values = [np.arange(size)], [np.arange(size)], [np.full(size, settings.least_information)]
+    for a, b, block in blocks:
+        moves = (column[a] >= 0) & (column[b] >= 0)
+        i, j = (7 * column[k[moves], None, None] for k in (a, b))
+        rows.append(np.broadcast_to(i + each[:, None], (len(i), 7, 7)).ravel())
+        columns.append(np.broadcast_to(j + each, (len(i), 7, 7)).ravel())
+        values.append(block[moves].ravel())
+    H = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
+    factor = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return -factor.solve(g[free].ravel()).reshape(-1, 7)

@@ -195,6 +195,8 @@ class PoseGraphSettings:
     """step, in radian and radii, below which the optimisation has converged"""
     largest_log_scale_step: float = 0.5
     """logarithm of the scale that one step may change"""
+    least_information: float = 1e-9
+    """that every unknown has, so that the equations can be solved"""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ def write_covariance(folder: Path, scan: Scan, joint: JointCovariance | None) ->
         return
     buffer = io.BytesIO()
     names = np.array([frame.name for frame in scan.frames])
-    np.savez_compressed(buffer, covariance=joint.matrix, frames=names, units=np.array(scan.units))
+    np.savez_compressed(buffer, factor=joint.factor, frames=names, units=np.array(scan.units))
     write_atomic(path, buffer.getvalue())
 
 
@@ -34,12 +34,12 @@ def read_covariance(folder: Path, scan: Scan) -> JointCovariance | None:
         return None
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            matrix, frames, units = archive["covariance"], archive["frames"].tolist(), str(archive["units"])
+            factor, frames, units = archive["factor"], archive["frames"].tolist(), str(archive["units"])
     except (*ARRAY_DAMAGE, KeyError) as error:
         raise FileError(path, f"cannot be read ({error})", "it is damaged or another file", _AGAIN) from error
     if frames != [frame.name for frame in scan.frames] or units != scan.units:
         raise FileError(path, "is that of other frames or another unit", "the poses are those of another scan", _AGAIN)
     size = 12 * len(frames) + UNKNOWNS
-    if matrix.shape != (size, size) or matrix.dtype != np.float64 or not np.isfinite(matrix).all():
-        raise FileError(path, f"covariance: is {matrix.dtype} {matrix.shape}", "the file is damaged", _AGAIN)
-    return JointCovariance(matrix)
+    if factor.ndim != 2 or len(factor) != size or factor.dtype != np.float64 or not np.isfinite(factor).all():
+        raise FileError(path, f"factor: is {factor.dtype} {factor.shape}", "the file is damaged", _AGAIN)
+    return JointCovariance(factor)

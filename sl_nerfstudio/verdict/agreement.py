@@ -63,12 +63,16 @@ def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> 
     pairs = _pairs(found, settings)
     seen = np.zeros(len(found.source), bool)
     seen[found.anchor] = True
+    of_frame: list[list[PairAgreement]] = [[] for _ in range(found.frames)]
+    for pair in pairs:
+        for k in pair.frames:
+            of_frame[k].append(pair)
     return CrossFrameAgreement(
         noise_px=noise_px,
         share=_mean(found.normalised < settings.sigmas),
         px_median=_quantile(found.px, 0.5),
         px_p95=_quantile(found.px, 0.95),
-        frames=tuple(_frame(seen[found.source == k], [p for p in pairs if k in p.frames]) for k in range(found.frames)),
+        frames=tuple(_frame(seen[found.source == k], of_frame[k]) for k in range(found.frames)),
         pairs=tuple(pairs),
     )
 

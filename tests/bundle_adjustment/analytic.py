@@ -10,7 +10,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapS
 from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.unknowns import by_kind, matrix_by_kind
+from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
 from sl_nerfstudio.geometry.se3 import inverse, pose, transform
@@ -143,11 +143,22 @@ def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:
     return maps.values[maps.offsets[frame] + pixel[:, 1] * maps.widths[frame] + pixel[:, 0]].double()
 
 
+def without_prior(equations: NormalEquations) -> Tensor:
+    """The normal matrix alone."""
+    return equations.matrix(torch.zeros_like(equations.H), torch.zeros_like(equations.g_common))
+
+
+def matrix_by_kind(matrix: Tensor, frames: int) -> Tensor:
+    """Rows and columns reordered as by `by_kind`; those after the frames' unknowns stay where they are."""
+    order = torch.arange(len(matrix))
+    order[: 12 * frames] = by_kind(order[: 12 * frames].reshape(frames, 12))
+    return matrix[order][:, order]
+
+
 def dense(equations: NormalEquations) -> tuple[Tensor, Tensor]:
     """Matrix and gradient by delta of all frames, then rho of all frames."""
     size, frames = equations.g.numel(), len(equations.g)
-    H = equations.matrix(torch.zeros_like(equations.H)).reshape(size, size)
-    return matrix_by_kind(H, frames), by_kind(equations.g)
+    return matrix_by_kind(without_prior(equations)[:size, :size], frames), by_kind(equations.g)
 
 
 def columns_of(linear: Linearisation) -> tuple[Tensor, Tensor]:

@@ -11,14 +11,15 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.free_parameters import constrained, free_parameters
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_covariance, prior_equations
+from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import joint_of_prior
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.bundle_adjustment.unknowns import by_kind, matrix_by_kind
+from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
 from sl_nerfstudio.geometry.similarity import fit_similarity
 
-from .analytic import ExactMaps, disturbed, images_of, rig_of, static_rig
+from .analytic import ExactMaps, disturbed, images_of, matrix_by_kind, rig_of, static_rig
 
 FRAMES, SIZE = 6, 100
 QUICK = AdjustmentSettings(anchors_per_frame=80, frames_per_anchor=3, max_iterations=16)
@@ -180,7 +181,7 @@ def test_free_directions_of_each_mode(mode, columns):
     B = free.steps(torch.eye(columns, dtype=torch.float64)).flatten(0, 1)
     generator = torch.Generator().manual_seed(0)
     A, y = torch.randn(36, 36, dtype=torch.float64, generator=generator), torch.randn(36, generator=generator).double()
-    assert torch.allclose(free.matrix((A + A.T).reshape(3, 12, 3, 12)), B.T @ (A + A.T) @ B, rtol=0, atol=1e-12)
+    assert torch.allclose(free.matrix(A + A.T), B.T @ (A + A.T) @ B, rtol=0, atol=1e-12)
     assert torch.allclose(free.vector(y.reshape(3, 12)), B.T @ y, rtol=0, atol=1e-12)
     x = torch.randn(columns, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     step = free.step(x)
@@ -225,7 +226,9 @@ def test_prior_equations_are_derivatives_of_the_weighted_difference():
     term = PriorTerm(prior, true, 3.0)
     assert term.energy(rig) == pytest.approx(6 * half_cost(rig), rel=1e-12)
     assert torch.equal(term.equations(rig)[0], 3 * H) and torch.equal(by_kind(term.equations(rig)[1]), 3 * g)
-    inverse_H = prior_covariance(prior, rig)
-    assert torch.allclose(inverse_H, torch.linalg.inv(matrix_by_kind(torch.block_diag(*H), n)), rtol=0, atol=1e-12)
+    factor = joint_of_prior(prior, rig)
+    inverse_H = torch.linalg.inv(matrix_by_kind(torch.block_diag(*H), n))
+    wanted = torch.block_diag(inverse_H, prior.intrinsics_sigma.square().diag())
+    assert torch.allclose(factor @ factor.T, wanted, rtol=0, atol=1e-12)
     at_start = prior_equations(prior, true, true)[1]
     assert at_start.abs().max() < 1e-12 * float(H.abs().max())

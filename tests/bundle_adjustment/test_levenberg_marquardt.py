@@ -15,9 +15,9 @@ from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.settings import StepSettings
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind, matrix_by_kind
+from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
-from .analytic import ExactMaps, dense, disturbed, rig_of
+from .analytic import ExactMaps, dense, disturbed, matrix_by_kind, rig_of
 
 FRAMES, SIZE = 4, 80
 SETTINGS = StepSettings()

@@ -55,31 +55,31 @@ def test_a_scene_that_holds_its_frames_is_searched_once():
     one, several = (
         adjust(start, maps, PRIOR, "known-rig", replace(s, anchors_per_frame=300)) for s in (ONE_SEARCH, SETTINGS)
     )
-    assert torch.equal(one.joint, several.joint)
+    assert torch.equal(one.factor, several.factor)
     assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera)
 
 
-def random_joint(seed: int) -> Tensor:
+def random_factor(seed: int) -> Tensor:
     A = torch.randn(12 * FRAMES + 6, 80, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return A @ A.T / 80
+    return A / 80**0.5
 
 
 def test_a_shake_has_the_covariance_of_the_poses_given_the_intrinsics():
-    joint, generator, k = random_joint(0), torch.Generator().manual_seed(1), 12 * FRAMES
-    draws = torch.stack([shake(joint, 2.0, generator) for _ in range(1000)])
-    wanted = torch.linalg.inv(torch.linalg.inv(joint)[:k, :k])  # precision of the poses alone
+    factor, generator, k = random_factor(0), torch.Generator().manual_seed(1), 12 * FRAMES
+    draws = torch.stack([shake(factor, 2.0, generator) for _ in range(1000)])
+    wanted = torch.linalg.inv(torch.linalg.inv(factor @ factor.T)[:k, :k])  # precision of the poses alone
     assert float(((draws.T @ draws / 1000 / 4 - wanted) / wanted.diagonal().max()).abs().max()) < 0.2
 
 
 def test_intrinsics_that_are_exact_change_nothing():
-    joint, k = random_joint(0), 12 * FRAMES
-    joint[k:], joint[:, k:] = 0, 0
-    alone = shake(joint, 1.0, torch.Generator().manual_seed(2))
+    factor, k = random_factor(0), 12 * FRAMES
+    factor[k:] = 0
+    alone = shake(factor, 1.0, torch.Generator().manual_seed(2))
     assert alone.isfinite().all() and float(alone.abs().max()) > 0.1
-    assert farthest_frame(joint, torch.zeros(k, dtype=torch.float64)) == 0
+    assert farthest_frame(factor, torch.zeros(k, dtype=torch.float64)) == 0
     one = torch.zeros(k, dtype=torch.float64)
-    one[6:12] = 3 * joint.diagonal()[6:12].sqrt()
-    assert farthest_frame(joint, one) == pytest.approx(3)
+    one[6:12] = 3 * factor[6:12].norm(dim=1)
+    assert farthest_frame(factor, one) == pytest.approx(3)
 
 
 def test_moving_and_scaling_all_frames_is_no_departure():
@@ -106,8 +106,10 @@ def test_drawn_starts_scatter_as_the_prior_states(with_projectors):
 
 
 def test_widening_adds_the_mean_square_to_poses_alone():
-    joint, k = random_joint(3), 12 * FRAMES
+    factor, k = random_factor(3), 12 * FRAMES
     a, b = torch.randn(2, k, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    more = widened(joint, [a, b]) - joint
-    assert torch.allclose(more[:k, :k], (torch.outer(a, a) + torch.outer(b, b)) / 2) and not more[k:].any()
-    assert torch.equal(widened(joint, []), joint)
+    wide = widened(factor, [a, b])
+    more = wide @ wide.T - factor @ factor.T
+    assert torch.allclose(more[:k, :k], (torch.outer(a, a) + torch.outer(b, b)) / 2)
+    assert float(more[k:].abs().max()) < 1e-12
+    assert torch.equal(widened(factor, []), factor)

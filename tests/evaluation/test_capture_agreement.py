@@ -5,7 +5,7 @@ import pytest
 
 from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement
 from sl_nerfstudio.evaluation.evaluate import evaluate
-from sl_nerfstudio.evaluation.frame_pixels import frame_pixels, look_up
+from sl_nerfstudio.evaluation.frame_pixels import MAX_PIXELS, frame_pixels, look_up, most_pixels
 from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
@@ -115,3 +115,16 @@ def test_large_frames_are_thinned_on_a_grid(clean_scan: Path) -> None:
     assert (every.stride, few.stride) == (1, 2)
     assert len(few.row) == pytest.approx(len(every.row) / 4, rel=0.1)
     assert not (few.row % 2).any() and not (few.column % 2).any()
+
+
+def test_many_frames_are_evaluated_at_fewer_pixels_of_each(clean_scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [most_pixels(frames) for frames in (1, 120, 1000)] == [MAX_PIXELS, MAX_PIXELS, 30_000]
+    scan, mesh, counts = read_scan(clean_scan), FacetedScan().truth(), []
+    every = evaluate(mesh, scan, scan.poses).agreement
+    monkeypatch.setattr("sl_nerfstudio.evaluation.frame_pixels._ALL_PIXELS", 1500)
+    few = evaluate(
+        mesh, scan, scan.poses, on_frame=lambda frame, figures, pixels: counts.append(len(pixels.row))
+    ).agreement
+    assert len(counts) == 3 and all(200 < count <= 550 for count in counts)
+    for a, b in zip(every.frames, few.frames, strict=True):
+        assert b.pixels == pytest.approx(a.pixels, rel=0.1) and b.hit_share == a.hit_share == 1.0

@@ -11,7 +11,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCov
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.lengths import PointPair, measure_lengths, parse_pair, read_pairs, typical_sigma
 from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.meshing.length_uncertainty import point_rows
+from sl_nerfstudio.meshing.length_uncertainty import point_changes
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.meshing.vertex_views import collect_views
 from sl_nerfstudio.scan import Scan, read_scan
@@ -34,7 +34,7 @@ def rows(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     chosen = np.unique(every.vertex)
     seen = np.zeros((len(chosen), FRAMES), dtype=bool)
     seen[np.searchsorted(chosen, every.vertex), every.frame] = True
-    return chosen, point_rows(mesh, scan, scan.poses, every, chosen), seen
+    return chosen, point_changes(mesh, scan, scan.poses, every, chosen, np.eye(12 * FRAMES + 6)), seen
 
 
 def quality() -> VertexQuality:
@@ -91,7 +91,7 @@ def test_a_length_has_the_uncertainty_of_its_ends(scan, rows):
     a, b = int(chosen[0]), int(chosen[-1])
     pair = PointPair("edge", tuple(mesh.vertices[a].tolist()), tuple(mesh.vertices[b].tolist()))
     factor = np.random.default_rng(1).normal(size=(12 * FRAMES + 6,) * 2) * 1e-3
-    joint = JointCovariance(factor @ factor.T)
+    joint = JointCovariance(factor)
     (length,) = measure_lengths([pair], mesh, quality(), scan, scan.poses, joint)
     u = mesh.vertices[b] - mesh.vertices[a]
     assert length.length == pytest.approx(np.linalg.norm(u), rel=1e-6)
@@ -102,7 +102,7 @@ def test_a_length_has_the_uncertainty_of_its_ends(scan, rows):
     assert length.sigma_independent == pytest.approx(independent, rel=1e-9)
     assert length.sigma == pytest.approx(np.hypot(length.sigma_shared, independent)) and length.views == (2, 2)
     rigid = np.r_[np.tile([1.0, 2, 3, 0.1, 0.2, 0.3], FRAMES), np.zeros(6 * FRAMES + 6)]
-    (still,) = measure_lengths([pair], mesh, quality(), scan, scan.poses, JointCovariance(np.outer(rigid, rigid)))
+    (still,) = measure_lengths([pair], mesh, quality(), scan, scan.poses, JointCovariance(rigid[:, None]))
     assert still.sigma_shared == pytest.approx(0, abs=1e-5)
     for known in ((None, joint), (quality(), None)):
         (unknown,) = measure_lengths([pair], mesh, known[0], scan, scan.poses, known[1])
@@ -117,7 +117,7 @@ def test_what_is_typical_of_lengths_is_their_growth(scan):
     growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
     step = 0.01 * np.r_[growth.ravel(), np.zeros(6)]
     exact = replace(known, sigma_independent=np.zeros(len(mesh.vertices)))
-    joint = JointCovariance(np.outer(step, step))
+    joint = JointCovariance(step[:, None])
     assert typical_sigma(mesh, exact, scan, scan.poses, joint) == pytest.approx(0.01, rel=1e-6)
     unseen = replace(known, views=np.zeros_like(known.views))
     for quality_, joint_ in ((None, joint), (known, None), (unseen, joint)):

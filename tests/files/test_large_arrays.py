@@ -7,7 +7,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files import large_arrays
-from sl_nerfstudio.files.large_arrays import GrowingArray, largest_in_memory
+from sl_nerfstudio.files.large_arrays import GrowingArray, in_file, largest_in_memory
 
 
 @pytest.mark.parametrize("most", [0, 100, 10**6])
@@ -37,3 +37,22 @@ def test_the_limit_is_a_share_of_the_memory_that_may_be_used(tmp_path, monkeypat
     assert largest_in_memory() == 1000000
     limit.write_text("max\n")
     assert largest_in_memory() > 10**7
+
+
+def test_arrays_in_a_file_are_the_same_arrays(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    rng = np.random.default_rng(0)
+    arrays = [rng.random((5, 3))[:, ::2], np.zeros((0, 2)), rng.random(7) > 0.5, np.float32([[1, np.nan]]), np.eye(4)]
+    found = in_file(arrays)
+    for array, same in zip(arrays, found, strict=True):
+        assert same.dtype == array.dtype and same.shape == array.shape
+        np.testing.assert_array_equal(same, array)
+    found[-1][0, 0] = 7  # as an array in memory
+    assert found[-1].sum() == 10 and not list(tmp_path.iterdir())
+    assert in_file([]) == [] and in_file([np.zeros(0)])[0].shape == (0,)
+
+
+def test_no_place_for_arrays_is_a_fault_of_the_user(monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
+    with pytest.raises(UserError, match=r"temporary file.*\n.*\n.*TMPDIR"):
+        in_file([np.zeros(3)])

@@ -15,8 +15,9 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.surface_derivatives import view_surface
 from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, Smoothing, independent_variance
 from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.vertex_sums import VertexSums, sum_views
 from sl_nerfstudio.meshing.vertex_uncertainty import surface_rows, vertex_uncertainty
-from sl_nerfstudio.meshing.vertex_views import VertexViews, collect_views, devices_of
+from sl_nerfstudio.meshing.vertex_views import FrameViews, VertexViews, collect_views, devices_of, views_by_frame
 from sl_nerfstudio.scan import Scan
 
 from .ray_cast_scan import pairs_around, scan_of
@@ -48,17 +49,82 @@ def views(scan: Scan) -> VertexViews:
     return collect_views(hill(), scan, scan.poses)
 
 
+@pytest.fixture(scope="module")
+def sums(scan: Scan) -> VertexSums:
+    return sum_views(views_by_frame(hill(), scan, scan.poses, None, "test"), len(hill().vertices))
+
+
+def confirmed_by(views: VertexViews, vertices: np.ndarray) -> np.ndarray:
+    """Which frames confirm some vertices."""
+    return np.stack([np.isin(vertices, views.vertex[views.frame == k]) for k in range(FRAMES)], 1)
+
+
 def rows_of(scan: Scan, views: VertexViews) -> tuple[np.ndarray, np.ndarray]:
     mesh = hill()
     vertices = np.unique(views.vertex)[::7]
-    return vertices, surface_rows(mesh.vertices, mesh.vertex_normals(), scan, scan.poses, views, vertices)
+    confirmed = confirmed_by(views, vertices)
+    return vertices, surface_rows(mesh.vertices[vertices], mesh.vertex_normals()[vertices], scan, scan.poses, confirmed)
+
+
+def test_sums_are_those_of_all_pairs_of_a_vertex_and_a_frame(views: VertexViews, sums: VertexSums):
+    count = len(hill().vertices)
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(views.vertex, values, count)
+
+    weight = views.pixels_per_area * (views.slope**2).sum(1)
+    wanted = {
+        "number": total(np.ones(len(weight))),
+        "distance": total(np.linalg.norm(views.residual, axis=1)),
+        "weight": total(weight),
+        "variance": total(weight * views.noise_px[views.frame] ** 2),
+        "pull": total(views.pixels_per_area * (views.slope * views.residual).sum(1)),
+    }
+    for name, values in wanted.items():
+        assert np.array_equal(getattr(sums, name), values), name
+    assert sums.correlation == views.correlation
+    for vertices in (np.arange(count), np.array([3, 900, 77])):
+        assert np.array_equal(sums.confirmed(vertices), confirmed_by(views, vertices))
+    angle = np.full(count, np.nan)
+    np.fmax.at(angle, views.vertex, views.ray_angle)
+    assert np.array_equal(sums.ray_angle, angle, equal_nan=True)
+
+
+def test_frames_that_confirm_too_little_have_the_noise_of_the_others():
+    one = FrameViews(np.array([0, 1]), np.ones((2, 2)), np.ones((2, 2)), np.ones(2), np.ones(2), 0.5, np.nan)
+    few = replace(one, vertex=np.array([1, 2]), noise_px=np.nan)
+    sums = sum_views([one, few], 4)
+    np.testing.assert_allclose(sums.variance, 0.25 * sums.weight)
+    assert sums.weight.tolist() == [2, 4, 2, 0] and sums.correlation == 1
+    assert np.isnan(sum_views([few], 4).variance[[1, 2]]).all()
+
+
+def test_random_draws_are_multiplied_with_fewer_digits(scan: Scan, monkeypatch: pytest.MonkeyPatch):
+    exact = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    found = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
+    assert not np.array_equal(found.sigma, exact.sigma, equal_nan=True)
+    np.testing.assert_allclose(found.sigma, exact.sigma, rtol=1e-4)
+
+
+def test_sigma_is_what_the_covariance_says_of_the_surface_less_its_motion(scan: Scan, sums: VertexSums):
+    """The whole matrix of derivatives at once, and the motion that fits it best."""
+    mesh, joint, seen = hill(), random_joint(), np.flatnonzero(sums.number)
+    p, n = mesh.vertices[seen], mesh.vertex_normals()[seen]
+    rows = surface_rows(p, n, scan, scan.poses, sums.confirmed(seen))
+    p = p - p.mean(0)
+    rigid = np.concatenate([n, np.cross(p, n)], 1)
+    rows = rows - rigid @ np.linalg.lstsq(rigid, rows, rcond=None)[0]
+    found = vertex_uncertainty(mesh, scan, scan.poses, joint, CELL)
+    shared = found.sigma[seen] ** 2 - found.sigma_independent[seen] ** 2
+    np.testing.assert_allclose(shared, ((rows @ joint.matrix) * rows).sum(1), rtol=1e-6)
 
 
 def random_joint() -> JointCovariance:
     size = 12 * FRAMES + 6
     factor = np.random.default_rng(1).normal(size=(size, size)) / size**0.5
     scale = np.r_[np.tile([0.02] * 3 + [1e-4] * 3, 2 * FRAMES), [1e-4] * 6]  # mm and radian
-    return JointCovariance(scale[:, None] * (factor @ factor.T) * scale)
+    return JointCovariance(scale[:, None] * factor)
 
 
 def test_noise_and_its_independence_are_measured_from_the_scan(views: VertexViews):
@@ -117,15 +183,15 @@ def test_vertices_move_as_surfaces_that_are_fitted_again(scan: Scan, views: Vert
 
 def test_a_common_rigid_motion_is_no_uncertainty_of_the_shape(scan: Scan):
     motion = np.r_[np.tile([1.0, 2.0, -1.0, 0.01, -0.02, 0.03], FRAMES), np.zeros(6 * FRAMES + 6)]
-    rigid = vertex_uncertainty(hill(), scan, scan.poses, JointCovariance(np.outer(motion, motion)), CELL)
+    rigid = vertex_uncertainty(hill(), scan, scan.poses, JointCovariance(motion[:, None]), CELL)
     exact = vertex_uncertainty(hill(), scan, scan.poses, None, CELL)
     np.testing.assert_allclose(rigid.sigma, exact.sigma, rtol=1e-6)
     assert np.array_equal(exact.sigma, exact.sigma_independent, equal_nan=True)
 
 
-def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views: VertexViews):
+def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views: VertexViews, sums: VertexSums):
     mesh, seen = hill(), np.unique(views.vertex)
-    on_truth = replace(views, residual=np.zeros_like(views.residual), correlation=1.0)
+    on_truth = replace(sums, pull=np.zeros_like(sums.pull), correlation=1.0)
     area = AVERAGED_CELLS * CELL**2
     v = seen[len(seen) // 2]
     mine = views.vertex == v
@@ -135,7 +201,7 @@ def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views:
     expected = (pixels * slope2 * noise**2).sum() / (pixels * slope2).sum() ** 2
     assert independent_variance(mesh, on_truth, area)[v] == pytest.approx(expected)
     # a surface that lies 0.6 mm beside what the pixels say is that uncertain
-    beside = replace(on_truth, residual=0.6 * views.slope)
+    beside = replace(on_truth, pull=0.6 * sums.weight)
     inner = np.abs(mesh.vertices[seen]).max(1) < 20
     np.testing.assert_allclose(np.sqrt(independent_variance(mesh, beside, area)[seen[inner]]), 0.6, rtol=1e-6)
 

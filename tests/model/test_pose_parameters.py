@@ -185,9 +185,8 @@ def test_results_of_the_adjustment_are_saved_with_the_poses():
     assert poses.self_calibration() is None
     sigma, found = torch.rand(FRAMES, 12), SelfCalibration(torch.rand(6).double(), torch.eye(6).double())
     factor = torch.randn(12 * FRAMES + 6, 12 * FRAMES + 6).double()
-    joint = factor + factor.T
     assert poses.joint_covariance() is None
-    poses.note(sigma, joint, found)
+    poses.note(sigma, factor, found)
     other = make(RigPoseParameters)
     other.load_state_dict(poses.state_dict())
     kept = other.self_calibration()
@@ -196,4 +195,9 @@ def test_results_of_the_adjustment_are_saved_with_the_poses():
     )
     assert torch.equal(other.sigma, sigma.double())
     both = other.joint_covariance()
-    assert both is not None and np.array_equal(both.matrix, joint.numpy())
+    assert both is not None and np.array_equal(both.factor, factor.numpy())
+    poses.note(sigma, torch.cat([factor, factor[:, :4]], 1), found)  # with the columns of other minima, say
+    more = poses.joint_covariance()
+    assert more is not None and more.factor.shape == factor.shape
+    wanted = factor @ factor.T + factor[:, :4] @ factor[:, :4].T
+    np.testing.assert_allclose(more.matrix, wanted.numpy(), atol=1e-9)

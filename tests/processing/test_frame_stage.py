@@ -1,18 +1,22 @@
 """The frame stage with a third decoder: decoding, resuming, and frames that fail."""
 
 import json
+import mmap
 import os
 import shutil
 import sys
+import tempfile
 
 import numpy as np
 import pytest
 
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.large_arrays import in_file
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage, run_frames
 from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
+from sl_nerfstudio.processing.kept import large_clouds
 from sl_nerfstudio.processing.kept.records import digest
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png
@@ -148,3 +152,39 @@ def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ram
     killed = type(job)(job.work, KilledDecoder(LAYOUT), job.camera, job.projector, job.seed)
     with pytest.raises(UserError, match=r"was killed\n.*cause:  2 processes need more memory.*\n.*--jobs"):
         list(run_frames(killed, captures.frames, 2))
+
+
+def _bytes_of(folder):
+    """Of all files but those that state times and paths."""
+    found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {name: content for name, content in found.items() if name.startswith(("coords", "mask", "transforms"))}
+
+
+def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, ramps_registered, ramp_scan, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    written, found = [], []
+    monkeypatch.setattr(large_clouds, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
+    for most in (10**9, 0):
+        monkeypatch.setattr(large_clouds, "largest_in_memory", lambda most=most: most)
+        out = tmp_path / str(most)
+        monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(out)])
+        main()
+        assert bool(written) == (most == 0)
+        found.append(_bytes_of(out))
+    assert len(found[0]) == 2 * len(NAMES) + 1 and found[0] == found[1]
+
+
+def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
+    worker = FrameWorker(ramp_scan.job(tmp_path))
+    clouds = clouds_of([worker(frame) for frame in _captures(ramp_scan).frames])
+    size = sum(array.nbytes for array in (clouds[0].points, clouds[0].coords))
+    kept = large_clouds.LargeClouds(6 * size)
+    same = [kept.kept(cloud) for cloud in clouds]
+    assert digest(tuple(same)) == digest(tuple(clouds))
+    assert not _mapped(same[0].points) and _mapped(same[-1].points) and _mapped(same[-1].pose.noise_px)
+
+
+def _mapped(array):
+    while array is not None and not isinstance(array, mmap.mmap):
+        array = getattr(array, "base", None)
+    return array is not None

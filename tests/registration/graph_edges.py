@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import Pivots
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
+from sl_nerfstudio.registration.similarities import exps_at
 
 NO_SLIP = np.array([0.0, 0, 0, 0, 0, 1, 0])  # the direction of a slip: about the line of sight
 
@@ -41,3 +42,8 @@ def turned(S: Similarity, degrees: float, centre: np.ndarray, axis: tuple[float,
     """A similarity into the axes of a target, turned there about a point."""
     R = Rotation.from_rotvec(np.radians(degrees) * np.array(axis, dtype=np.float64)).as_matrix()
     return Similarity(1.0, R, centre - R @ centre) @ S
+
+
+def exp_at(x: np.ndarray, centre: np.ndarray, radius: float, largest_log_scale: float) -> Similarity:
+    """The similarity of one increment about a pivot."""
+    return exps_at(x[None], centre[None], np.array([radius]), largest_log_scale).each()[0]

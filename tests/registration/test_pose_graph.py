@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.increments import exp_at
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights
 from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
-from tests.registration.graph_edges import edge, pivots_of
+from tests.registration.graph_edges import edge, exp_at, pivots_of
 
 
 def random_nodes(n: int, rng: np.random.Generator) -> list[Similarity]:

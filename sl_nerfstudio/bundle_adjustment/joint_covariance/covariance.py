@@ -9,26 +9,36 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_covariance
+from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import unit_columns
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
+from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
 from sl_nerfstudio.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Second moments of the errors of delta of all frames, then rho of all frames, then the intrinsics."""
+    """Second moments of the errors of delta of all frames, then rho of all frames, then the intrinsics.
 
-    matrix: Float64[ndarray, "joint joint"]
+    They are `factor @ factor.T`. Of scans with more than 106 frames the columns are random draws (`draws`).
+    """
+
+    factor: Float64[ndarray, "joint k"]
+
+    @property
+    def matrix(self) -> Float64[ndarray, "joint joint"]:
+        """The covariance itself, which takes much memory for many frames."""
+        return self.factor @ self.factor.T
 
     @property
     def frames(self) -> int:
         """Number of frames."""
-        return (len(self.matrix) - UNKNOWNS) // 12
+        return (len(self.factor) - UNKNOWNS) // 12
 
     def mapped(self, S_target_world: Similarity) -> "JointCovariance":
         """For the same devices in other axes and another unit.
@@ -40,39 +50,18 @@ class JointCovariance:
         cross = np.cross(np.eye(3), t).T  # cross @ w = w x t
         frame = np.block([[s * R, -cross @ R], [np.zeros((3, 3)), R]])
         relative = np.diag([s] * 3 + [1.0] * 3)
-        once = _rows_mapped(self.matrix, frame, relative)
-        return JointCovariance(_rows_mapped(once.T, frame, relative))
+        half, out = 6 * self.frames, self.factor.copy()
+        for first, J in ((0, frame), (half, relative)):
+            part = self.factor[first : first + half]
+            out[first : first + half] = (J @ part.reshape(-1, 6, part.shape[1])).reshape(half, -1)
+        return JointCovariance(out)
 
 
-def _rows_mapped(
-    matrix: Float64[ndarray, "joint k"], frame: Float64[ndarray, "6 6"], relative: Float64[ndarray, "6 6"]
-) -> Float64[ndarray, "joint k"]:
-    """Every frame's rows under one linear map of its delta and one of its rho."""
-    half = (len(matrix) - UNKNOWNS) // 2
-    out = matrix.copy()
-    for first, J in ((0, frame), (half, relative)):
-        part = slice(first, first + half)
-        out[part] = (J @ matrix[part].reshape(-1, 6, matrix.shape[1])).reshape(half, -1)
-    return out
-
-
-def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint joint"]:
-    """The covariance before any residual is computed."""
-    return torch.block_diag(prior_covariance(prior, start), (prior.intrinsics_sigma**2).diag())
-
-
-def packed(joint: Float[Tensor, "joint joint"]) -> Float[Tensor, "entries"]:
-    """The lower triangle, row by row: half of the memory."""
-    return joint[_lower(len(joint))]
-
-
-def unpacked(entries: Float[Tensor, "entries"]) -> Float[Tensor, "joint joint"]:
-    """The matrix of which `packed` gave the lower triangle."""
-    size = round(((8 * len(entries) + 1) ** 0.5 - 1) / 2)
-    out = entries.new_zeros(size, size)
-    out[_lower(size)] = entries
-    return out + out.tril(-1).T
-
-
-def _lower(size: int) -> Bool[Tensor, "joint joint"]:
-    return torch.ones(size, size, dtype=torch.bool).tril()
+def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint k"]:
+    """A factor of the covariance before any residual is computed."""
+    H, _ = prior_equations(prior, start, start)
+    rows = 12 * start.frames + UNKNOWNS
+    unit = unit_columns(rows, rows)
+    upper = torch.linalg.cholesky(H).mT
+    frames = torch.linalg.solve_triangular(upper, unit[:-UNKNOWNS].reshape(start.frames, 12, -1), upper=True)
+    return torch.cat([by_kind(frames), prior.intrinsics_sigma[:, None] * unit[-UNKNOWNS:]])

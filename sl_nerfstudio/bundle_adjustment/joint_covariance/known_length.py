@@ -17,16 +17,15 @@ from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 
 def with_known_length(
-    joint: Float[Tensor, "joint joint"], rig: Rig, log_length: Float[Tensor, "unknowns"]
-) -> Float[Tensor, "joint joint"]:
-    """The covariance under the scale at which a length does not err; `log_length` is its derivative by the poses."""
-    growth = torch.zeros(len(joint), dtype=torch.float64)
+    factor: Float[Tensor, "joint k"], rig: Rig, log_length: Float[Tensor, "unknowns"]
+) -> Float[Tensor, "joint k"]:
+    """A factor under the scale at which a length does not err; `log_length` is its derivative by the poses."""
+    growth = torch.zeros(len(factor), dtype=torch.float64)
     growth[: len(log_length)] = gauge_directions(rig)[:, 6]
     known = torch.zeros_like(growth)
     known[: len(log_length)] = log_length
     known = known / (known @ growth)
-    once = joint - torch.outer(growth, known @ joint)
-    return once - torch.outer(once @ known, growth)
+    return factor - torch.outer(growth, known @ factor)
 
 
 def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:

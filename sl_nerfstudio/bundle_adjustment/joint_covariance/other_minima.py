@@ -21,16 +21,16 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.se3 import exp_se3, exp_so3, inverse, log_se3
 
 
-def shake(joint: Float[Tensor, "joint joint"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:
+def shake(factor: Float[Tensor, "joint k"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:
     """A random increment (delta, rho) of some sigmas of the poses, the intrinsics staying as they are."""
-    variance, axes = torch.linalg.eigh(_given_intrinsics(joint))
+    variance, axes = torch.linalg.eigh(_given_intrinsics(factor))
     draw = torch.randn(len(variance), generator=generator, dtype=torch.float64)
     return axes @ (sigmas * variance.clamp_min(0).sqrt() * draw)
 
 
-def farthest_frame(joint: Float[Tensor, "joint joint"], departure: Float[Tensor, "unknowns"]) -> float:
+def farthest_frame(factor: Float[Tensor, "joint k"], departure: Float[Tensor, "unknowns"]) -> float:
     """Increment of the frame that departs most, in sigma of the poses given the intrinsics (RMS over its six)."""
-    sigma = _given_intrinsics(joint).diagonal().clamp_min(0).sqrt()
+    sigma = _given_intrinsics(factor).diagonal().clamp_min(0).sqrt()
     ratio = torch.where(sigma > 0, departure / sigma, torch.zeros_like(sigma))
     return float(ratio[: len(ratio) // 2].reshape(-1, 6).pow(2).mean(1).max().sqrt())
 
@@ -60,19 +60,18 @@ def drawn_start(rig: Rig, prior: PosePrior, with_projectors: bool, generator: to
 
 
 def widened(
-    joint: Float[Tensor, "joint joint"], departures: Sequence[Float[Tensor, "unknowns"]]
-) -> Float[Tensor, "joint joint"]:
+    factor: Float[Tensor, "joint k"], departures: Sequence[Float[Tensor, "unknowns"]]
+) -> Float[Tensor, "joint more"]:
     """The covariance with the mean square of what other searches found, none of them better than the others."""
-    out, k = joint.clone(), len(joint) - UNKNOWNS
-    for departure in departures:
-        out[:k, :k].addr_(departure, departure, alpha=1 / len(departures))
-    return out
+    columns = [torch.nn.functional.pad(d / len(departures) ** 0.5, (0, UNKNOWNS)) for d in departures]
+    return torch.cat([factor, *(column[:, None] for column in columns)], 1)
 
 
-def _given_intrinsics(joint: Float[Tensor, "joint joint"]) -> Float[Tensor, "unknowns unknowns"]:
-    k = len(joint) - UNKNOWNS
-    common = joint[k:, k:]
-    scale = common.diagonal().clamp_min(1e-30).sqrt()
-    inner = torch.linalg.pinv(common / torch.outer(scale, scale), hermitian=True)
-    border = joint[:k, k:] / scale
-    return joint[:k, :k] - border @ inner @ border.T
+def _given_intrinsics(factor: Float[Tensor, "joint k"]) -> Float[Tensor, "unknowns unknowns"]:
+    """Covariance of the poses if the intrinsics are right."""
+    poses, common = factor[:-UNKNOWNS], factor[-UNKNOWNS:]
+    scale = common.norm(dim=1).clamp_min(1e-15)
+    common = common / scale[:, None]
+    inner = torch.linalg.pinv(common @ common.T, hermitian=True)
+    border = poses @ common.T
+    return poses @ poses.T - border @ inner @ border.T

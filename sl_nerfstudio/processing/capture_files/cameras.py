@@ -11,7 +11,8 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.relative_pose.camera_estimate import CameraEstimate, FrameOfCamera, estimate_camera
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
@@ -117,9 +118,9 @@ def refine_camera(
             break
         found = estimate_camera(frames, job.camera, job.projector, start.sigma, job.seed, refined.camera)
         refined = replace(job, camera=found.camera)
-        worker = FrameWorker(refined)
+        worker, clouds = FrameWorker(refined), LargeClouds()
         again = [
-            result if result.cloud is None else worker.calibrate(result, worker.load(result))
+            result if result.cloud is None else with_kept_cloud(worker.calibrate(result, worker.load(result)), clouds)
             for result in track(again, "calibrating again", len(again))
         ]
     if found is None:

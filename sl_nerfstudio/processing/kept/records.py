@@ -2,15 +2,16 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy import ndarray
 
+T = TypeVar("T")
 _TREE = "tree"  # name of the archive's member that is no array
 
 
@@ -30,6 +31,13 @@ def decode(content: bytes, classes: Sequence[type]) -> Any:
         tree = json.loads(archive[_TREE].tobytes())
         arrays = [archive[f"array{k}"] for k in range(len(archive.files) - 1)]
     return _built(tree, arrays, {kind.__name__: kind for kind in classes})
+
+
+def with_arrays(value: T, classes: Sequence[type], change: Callable[[Sequence[ndarray]], Sequence[ndarray]]) -> T:
+    """The same value with other arrays in place of its own; `classes` as for `decode`."""
+    arrays: list[ndarray] = []
+    tree = _flat(value, arrays)
+    return _built(tree, change(arrays), {kind.__name__: kind for kind in classes})
 
 
 def digest(value: object) -> str:

@@ -15,6 +15,7 @@ from sl_nerfstudio.calibration.stated_sigma import Shares
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.processing.config import Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.result import Registration
@@ -116,12 +117,12 @@ def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tens
 
 def with_projector(clouds: Sequence[FrameCloud], consistent: ConsistentFrames, projector: Device) -> list[FrameCloud]:
     """The clouds with another projector: their poses follow, from the adjusted ones where there are such."""
-    poses = consistent.adjusted.poses
+    poses, kept = consistent.adjusted.poses, LargeClouds()
     out = []
     for k, cloud in enumerate(clouds):
         T = poses.T_camera_projector[k] if consistent.registration.registered[k] else cloud.pose.T_camera_projector
         pose = relative_pose_near(T, *correspondences_of(cloud.coords), cloud.camera, projector)
-        out.append(frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose))
+        out.append(kept.kept(frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose)))
     return out
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, with_kept_cloud
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.result import Registration
@@ -37,8 +38,11 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
         return list(results)
     uv_camera, uv_projector = (np.concatenate(part) for part in zip(*parts, strict=True))
     common = estimate_relative_pose(uv_camera, uv_projector, job.camera, job.projector, job.seed)
+    clouds = LargeClouds()
     return [
-        _with_pose(job, result, decoded[result.name], common) if result.name in decoded else result
+        with_kept_cloud(_with_pose(job, result, decoded[result.name], common), clouds)
+        if result.name in decoded
+        else result
         for result in track(results, "calibrating with one pose", len(results))
     ]
 

@@ -8,7 +8,8 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, with_kept_cloud
+from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.projector.estimation import sigma_of_fields
 from sl_nerfstudio.processing.projector.found import FoundProjector
@@ -59,7 +60,8 @@ def place_static(job: FrameJob, results: Sequence[FrameStageResult], stated: boo
     found = None if known else _found(placed, len(decoded))
     T = {result.name: pose for result, pose in zip(decoded, placed.T_world_camera, strict=True)}
     maps = {result.name: uv for result, uv in zip(decoded, coords, strict=True)}
-    results = [_calibrated(result, maps, T, placed, job) for result in results]
+    clouds = LargeClouds()
+    results = [with_kept_cloud(_calibrated(result, maps, T, placed, job), clouds) for result in results]
     with_cloud = [result for result in results if result.cloud is not None]
     poses = np.stack([T[result.name] for result in with_cloud]) if with_cloud else np.zeros((0, 4, 4))
     baseline = np.linalg.norm(poses[:, :3, 3] - placed.T_world_projector[:3, 3], axis=1)
