@@ -1,6 +1,7 @@
 """The objects, as meshes of about 120 mm: eight that found faults before, and twelve of the kind that people scan."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -65,7 +66,7 @@ def mug() -> trimesh.Trimesh:
 def box() -> trimesh.Trimesh:
     """110 x 70 x 60 mm: the same after half a turn."""
     mesh = trimesh.creation.box((110, 70, 60))
-    return mesh.subdivide_to_size(4.0)
+    return cast(trimesh.Trimesh, mesh.subdivide_to_size(4.0))
 
 
 def nut() -> trimesh.Trimesh:
@@ -154,7 +155,7 @@ def blade() -> trimesh.Trimesh:
         block((0, 4, -44), (56, 34, 28), 1.5),
         *[drum((0, 4 + side * 19, z), 5, 90, axis=0) for side in (-1, 1) for z in (-40, -51)],
     )
-    return trimesh.util.concatenate([wing, meshed(root, (34, 34, 64))])
+    return _concatenated([wing, meshed(root, (34, 34, 64))])
 
 
 def housing() -> trimesh.Trimesh:
@@ -251,7 +252,7 @@ def wire() -> trimesh.Trimesh:
     knots = [trimesh.creation.icosphere(subdivisions=3, radius=4.0) for _ in range(8)]
     for ball_, at in zip(knots, (a, b, c, d, e, f, g, h), strict=True):
         ball_.apply_translation(at)
-    return trimesh.util.concatenate([*parts, *knots])
+    return _concatenated([*parts, *knots])
 
 
 def pair() -> trimesh.Trimesh:
@@ -269,6 +270,10 @@ def steps() -> trimesh.Trimesh:
     parts = [block((-44 + 22 * k, 0, -38 + 5.5 * (k + 1)), (22, 60 - 4 * k, 11 * (k + 1)), 0.6) for k in range(5)]
     holes = [drum((-22, 12, -20), 6, 30), drum((22, -8, 0), 7, 60), block((0, -18, -4), (10, 40, 16), 0.5)]
     return meshed(without(joined(*parts), *holes), (62, 38, 46))
+
+
+def _concatenated(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(list(parts)))
 
 
 OBJECTS: dict[str, Callable[[], trimesh.Trimesh]] = {

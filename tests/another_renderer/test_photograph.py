@@ -1,10 +1,14 @@
 """The other renderer against the pinhole formulas of docs/scan-format.md, written out."""
 
+import ast
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.another_renderer import objects
 from benchmarks.another_renderer.objects import OBJECTS
 from benchmarks.another_renderer.optics import Lens, into_device, looking, triangulated
 from benchmarks.another_renderer.photograph import Look, Projection, View, photograph
@@ -110,3 +114,14 @@ def test_objects_are_closed_and_of_a_handy_size(name):
     assert mesh.is_watertight
     assert mesh.volume > 0
     assert 90 < np.ptp(mesh.vertices, axis=0).max() < 140
+
+
+def test_nothing_is_shared_with_the_package():
+    """Else a mistake in both would be none."""
+    files = sorted(Path(objects.__file__).parent.glob("*.py"))
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    imported = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    imported |= {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
+    own = {name for name in imported if name.startswith("benchmarks")}
+    assert own and all(name.startswith("benchmarks.another_renderer") for name in own)
+    assert not any(name.startswith("sl_nerfstudio") for name in imported)
