@@ -25,7 +25,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
 )
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import away_from_borders, observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
 from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import (
@@ -33,11 +33,19 @@ from sl_nerfstudio.bundle_adjustment.residuals import (
     Observations,
     Residuals,
     linearise,
+    pixels_of_rows,
     residuals_of,
     viewing_cosines,
 )
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of, noise_ratios
+from sl_nerfstudio.bundle_adjustment.robust_kernel import (
+    Kernel,
+    frame_medians,
+    narrowed,
+    noise_of,
+    noise_ratios,
+    useful_distance,
+)
 from sl_nerfstudio.bundle_adjustment.self_calibration import (
     UNKNOWNS,
     SelfCalibration,
@@ -45,6 +53,7 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import (
     with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread
 
@@ -224,8 +233,25 @@ def _search(problem: _Problem, refine: RefinePoses) -> tuple[_Progress, float] |
     for stage in rough:
         found = _run(problem, stage, found)
     found = _relocalised(problem, refine, rough[-1], found)
+    found = _away_from_borders(problem, found)
     found = _run(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
     return found, before
+
+
+def _away_from_borders(problem: _Problem, found: _Progress) -> _Progress:
+    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual."""
+    state, maps, s = found.state, problem.maps, problem.settings.kernel
+    anchors, rows = state.anchors, found.rows
+    r = residuals_of(state.rig, anchors, rows, maps)
+    own = maps.border_distance(anchors.frame, project(state.rig.camera[anchors.frame], anchors.d_camera)[0])
+    seen = maps.border_distance(rows.frame, pixels_of_rows(state.rig, anchors, rows)[0])
+    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows), s)
+    nearer = torch.minimum(own[rows.anchor], seen)
+    least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
+    if least <= 0:
+        return found
+    anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
+    return replace(found, state=replace(state, anchors=anchors), rows=rows)
 
 
 def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment) -> Adjustment:

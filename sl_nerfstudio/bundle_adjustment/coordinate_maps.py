@@ -8,13 +8,15 @@ the adjustment would turn that offset into wrong poses.)
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.loops.borders import border_distances
 from sl_nerfstudio.bundle_adjustment.loops.drawing import draw_pixels
 from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory, look_up_windows
 from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
@@ -105,6 +107,21 @@ class CoordinateMaps:
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """For compiled loops: values, offsets, widths, heights."""
         return self.values.numpy(), self.offsets.numpy(), self.widths.numpy(), self.heights.numpy()
+
+    @cached_property
+    def _border(self) -> UInt8[ndarray, "pixels"]:
+        out = np.zeros(len(self.values), dtype=np.uint8)
+        border_distances(self.frames, *self.arrays, out)
+        return out
+
+    def border_distance(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """Pixels to the nearest one without a coordinate, from positions in `frame`; 0 outside the image."""
+        w, h = self.widths[frame], self.heights[frame]
+        x, y = (uv_camera[:, k].nan_to_num(-1.0).clamp(-1, 2**30).floor().long() for k in range(2))
+        inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
+        pixel = torch.where(inside, self.offsets[frame] + y * w + x, torch.zeros_like(x))
+        found = torch.from_numpy(self._border[pixel.numpy()]).double()
+        return torch.where(inside, found, torch.zeros_like(found))
 
     def look_up(
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory | None = None

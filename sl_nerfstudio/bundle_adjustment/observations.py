@@ -75,6 +75,30 @@ def observe(
     return Observations(*(torch.cat([none, *part]) for part in ([p[k] for p in parts] for k in range(2))))
 
 
+def away_from_borders(
+    anchors: Anchors,
+    rows: Observations,
+    distances: tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]],
+    least: float,
+    frames: int,
+) -> tuple[Anchors, Observations]:
+    """Only anchors, and rows, that are at least so many pixels from the border of what was decoded.
+
+    `distances` are those of anchors in their own frame and of rows in the frame that looks up. Of frames of thin
+    things, which are all border, the better half remains.
+    """
+    own, seen = distances
+    limit = torch.full((frames,), least, dtype=own.dtype)
+    for frame in range(frames):
+        mine = own[anchors.frame == frame]
+        if len(mine):
+            limit[frame] = min(least, float(mine.median()))
+    kept = own >= limit[anchors.frame]
+    number = torch.cumsum(kept, 0) - 1
+    chosen = kept[rows.anchor] & (seen >= limit[rows.frame])
+    return anchors.chosen(kept), Observations(number[rows.anchor[chosen]], rows.frame[chosen])
+
+
 def every_other(frames: int) -> Bool[Tensor, "frames frames"]:
     """Every frame may look up anchors of every other."""
     return ~torch.eye(frames, dtype=torch.bool)

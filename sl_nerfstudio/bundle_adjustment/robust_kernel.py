@@ -5,6 +5,7 @@ most frames already fit, a frame that does not yet fit keeps a kernel wide enoug
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -92,6 +93,23 @@ def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
     return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)
+
+
+def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], settings: KernelSettings) -> float:
+    """Distance from the border of what was decoded from which on residuals are no larger than usual.
+
+    Classes by distance hold equally many. Only those that are nearer than most are asked, so at most half fall away.
+    """
+    if not len(distance):
+        return 0.0
+    shares = np.linspace(0, 1, settings.border_classes + 1)[: settings.border_classes // 2 + 1]
+    edges = np.quantile(array(distance), shares)
+    most = settings.most_border_noise * float(size.median().clamp_min(settings.noise_floor_px))
+    for low, high in reversed(list(pairwise(edges.tolist()))):
+        mine = (distance >= low) & (distance < high)
+        if mine.any() and float(size[mine].median()) > most:
+            return high
+    return 0.0
 
 
 def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSettings) -> Float[Tensor, "rows"]:

@@ -43,6 +43,11 @@ class KernelSettings:
     """Classes of look-ups, by the cosine at which the camera sees the surface, each of which has its own noise."""
     least_noise_ratio: float = 0.5
     """Smallest noise of such a class, relative to that of all look-ups."""
+    border_classes: int = 8
+    """Classes of look-ups by the distance from the border of what was decoded, whose noise is compared."""
+    most_border_noise: float = 1.25
+    """Noise of such a class, relative to that of all look-ups, beyond which it and those nearer to the border are left
+    out: a decoder continues coordinates up to there, and errs alike in many frames."""
     least_curvature: float = 0.2
     """Smallest share of what weights say that residuals may really say: with less, most of them do not fit at all."""
     noise_floor_px: float = 0.01

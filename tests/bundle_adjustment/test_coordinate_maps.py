@@ -156,3 +156,25 @@ def test_slopes_of_wide_windows_have_the_smaller_errors_of_more_pixels():
         slopes = maps.with_windows(half_window).look_up(frame, uv).jacobian
         n2 = (2 * half_window + 1) ** 2
         assert float(slopes.square().mean().sqrt()) == pytest.approx(0.3 * (12 / n2 / (n2 - 1)) ** 0.5, rel=0.1)
+
+
+def test_distances_from_the_border_count_steps_to_the_nearest_pixel_without_a_coordinate():
+    """Against all pixels compared with all, outside of the image included."""
+    generator, images = torch.Generator().manual_seed(3), plane_images()
+    for image in images:
+        image[torch.rand(image.shape[:2], generator=generator) < 0.03] = NAN
+    maps = CoordinateMaps.of(images)
+    for frame, image in enumerate(images):
+        known = torch.isfinite(torch.nn.functional.pad(image[..., 0], (1, 1, 1, 1), value=NAN))
+        holes = torch.nonzero(~known) - 1
+        cells = torch.nonzero(torch.ones(image.shape[:2]))
+        steps = (cells[:, None] - holes).abs().amax(-1).amin(-1)
+        found = maps.border_distance(torch.full((len(cells),), frame), cells.flip(1) + 0.5)
+        assert torch.equal(found, steps.double())
+        assert steps.max() > 3
+
+
+def test_positions_outside_an_image_are_at_its_border():
+    maps = CoordinateMaps.of(plane_images())
+    at = torch.tensor([[-0.1, 5.0], [30.0, 5.0], [5.0, 20.0], [NAN, 5.0], [29.9, 5.0], [15.0, 10.0]]).double()
+    assert maps.border_distance(torch.zeros(6, dtype=torch.int64), at).tolist() == [0, 0, 0, 0, 1, 10]

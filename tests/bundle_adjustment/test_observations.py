@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.observations import involving, observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import (
+    away_from_borders,
+    involving,
+    observe,
+    partners,
+    place_anchors,
+)
 from sl_nerfstudio.geometry.se3 import rotate, transform
 
 from .analytic import ExactMaps, cast, rig_of
@@ -105,3 +111,19 @@ def test_partners_see_the_same_surface_and_are_few(scene):
     assert few[allowed.pairs(anchors)[0], allowed.frame].all()
     kept = few[rows.pairs(anchors)[0], rows.frame]
     assert torch.equal(allowed.anchor, rows.anchor[kept]) and torch.equal(allowed.frame, rows.frame[kept])
+
+
+def test_what_is_near_the_border_falls_away_with_its_rows(scene):
+    rig, maps, anchors = scene
+    rows = observe(rig, anchors, maps, 3, ALL, 0.1, torch.Generator().manual_seed(1))
+    own = torch.arange(len(anchors.frame)).double() % 10
+    thin = anchors.frame == 1  # all of it is near the border
+    own[thin] = 2.0 + torch.arange(int(thin.sum())).double() % 2
+    seen = torch.arange(len(rows.anchor)).double() % 7
+    kept, left = away_from_borders(anchors, rows, (own, seen), 4.0, FRAMES)
+    limit = torch.tensor([4.0, float(own[thin].median()), 4.0, 4.0, 4.0], dtype=torch.float64)
+    assert torch.equal(kept.depth, anchors.depth[own >= limit[anchors.frame]])
+    assert 0.5 <= float((kept.frame == 1).sum() / (anchors.frame == 1).sum()) < 1.01
+    expected = (own >= limit[anchors.frame])[rows.anchor] & (seen >= limit[rows.frame])
+    assert torch.equal(left.frame, rows.frame[expected])
+    assert torch.equal(kept.depth[left.anchor], anchors.depth[rows.anchor[expected]])

@@ -6,7 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel, frame_medians, narrowed, noise_of, noise_ratios
+from sl_nerfstudio.bundle_adjustment.robust_kernel import (
+    Kernel,
+    frame_medians,
+    narrowed,
+    noise_of,
+    noise_ratios,
+    useful_distance,
+)
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 
 SETTINGS = KernelSettings()
@@ -127,3 +134,26 @@ def test_look_ups_that_see_obliquely_are_as_noisy_as_their_residuals_say():
 def test_without_any_look_up_all_count_alike():
     none = Residuals(torch.zeros(1, 2).double(), torch.zeros(3, 2).double(), torch.zeros(3, dtype=torch.bool))
     assert (noise_ratios(none, torch.rand(3).double(), SETTINGS) == 1).all()
+
+
+def noisy(worse_below: float, factor: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances up to 40 pixels, and residuals that are larger near the border."""
+    generator = torch.Generator().manual_seed(4)
+    distance = (40 * torch.rand(20000, generator=generator, dtype=torch.float64)).floor()
+    size = torch.randn(20000, 2, generator=generator, dtype=torch.float64).norm(dim=-1)
+    return distance, torch.where(distance < worse_below, factor * size, size)
+
+
+def test_look_ups_are_useful_from_where_residuals_are_no_larger_than_usual():
+    """Classes are an eighth of all, five pixels wide."""
+    assert useful_distance(*noisy(10, 2.0), SETTINGS) == pytest.approx(10, abs=1)
+    assert useful_distance(*noisy(0, 1.0), SETTINGS) == 0
+    assert useful_distance(torch.zeros(0), torch.zeros(0), SETTINGS) == 0
+
+
+def test_at_most_half_of_the_look_ups_fall_away():
+    distance, size = noisy(30, 3.0)
+    least = useful_distance(distance, torch.where(distance < 20, 3 * size, size), SETTINGS)
+    assert least == pytest.approx(20, abs=1)
+    distance, size = noisy(0, 1.0)
+    assert useful_distance(distance, torch.where(distance > 30, 9 * size, size), SETTINGS) == 0
