@@ -104,5 +104,5 @@ def _step(
         columns.append(np.broadcast_to(j + each, (len(i), 7, 7)).ravel())
         values.append(block[moves].ravel())
     H = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
-    factor = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    factor = splu(H, permc_spec="MMD_AT_PLUS_A")
     return -factor.solve(g[free].ravel()).reshape(-1, 7)
