@@ -43,7 +43,7 @@ def optimise_pose_graph(
     chi2 = np.full(len(edges), np.inf)
     if connected:
         arrays = EdgeArrays.of(connected)
-        every = Similarities.of([S or Similarity.identity() for S in nodes])
+        every = Similarities.of([S or Similarity.identity() for S in nodes]).orthonormal()
         root = next(iter(start))
         free = np.array([k for k, S in enumerate(nodes) if S is not None and k != root], dtype=np.int64)
         every = _optimised(arrays, every, pivots, free, weight[inside], settings)

@@ -37,6 +37,14 @@ class Similarities:
         """One point of frame b each in frame a."""
         return self.scale[:, None] * (self.R @ p[..., None])[..., 0] + self.t
 
+    def orthonormal(self) -> "Similarities":
+        """With the rotations nearest to their matrices.
+
+        `inverse` transposes. Products of many similarities and inverses double what is not orthonormal again and again, so
+        rounding errors become large where components are joined a hundred times.
+        """
+        return Similarities(self.scale, Rotation.from_matrix(self.R).as_matrix(), self.t)
+
     def inverse(self) -> "Similarities":
         """Of each."""
         R = self.R.transpose(0, 2, 1)

@@ -127,3 +127,18 @@ def test_an_edge_can_be_read_both_ways():
     e = edge(nodes, 0, 1)
     p = np.array([[0.1, 0.2, -3.0]])
     np.testing.assert_allclose(e.between(1, 0).points(e.between(0, 1).points(p)), p)
+
+
+def test_rounding_errors_of_rotations_do_not_grow():
+    """Where a hundred components were joined, products with transposed matrices had left rotations 2 % from orthonormal."""
+    nodes = random_nodes(8, np.random.default_rng(5))
+    edges = [edge(nodes, i, j) for i, j in ring(8)]
+    rng = np.random.default_rng(6)
+    start = {
+        k: Similarity(S.scale, S.R @ (np.eye(3) + 0.01 * rng.standard_normal((3, 3))), S.t) if k else S
+        for k, S in start_of(nodes).items()
+    }
+    solution = optimise_pose_graph(edges, pivots_of(nodes), start, np.ones(len(edges)))
+    assert largest_error(solution.S_world_camera, nodes) < 1e-6
+    for S in solution.S_world_camera:
+        np.testing.assert_allclose(S.R.T @ S.R, np.eye(3), atol=1e-12)
