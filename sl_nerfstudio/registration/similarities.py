@@ -40,7 +40,7 @@ class Similarities:
     def orthonormal(self) -> "Similarities":
         """With the rotations nearest to their matrices.
 
-        `inverse` transposes. Products of many similarities and inverses double what is not orthonormal again and again, so
+        `inverse` transposes, and products of similarities and inverses double what is not orthonormal, again and again:
         rounding errors become large where components are joined a hundred times.
         """
         return Similarities(self.scale, Rotation.from_matrix(self.R).as_matrix(), self.t)

@@ -130,7 +130,7 @@ def test_an_edge_can_be_read_both_ways():
 
 
 def test_rounding_errors_of_rotations_do_not_grow():
-    """Where a hundred components were joined, products with transposed matrices had left rotations 2 % from orthonormal."""
+    """Where a hundred components were joined, products with transposes had left rotations 2 % from orthonormal."""
     nodes = random_nodes(8, np.random.default_rng(5))
     edges = [edge(nodes, i, j) for i, j in ring(8)]
     rng = np.random.default_rng(6)
