@@ -105,7 +105,7 @@ def test_half_of_a_turn_made_twice_is_the_turn() -> None:
         assert Rotation.from_matrix(half.R).magnitude() == pytest.approx(np.radians(degrees / 2))
 
 
-@pytest.mark.parametrize("degrees", [10.0, 16.0])
-def test_a_medal_that_slides_a_little_is_not_symmetric(degrees: float) -> None:
+def test_a_medal_that_slides_a_little_is_not_symmetric() -> None:
     medal = Scan("medal")
-    assert medal.turns(contradicting(medal, degrees)) == ()
+    for degrees in (10.0, 16.0):
+        assert medal.turns(contradicting(medal, degrees)) == ()
