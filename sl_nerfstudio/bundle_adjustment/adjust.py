@@ -23,7 +23,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     shake,
     widened,
 )
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step, moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import away_from_borders, observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
@@ -285,10 +285,9 @@ def _leads_back(
     linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
     kernel = _kernel(state, found.rows, found.widths, linear.residuals, problem)
     equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
-    depth = state.anchors.depth + equations.depth_step(torch.cat([delta, rho], 1))
-    steps = problem.settings.steps
-    depth = depth.clamp(steps.least_depth * state.anchors.depth, steps.most_depth * state.anchors.depth)
-    beside = replace(state, rig=state.rig.moved(delta, rho), anchors=state.anchors.at(depth))
+    step = torch.cat([delta, rho], 1)
+    rig, anchors = moved_together(state.rig, state.anchors, equations, step, problem.settings.steps)
+    beside = replace(state, rig=rig, anchors=anchors)
     back = _run(problem, _Stage(refine, False, s.shake_steps), replace(found, state=beside))
     left = farthest_frame(result.factor, departure_of(back.state.rig, state.rig))
     return left <= s.most_left * s.shake_sigmas
