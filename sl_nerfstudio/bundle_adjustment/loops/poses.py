@@ -3,7 +3,7 @@
 Poses are 4x4 matrices. An increment (v, w) moves by the exponential of its twist, before the pose.
 """
 
-from math import atan2, cos, sin, sqrt
+from math import atan2, sin, sqrt
 
 from sl_nerfstudio.compiled import compiled, compiled_range
 
