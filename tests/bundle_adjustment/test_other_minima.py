@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import adjust
+from sl_nerfstudio.bundle_adjustment.adjust import adjust, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     departure_of,
@@ -57,6 +57,19 @@ def test_a_scene_that_holds_its_frames_is_searched_once():
     )
     assert torch.equal(one.factor, several.factor)
     assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera)
+
+
+def test_the_minimum_alone_is_an_adjustment_without_the_question_which_can_be_asked_later(monkeypatch):
+    monkeypatch.setattr(analytic, "BALLS", ())
+    true = rig_of(FRAMES, SIZE)
+    start, maps = disturbed(true, 0), noisy_maps(0, 0.02)
+    one, several = (adjust(start, maps, PRIOR, "known-rig", s) for s in (ONE_SEARCH, SETTINGS))
+    minimum = find_minimum(start, maps, PRIOR, "known-rig", SETTINGS)
+    asked = minimum.with_other_minima()
+    assert torch.equal(minimum.adjustment.factor, one.factor) and torch.equal(asked.factor, several.factor)
+    assert float((asked.sigma / one.sigma)[:, :6].max()) > 1.5
+    for found in (minimum.adjustment, asked, several):
+        assert torch.equal(found.rig.T_world_camera, one.rig.T_world_camera)
 
 
 def random_factor(seed: int) -> Tensor:
