@@ -153,6 +153,26 @@ class _Progress:
         return replace(self, state=replace(self.state, rig=rig), widths=widths)
 
 
+@dataclass(frozen=True)
+class Minimum:
+    """Where a search has ended; whether it is one of several such places has not been asked yet."""
+
+    adjustment: Adjustment  # with the covariance of this minimum alone
+    problem: _Problem
+    refine: RefinePoses
+    progress: _Progress | None  # None: there was nothing to search
+
+    @one_library_thread()
+    def with_other_minima(self) -> Adjustment:
+        """The same poses; where they are one of several minima, their covariance covers those of other searches."""
+        found = self.adjustment
+        if self.progress is None:
+            return found
+        return replace(
+            found, factor=widened(found.factor, _departures(self.problem, self.refine, self.progress, found))
+        )
+
+
 def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
     """Take the steps of one stage, until nothing moves any more."""
     start, maps, s = problem.start, problem.maps, problem.settings
@@ -189,7 +209,6 @@ def _kernel(
     return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), ratio)
 
 
-@one_library_thread()
 def adjust(
     start: Rig,
     maps: CoordinateMaps,
@@ -202,12 +221,24 @@ def adjust(
     The gauge stays where the prior puts it; `gauge.restore` sets the scale afterwards. Frames that share nothing with
     others do not move.
     """
+    return find_minimum(start, maps, prior, refine, settings).with_other_minima()
+
+
+@one_library_thread()
+def find_minimum(
+    start: Rig,
+    maps: CoordinateMaps,
+    prior: PosePrior,
+    refine: RefinePoses,
+    settings: AdjustmentSettings,
+) -> Minimum:
+    """Adjust all poses together without asking for other minima, for results that may be replaced by later ones."""
     problem = _problem(start, maps, prior, settings)
     first = _search(problem, refine)
     if first is None:
-        return _unmoved(start, prior, free_parameters(refine, start), settings)
+        return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
     found, before = first
-    return _with_other_minima(problem, refine, found, _result(problem, refine, found, before))
+    return Minimum(_result(problem, refine, found, before), problem, refine, found)
 
 
 def _problem(start: Rig, maps: CoordinateMaps, prior: PosePrior, settings: AdjustmentSettings) -> _Problem:
@@ -256,13 +287,15 @@ def _away_from_borders(problem: _Problem, found: _Progress) -> _Progress:
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
 
 
-def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment) -> Adjustment:
-    """The result; where it is one of several, its covariance covers those that other searches find."""
+def _departures(
+    problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment
+) -> list[Float[Tensor, "unknowns"]]:
+    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
     asked = s.searches > 0 and refine in _FRAMES_MOVE and result.rig.frames <= s.most_frames
     problem = replace(problem, unplaced=result.unplaced)
     if not asked or _leads_back(problem, refine, found, result, generator):
-        return result
+        return []
     limits = s.worse * _misfits(problem.maps, found)
     limits[list(result.unplaced)] = float("inf")
     departures = []
@@ -272,7 +305,7 @@ def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress,
         other = _search(again, refine)
         if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
             departures.append(_departure(problem, other[0], result))
-    return replace(result, factor=widened(result.factor, departures))
+    return departures
 
 
 def _departure(problem: _Problem, other: _Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:

@@ -1,6 +1,6 @@
 """From a registration to a scan's poses: bundle adjustment of all registered frames, in the registration's gauge."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.bundle_adjustment.adjust import adjust
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, Minimum, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
@@ -94,10 +94,33 @@ class AdjustedFrames:
         return self.mapped(Similarity.scaling(factor))
 
 
+@dataclass(frozen=True)
+class RegisteredMinimum:
+    """Where the adjustment of all registered frames has ended."""
+
+    frames: AdjustedFrames  # with the sigma of this minimum alone
+    _minimum: Minimum
+    _stated: Callable[[Adjustment], tuple[PoseSigma | None, ...]]
+
+    def with_other_minima(self) -> AdjustedFrames:
+        """The same poses; their sigma also covers how far other minima are, which takes several more searches."""
+        return replace(self.frames, sigma=self._stated(self._minimum.with_other_minima()))
+
+
 def adjust_registered(
     clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
 ) -> AdjustedFrames:
     """Adjust cameras and projectors of all registered frames together, from their coordinates.
+
+    Raises UserError if fewer than two frames are registered.
+    """
+    return find_registered_minimum(clouds, registration, settings).with_other_minima()
+
+
+def find_registered_minimum(
+    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
+) -> RegisteredMinimum:
+    """The same without asking for other minima, for frames of which some may be taken out.
 
     Raises UserError if fewer than two frames are registered.
     """
@@ -112,18 +135,23 @@ def adjust_registered(
     )
     maps = CoordinateMaps.of((torch.from_numpy(clouds[k].coords) for k in index), s.adjustment.look_up)
     prior = _prior(clouds, registration, index, S_scene_world.scale, s)
-    found = adjust(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
+    minimum = find_minimum(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
+    found, S_world_scene = minimum.adjustment, S_scene_world.inverse()
     rig = restore(start, found.rig, baseline_scale(start, found.rig, None))
-    S_world_scene = S_scene_world.inverse()
-    stated = s.dependence * frame_sigmas(found.sigma.clamp_min(s.least_sigma), S_world_scene.scale)
-    return AdjustedFrames(
+
+    def stated(found: Adjustment) -> tuple[PoseSigma | None, ...]:
+        sigma = s.dependence * frame_sigmas(found.sigma.clamp_min(s.least_sigma), S_world_scene.scale)
+        return _sigmas_among_all(sigma, index, len(clouds))
+
+    frames = AdjustedFrames(
         _among_all(rig.poses(S_world_scene), index, len(clouds)),
-        _sigmas_among_all(stated, index, len(clouds)),
+        stated(found),
         found.noise_px,
         found.median_before_px,
         found.median_after_px,
         found.intrinsics,
     )
+    return RegisteredMinimum(frames, minimum, stated)
 
 
 def keep_registered(

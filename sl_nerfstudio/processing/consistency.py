@@ -13,7 +13,8 @@ import numpy as np
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
     AdjustedFrames,
     RegisteredFramesSettings,
-    adjust_registered,
+    RegisteredMinimum,
+    find_registered_minimum,
     keep_registered,
 )
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
@@ -26,7 +27,7 @@ from sl_nerfstudio.verdict.scan_agreement import compare_frames
 from sl_nerfstudio.verdict.settings import VerdictSettings
 
 _ROUNDS = 4
-_INCLUSIONS = 3  # times that frames left out are tried
+_INCLUSIONS = 3  # times that frames left out are placed
 _FEWEST = 2  # frames of a scan
 
 
@@ -39,6 +40,20 @@ class ConsistentFrames:
     cross: CrossFrameAgreement  # of the registered frames, in their order
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Frames that were adjusted together, and may be adjusted again with others."""
+
+    registration: Registration
+    minimum: RegisteredMinimum
+    cross: CrossFrameAgreement
+
+    def missing(self) -> list[int]:
+        """Frames that are not in it."""
+        found: list[int] = np.flatnonzero(~self.registration.registered).tolist()
+        return found
+
+
 def adjust_consistent(
     clouds: Sequence[FrameCloud],
     registration: Registration,
@@ -48,35 +63,35 @@ def adjust_consistent(
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
     Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
-    again as long as frames come in, because each shows more of the surface to the rest.
+    again as long as frames come in, because each shows more of the surface to the rest. Each frame is placed once: if
+    it contradicts the others there, too, it stays out. How far other minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
+    placed_before: set[int] = set()
     for _ in range(_INCLUSIONS):
-        more = _with_agreeing(clouds, found, log, settings)
-        if more is None:
+        candidates = [k for k in found.missing() if k not in placed_before]
+        more = _placed(clouds, found, candidates)
+        new = [k for k in candidates if more.registered[k]]
+        if not new:
             break
-        known = found.registration.registered
-        found = _without_contradictions(clouds, more, log, settings)
+        placed_before.update(new)
+        names = ", ".join(registration.names[k] for k in new)
+        log(f"placed against the adjusted frames: {names}; adjusting again with them")
+        larger = _with_agreeing(clouds, more, new, settings)
+        if larger is None:
+            break
+        known, found = found.registration.registered, _without_contradictions(clouds, larger, log, settings)
         if not (found.registration.registered & ~known).any():
             break
-    return found
+    return ConsistentFrames(found.registration, found.minimum.with_other_minima(), found.cross)
 
 
 def _with_agreeing(
-    clouds: Sequence[FrameCloud],
-    found: ConsistentFrames,
-    log: Callable[[str], None],
-    settings: RegisteredFramesSettings | None,
-) -> ConsistentFrames | None:
-    """All frames adjusted again with those left out that can be placed and then agree; None if there are none."""
-    more = _with_left_out(clouds, found)
-    new: list[int] = np.flatnonzero(more.registered & ~found.registration.registered).tolist()
-    if not new:
-        return None
-    names = ", ".join(found.registration.names[k] for k in new)
-    log(f"placed against the adjusted frames: {names}; adjusting again with them")
+    clouds: Sequence[FrameCloud], more: Registration, new: Sequence[int], settings: RegisteredFramesSettings | None
+) -> _Group | None:
+    """All frames adjusted again with those of the `new` ones that then agree; None if none does."""
     with_more = _adjusted(clouds, more, settings)
     doubtful = [k for k in new if not _agrees_well(with_more, k)]
     if len(doubtful) == len(new):
@@ -95,35 +110,35 @@ def registered_only(
     return ConsistentFrames(registration, kept, _compared(clouds, registration, kept, exact=False))
 
 
-def _agrees_well(found: ConsistentFrames, k: int) -> bool:
+def _agrees_well(found: _Group, k: int) -> bool:
     """Whether a frame agrees with the others as well as frames of a good scan do."""
     limits = VerdictSettings()
     frame = found.cross.frames[int(found.registration.registered[:k].sum())]
     return frame.excess <= limits.good_excess and frame.share >= limits.good_share
 
 
-def _with_left_out(clouds: Sequence[FrameCloud], found: ConsistentFrames) -> Registration:
-    """The registration with frames that can be placed against the adjusted ones."""
-    poses, known = found.adjusted.poses, found.registration.registered
-    if known.all():
+def _placed(clouds: Sequence[FrameCloud], found: _Group, candidates: Sequence[int]) -> Registration:
+    """The registration with those of the frames that can be placed against the adjusted ones."""
+    if not candidates:
         return found.registration
+    frames, known = found.minimum.frames, found.registration.registered
     sharper, kept = [], LargeClouds()
     for k, cloud in enumerate(clouds):
-        sigma = found.adjusted.sigma[k]
+        sigma = frames.sigma[k]
         if known[k] and sigma is not None:
-            direction = sigma.relative_translation / float(poses.baseline[k])
+            direction = sigma.relative_translation / float(frames.poses.baseline[k])
             turn = float(np.radians(sigma.relative_rotation_deg))
-            cloud = kept.kept(with_relative_pose(cloud, poses.T_camera_projector[k], turn, direction))
+            cloud = kept.kept(with_relative_pose(cloud, frames.poses.T_camera_projector[k], turn, direction))
         sharper.append(cloud)
-    return include_left_out(sharper, found.registration, poses)
+    return include_left_out(sharper, found.registration, frames.poses, candidates)
 
 
 def _without_contradictions(
     clouds: Sequence[FrameCloud],
-    found: ConsistentFrames,
+    found: _Group,
     log: Callable[[str], None],
     settings: RegisteredFramesSettings | None,
-) -> ConsistentFrames:
+) -> _Group:
     for _ in range(_ROUNDS):
         groups = agreeing_groups(found.cross)
         index = np.flatnonzero(found.registration.registered)
@@ -172,9 +187,9 @@ def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) 
 
 def _adjusted(
     clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None
-) -> ConsistentFrames:
-    adjusted = adjust_registered(clouds, registration, settings)
-    return ConsistentFrames(registration, adjusted, compare_registered(clouds, registration, adjusted))
+) -> _Group:
+    minimum = find_registered_minimum(clouds, registration, settings)
+    return _Group(registration, minimum, compare_registered(clouds, registration, minimum.frames))
 
 
 def compare_registered(

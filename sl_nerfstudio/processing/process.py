@@ -34,7 +34,7 @@ from sl_nerfstudio.processing.selection.object_words import object_sentences
 from sl_nerfstudio.processing.summary import summarise
 from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.projector_choice import ProjectorChoice, choose_projectors, chosen_clouds
+from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration, with_undecided
 
@@ -130,21 +130,14 @@ def _register(
     clouds: Sequence[FrameCloud], unordered: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
 ) -> tuple[tuple[int, ...], Registration]:
     """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
-    choice, registration = _register_once(clouds, not unordered, seed, start, log)
+    choice = choose_projectors(clouds, not unordered, seed)
+    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start, log)
     if not (unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
-        if any(cloud.alternatives for cloud in clouds):  # they were compared with the wrong neighbours
-            choice, registration = _register_once(clouds, False, seed, start, log)
-    return choice.chosen, registration
-
-
-def _register_once(
-    clouds: Sequence[FrameCloud], sequence: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
-) -> tuple[ProjectorChoice, Registration]:
-    """The pose of every frame's projector where several are possible, then the poses of the frames."""
-    choice = choose_projectors(clouds, sequence, seed)
-    registration = register(chosen_clouds(clouds, choice.chosen), sequence, seed, start, log)
-    return choice, with_undecided(registration, choice.undecided)
+        before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
+        if choice.chosen != before.chosen:
+            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
+    return choice.chosen, with_undecided(registration, choice.undecided)
 
 
 def _require_clouds(

@@ -48,10 +48,11 @@ def include_left_out(
     clouds: Sequence[FrameCloud],
     registration: Registration,
     adjusted: DevicePoses,
+    left_out: Sequence[int],
     seed: int = 0,
     settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
-    """The registration, at the adjusted poses, with the frames that can now be placed by more than one pair.
+    """The registration, at the adjusted poses, with those of `left_out` that can now be placed by more than one pair.
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
@@ -64,7 +65,6 @@ def include_left_out(
         for k, T in enumerate(adjusted.T_world_camera)
         if registration.registered[k]
     }
-    left_out = [k for k in range(n) if not registration.registered[k]]
     search = settings.pair.anywhere
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)

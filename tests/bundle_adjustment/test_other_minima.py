@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment.adjust import adjust
+from sl_nerfstudio.bundle_adjustment.adjust import adjust, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     departure_of,
@@ -83,6 +83,19 @@ def test_frames_of_another_rig_are_where_it_has_them():
         for k in range(FRAMES):
             assert torch.equal(getattr(mixed, part)[k], getattr(other if k in (1, 3) else rig, part)[k])
     assert torch.equal(with_frames_of(rig, other, ()).T_world_camera, rig.T_world_camera)
+
+
+def test_the_minimum_alone_is_an_adjustment_without_the_question_which_can_be_asked_later(monkeypatch):
+    monkeypatch.setattr(analytic, "BALLS", ())
+    true = rig_of(FRAMES, SIZE)
+    start, maps = disturbed(true, 0), noisy_maps(0, 0.02)
+    one, several = (adjust(start, maps, PRIOR, "known-rig", s) for s in (ONE_SEARCH, SETTINGS))
+    minimum = find_minimum(start, maps, PRIOR, "known-rig", SETTINGS)
+    asked = minimum.with_other_minima()
+    assert torch.equal(minimum.adjustment.factor, one.factor) and torch.equal(asked.factor, several.factor)
+    assert float((asked.sigma / one.sigma)[:, :6].max()) > 1.5
+    for found in (minimum.adjustment, asked, several):
+        assert torch.equal(found.rig.T_world_camera, one.rig.T_world_camera)
 
 
 def random_factor(seed: int) -> Tensor:

@@ -7,14 +7,21 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
+from sl_nerfstudio.bundle_adjustment import adjust as adjustment
+from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    RegisteredFramesSettings,
+    adjust_registered,
+    find_registered_minimum,
+)
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
+from sl_nerfstudio.registration.reinclusion import include_left_out
 from sl_nerfstudio.registration.result import CoordinatesDisagree, NoCommonSurface, Registration, UncertainRotation
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+from tests.bundle_adjustment import analytic
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of
 from tests.relative_pose.known_pose import known_pose
@@ -26,10 +33,20 @@ RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))
 NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
 
 
+QUICK = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
+
+
 @pytest.fixture(autouse=True)
-def quick_adjustment(monkeypatch):
-    quick = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
-    monkeypatch.setattr(consistency, "adjust_registered", lambda c, r, _: adjust_registered(c, r, quick))
+def adjusted(monkeypatch) -> list[list[int]]:
+    """Adjustments are quick; the frames of each are listed."""
+    groups: list[list[int]] = []
+
+    def quick(clouds, registration, _):
+        groups.append(np.flatnonzero(registration.registered).tolist())
+        return find_registered_minimum(clouds, registration, QUICK)
+
+    monkeypatch.setattr(consistency, "find_registered_minimum", quick)
+    return groups
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +102,9 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
     """Each that comes in may be what the next one needs: trying ends when nothing is left out."""
     true, calls = registration_of(RIG.T_world_camera.numpy()), []
 
-    def one_at_a_time(clouds, registration, poses):
-        lost = np.flatnonzero(~registration.registered)
-        calls.append(lost.tolist())
-        return without_groups(true, [[int(k)] for k in lost[1:]]) if len(lost) else registration
+    def one_at_a_time(clouds, registration, poses, candidates):
+        calls.append(list(candidates))
+        return without_groups(true, [[k] for k in candidates[1:]])
 
     monkeypatch.setattr(consistency, "include_left_out", one_at_a_time)
     log = []
@@ -100,10 +116,8 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
 
 def test_a_frame_of_another_object_is_taken_out_by_name(clouds):
     """It cannot be placed anew, either."""
-    stranger = stranger_of(clouds[MOVED])
     log = []
-    found = adjust_consistent([*clouds[:MOVED], stranger, *clouds[MOVED + 1 :]],
-                              registration_of(RIG.T_world_camera.numpy()), log.append)  # fmt: skip
+    found = adjust_consistent(with_stranger(clouds), registration_of(RIG.T_world_camera.numpy()), log.append)
     assert found.registration.exclusions == (CoordinatesDisagree(NAMES[MOVED], (NAMES[MOVED],)),)
     assert found.registration.registered.tolist() == [k != MOVED for k in range(FRAMES)]
     assert found.registration.component.tolist() == [-1 if k == MOVED else 0 for k in range(FRAMES)]
@@ -111,6 +125,68 @@ def test_a_frame_of_another_object_is_taken_out_by_name(clouds):
         f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them"
     )
     assert np.isnan(found.adjusted.poses.T_world_camera[MOVED]).all()
+
+
+def test_a_frame_that_contradicts_again_where_it_was_placed_is_not_placed_a_third_time(clouds, monkeypatch, adjusted):
+    """Here every frame that is asked for is placed, a stranger, too; another frame comes in beside it."""
+    true, asked = registration_of(RIG.T_world_camera.numpy()), []
+    everything, rest = list(range(FRAMES)), [k for k in range(FRAMES) if k not in (1, MOVED)]
+
+    def all_of_them(clouds, registration, poses, candidates):
+        asked.append(list(candidates))
+        return without_groups(true, [[k] for k in registration_gaps(registration) if k not in candidates])
+
+    monkeypatch.setattr(consistency, "include_left_out", all_of_them)
+    log = []
+    found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append)
+    assert asked == [[1, MOVED]]
+    assert adjusted == [[0, *everything[2:]], rest, everything, sorted([1, *rest])]
+    assert np.flatnonzero(~found.registration.registered).tolist() == [MOVED]
+    assert found.registration.exclusions == (CoordinatesDisagree(NAMES[MOVED], (NAMES[MOVED],)),)
+    assert log == [
+        f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them",
+        f"placed against the adjusted frames: {NAMES[1]}, {NAMES[MOVED]}; adjusting again with them",
+    ]
+
+
+def test_only_frames_that_are_asked_for_are_placed(clouds):
+    true = registration_of(RIG.T_world_camera.numpy())
+    start = without_groups(true, [[1], [MOVED]])
+    poses = find_registered_minimum(clouds, start, QUICK).frames.poses
+    both = include_left_out(clouds, start, poses, [1, MOVED])
+    assert both.registered.all() and both.exclusions == ()
+    one = include_left_out(clouds, start, poses, [MOVED])
+    assert registration_gaps(one) == [1] and [e.frame for e in one.exclusions] == [NAMES[1]]
+    for found in (both, one):
+        np.testing.assert_allclose(found.T_world_camera[MOVED], true.T_world_camera[MOVED], atol=0.02)
+
+
+def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_show(monkeypatch):
+    """On a plane along which frames slide; a stranger among them makes two adjustments of it."""
+    monkeypatch.setattr(analytic, "BALLS", ())
+    clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.02)), []
+    search = adjustment._search
+    monkeypatch.setattr(adjustment, "_search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
+    monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
+    found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None)
+    kept = [k for k in range(FRAMES) if k != MOVED]
+    assert np.flatnonzero(found.registration.registered).tolist() == kept
+    assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + QUICK.adjustment.other_minima.searches)]
+    wanted = adjust_registered(clouds, found.registration, QUICK)
+    alone = find_registered_minimum(clouds, found.registration, QUICK).frames
+    np.testing.assert_array_equal(found.adjusted.poses.T_world_camera, wanted.poses.T_world_camera)
+    assert found.adjusted.sigma == wanted.sigma
+    assert max(found.adjusted.sigma[k].camera_translation / alone.sigma[k].camera_translation for k in kept) > 1.5
+
+
+def registration_gaps(registration: Registration) -> list[int]:
+    """Numbers of the frames that are not registered."""
+    return np.flatnonzero(~registration.registered).tolist()
+
+
+def with_stranger(clouds):
+    """The frames, one of them of another object."""
+    return [*clouds[:MOVED], stranger_of(clouds[MOVED]), *clouds[MOVED + 1 :]]
 
 
 def stranger_of(cloud):
