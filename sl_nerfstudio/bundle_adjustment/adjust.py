@@ -120,6 +120,7 @@ class _Problem:
     generator: torch.Generator
     partners: Bool[Tensor, "frames frames"]
     anchors: Anchors  # where they are with the starting poses
+    given_up: tuple[int, ...]  # frames for which an earlier search has found no place
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor."""
@@ -239,14 +240,16 @@ def find_minimum(
     return Minimum(_result(problem, refine, found, before), problem, refine, found)
 
 
-def _problem(start: Rig, maps: CoordinateMaps, prior: PosePrior, settings: AdjustmentSettings) -> _Problem:
+def _problem(
+    start: Rig, maps: CoordinateMaps, prior: PosePrior, settings: AdjustmentSettings, given_up: tuple[int, ...] = ()
+) -> _Problem:
     """A search from `start`, to which the prior belongs."""
     generator = torch.Generator().manual_seed(settings.seed)
     per_frame = min(settings.anchors_per_frame, settings.max_anchors // start.frames)
     per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
     anchors = place_anchors(start, maps, per_frame, generator)
     together = partners(start, anchors, maps, settings.partners, settings.least_cosine, generator)
-    return _Problem(start, maps, prior, settings, generator, together, anchors)
+    return _Problem(start, maps, prior, settings, generator, together, anchors, given_up)
 
 
 def _search(problem: _Problem, refine: RefinePoses) -> tuple[_Progress, float] | None:
@@ -288,15 +291,20 @@ def _away_from_borders(problem: _Problem, found: _Progress) -> _Progress:
 def _departures(
     problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment
 ) -> list[Float[Tensor, "unknowns"]]:
-    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
+    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result.
+
+    Frames without a place are not asked: neither their poses nor their sigma hold.
+    """
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
     asked = s.searches > 0 and refine in _FRAMES_MOVE and result.rig.frames <= s.most_frames
     if not asked or _leads_back(problem, refine, found, result, generator):
         return []
     departures, limits = [], s.worse * _misfits(problem.maps, found)
+    limits[list(result.unplaced)] = float("inf")
     for _ in range(s.searches):
         start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        other = _search(_problem(start, problem.maps, problem.prior, problem.settings), refine)
+        again = _problem(start, problem.maps, problem.prior, problem.settings, result.unplaced)
+        other = _search(again, refine)
         if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
             departures.append(departure_of(other[0].state.rig, result.rig))
     return departures
@@ -334,7 +342,7 @@ def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _
     for _ in range(problem.settings.relocalisation.rounds):
         rig = relocalise(
             found.state.rig, problem.start, problem.maps, problem.prior, refine, found.noise, problem.generator,
-            problem.settings,
+            problem.settings, problem.given_up,
         )  # fmt: skip
         moved = (rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():

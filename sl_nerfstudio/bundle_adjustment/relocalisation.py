@@ -4,6 +4,7 @@ With all other frames fixed, a frame has six unknowns and thousands of residuals
 a few poses around its current one, it finds the surface that the others agree on.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import torch
@@ -109,8 +110,11 @@ def relocalise(
     noise: float,
     generator: torch.Generator,
     settings: AdjustmentSettings,
+    given_up: Collection[int] = (),
 ) -> Rig:
     """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
+
+    So do frames that are `given_up`: an earlier search has found no place for them.
 
     The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
     starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
@@ -125,7 +129,7 @@ def relocalise(
     lost = find_lost_frames(support, s)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     enough = least_support(support, s)
-    for k in lost.tolist():
+    for k in (k for k in lost.tolist() if k not in given_up):
         best, best_support = rig, float(support[k]) + s.least_gain
         for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)

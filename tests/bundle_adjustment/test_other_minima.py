@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment import relocalisation
 from sl_nerfstudio.bundle_adjustment.adjust import adjust, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
@@ -70,6 +71,22 @@ def test_the_minimum_alone_is_an_adjustment_without_the_question_which_can_be_as
     assert float((asked.sigma / one.sigma)[:, :6].max()) > 1.5
     for found in (minimum.adjustment, asked, several):
         assert torch.equal(found.rig.T_world_camera, one.rig.T_world_camera)
+
+
+def test_a_frame_without_a_place_is_not_searched_for_again_and_spoils_no_search(monkeypatch):
+    """Its image is upside down, so it fits nowhere; the others slide."""
+    monkeypatch.setattr(analytic, "BALLS", ())
+    true, lost, tried = rig_of(FRAMES, SIZE), 2, []
+    generator = torch.Generator().manual_seed(0)
+    images = [image + 0.02 * torch.randn(SIZE, SIZE, 2, generator=generator) for image in images_of(true, SIZE)]
+    images[lost] = images[lost].flip(0)
+    place_one = relocalisation._place_one
+    monkeypatch.setattr(relocalisation, "_place_one", lambda rig, k, *rest: tried.append(k) or place_one(rig, k, *rest))
+    minimum = find_minimum(disturbed(true, 0), CoordinateMaps.of(images), PRIOR, "known-rig", SETTINGS)
+    assert minimum.adjustment.unplaced == (lost,) and set(tried) == {lost}
+    tried.clear()
+    others = minimum.with_other_minima().factor.shape[1] - minimum.adjustment.factor.shape[1]
+    assert tried == [] and others == SETTINGS.other_minima.searches
 
 
 def random_factor(seed: int) -> Tensor:
