@@ -89,8 +89,9 @@ class NormalEquations:
         slot = np.full(frames, -1)
         slot[self.chosen] = np.arange(m)
         H = np.zeros((12 * m + more, 12 * m + more))
-        pair_sums(m, self.chosen, slot, self.groups, self.rows, self.cross, self.depths.arrays, H)
-        mirror(m, H)
+        if m > 1:
+            pair_sums(m, self.chosen, slot, self.groups, self.rows, self.cross, self.depths.arrays, H)
+            mirror(m, H)
         out, first = torch.from_numpy(H), 12 * m
         for k, block in enumerate(self.H + prior):
             out[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] = block
