@@ -8,11 +8,9 @@ from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from jaxtyping import install_import_hook
+from tests import type_checks
 
-import tests.type_checks  # noqa: F401  (the next line finds it by its name)
-
-install_import_hook("sl_nerfstudio", "tests.type_checks.checked")
+type_checks.install()
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
