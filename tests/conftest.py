@@ -14,16 +14,23 @@ type_checks.install()
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
-import torch  # noqa: E402
 
-torch.set_num_threads(1)
-# While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
-# half a minute; a new thread has a short one.
-_importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))
-_importing.start()
-_importing.join()
 hypothesis.settings.register_profile("project", deadline=None, derandomize=True, max_examples=50, print_blob=True)
 hypothesis.settings.load_profile("project")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What takes long to import; not in the process that only hands out the tests to others."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return
+    import torch
+
+    torch.set_num_threads(1)
+    # While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
+    # half a minute; a new thread has a short one.
+    importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))
+    importing.start()
+    importing.join()
 
 
 @pytest.fixture(autouse=True)
