@@ -22,6 +22,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     farthest_frame,
     shake,
     widened,
+    with_frames_of,
 )
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step, moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
@@ -120,6 +121,7 @@ class _Problem:
     generator: torch.Generator
     partners: Bool[Tensor, "frames frames"]
     anchors: Anchors  # where they are with the starting poses
+    unplaced: tuple[int, ...] = ()  # frames that are known to agree with no others: they are not searched for
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor."""
@@ -258,15 +260,24 @@ def _with_other_minima(problem: _Problem, refine: RefinePoses, found: _Progress,
     """The result; where it is one of several, its covariance covers those that other searches find."""
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
     asked = s.searches > 0 and refine in _FRAMES_MOVE and result.rig.frames <= s.most_frames
+    problem = replace(problem, unplaced=result.unplaced)
     if not asked or _leads_back(problem, refine, found, result, generator):
         return result
-    departures, limits = [], s.worse * _misfits(problem.maps, found)
+    limits = s.worse * _misfits(problem.maps, found)
+    limits[list(result.unplaced)] = float("inf")
+    departures = []
     for _ in range(s.searches):
         start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        other = _search(_problem(start, problem.maps, problem.prior, problem.settings), refine)
+        again = replace(_problem(start, problem.maps, problem.prior, problem.settings), unplaced=result.unplaced)
+        other = _search(again, refine)
         if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
-            departures.append(departure_of(other[0].state.rig, result.rig))
+            departures.append(_departure(problem, other[0], result))
     return replace(result, factor=widened(result.factor, departures))
+
+
+def _departure(problem: _Problem, other: _Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:
+    """From the result to another one, of the frames that are placed."""
+    return departure_of(with_frames_of(other.state.rig, result.rig, problem.unplaced), result.rig)
 
 
 def _misfits(maps: CoordinateMaps, found: _Progress) -> Float[Tensor, "frames"]:
@@ -289,7 +300,7 @@ def _leads_back(
     rig, anchors = moved_together(state.rig, state.anchors, equations, step, problem.settings.steps)
     beside = replace(state, rig=rig, anchors=anchors)
     back = _run(problem, _Stage(refine, False, s.shake_steps), replace(found, state=beside))
-    left = farthest_frame(result.factor, departure_of(back.state.rig, state.rig))
+    left = farthest_frame(result.factor, _departure(problem, back, result))
     return left <= s.most_left * s.shake_sigmas
 
 
@@ -300,7 +311,7 @@ def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _
     for _ in range(problem.settings.relocalisation.rounds):
         rig = relocalise(
             found.state.rig, problem.start, problem.maps, problem.prior, refine, found.noise, problem.generator,
-            problem.settings,
+            problem.settings, problem.unplaced,
         )  # fmt: skip
         moved = (rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():

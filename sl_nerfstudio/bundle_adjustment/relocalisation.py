@@ -109,11 +109,13 @@ def relocalise(
     noise: float,
     generator: torch.Generator,
     settings: AdjustmentSettings,
+    never: tuple[int, ...] = (),
 ) -> Rig:
     """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
 
     The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
     starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
+    Frames in `never` are not searched for.
     """
     s = settings.relocalisation
     relative_free = refine == "free"
@@ -125,7 +127,7 @@ def relocalise(
     lost = find_lost_frames(support, s)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     enough = least_support(support, s)
-    for k in lost.tolist():
+    for k in (k for k in lost.tolist() if k not in never):
         best, best_support = rig, float(support[k]) + s.least_gain
         for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)

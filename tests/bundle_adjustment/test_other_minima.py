@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment import adjust as adjustment
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
@@ -15,6 +16,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     farthest_frame,
     shake,
     widened,
+    with_frames_of,
 )
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, OtherMinimaSettings
@@ -57,6 +59,30 @@ def test_a_scene_that_holds_its_frames_is_searched_once():
     )
     assert torch.equal(one.factor, several.factor)
     assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera)
+
+
+def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkeypatch):
+    """It agrees with nothing anywhere, which says nothing about where the others are."""
+    stranger, searches = 2, []
+    maps = noisy_maps(1, 0.3)
+    monkeypatch.setattr(analytic, "BALLS", analytic.BALLS[:1])
+    values, first, last = maps.values.clone(), int(maps.offsets[stranger]), int(maps.offsets[stranger + 1])
+    values[first:last] = noisy_maps(2, 0.3).values[first:last].roll(SIZE // 5, 0)
+    start = disturbed(rig_of(FRAMES, SIZE), 1)
+    search = adjustment._search
+    monkeypatch.setattr(adjustment, "_search", lambda *a: searches.append(a) or search(*a))
+    one, several = (adjust(start, replace(maps, values=values), PRIOR, "free", s) for s in (ONE_SEARCH, SETTINGS))
+    assert one.unplaced == several.unplaced == (stranger,)
+    assert len(searches) == 2 and torch.equal(one.factor, several.factor)
+
+
+def test_frames_of_another_rig_are_where_it_has_them():
+    rig, other = rig_of(FRAMES, SIZE), disturbed(rig_of(FRAMES, SIZE), 3, relative=0.5)
+    mixed = with_frames_of(rig, other, (1, 3))
+    for part in ("T_world_camera", "T_camera_projector"):
+        for k in range(FRAMES):
+            assert torch.equal(getattr(mixed, part)[k], getattr(other if k in (1, 3) else rig, part)[k])
+    assert torch.equal(with_frames_of(rig, other, ()).T_world_camera, rig.T_world_camera)
 
 
 def random_factor(seed: int) -> Tensor:
