@@ -3,7 +3,7 @@
 import sys
 from functools import partial
 
-from sl_nerfstudio.model.texture_atlas import unwrap_mesh_with_xatlas
+from sl_nerfstudio.model.texture_rays import unwrap_mesh_with_xatlas
 
 _EXPORTER = "nerfstudio.scripts.exporter"
 
@@ -11,7 +11,7 @@ _EXPORTER = "nerfstudio.scripts.exporter"
 def quicken_exporters() -> None:
     """Called when a run is opened; does nothing in commands other than `ns-export`.
 
-    - A texture's rays are found by drawing triangles; see texture_atlas.py.
+    - A texture's rays are found by drawing triangles; see texture_rays.py.
     - open3d's Poisson reconstruction runs in one thread. Its threads wait for each other in loops: 20,000 points at
       depth 6 took 0.5 s with one thread and more than 30 s with four, on four cores that were not idle.
     """
