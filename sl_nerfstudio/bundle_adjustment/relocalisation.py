@@ -41,10 +41,10 @@ class _Problem:
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
         """Anchors in other frames that may see them; with `around`, only of or in one frame."""
-        return _rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
+        return rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
 
 
-def _rows_of_all(
+def rows_of_all(
     rig: Rig,
     anchors: Anchors,
     maps: CoordinateMaps,
@@ -78,7 +78,7 @@ def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: Adju
     """Frames that see too little of the surface on which the others agree, in order."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = _rows_of_all(rig, anchors, maps, settings, generator)
+    rows = rows_of_all(rig, anchors, maps, settings, generator)
     support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
     wrong = support.isnan() | (support < s.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())

@@ -69,8 +69,8 @@ def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkey
     values, first, last = maps.values.clone(), int(maps.offsets[stranger]), int(maps.offsets[stranger + 1])
     values[first:last] = noisy_maps(2, 0.3).values[first:last].roll(SIZE // 5, 0)
     start = disturbed(rig_of(FRAMES, SIZE), 1)
-    search = adjustment._search
-    monkeypatch.setattr(adjustment, "_search", lambda *a: searches.append(a) or search(*a))
+    search = adjustment.search
+    monkeypatch.setattr(adjustment, "search", lambda *a: searches.append(a) or search(*a))
     one, several = (adjust(start, replace(maps, values=values), PRIOR, "free", s) for s in (ONE_SEARCH, SETTINGS))
     assert one.unplaced == several.unplaced == (stranger,)
     assert len(searches) == 2 and torch.equal(one.factor, several.factor)
