@@ -78,6 +78,7 @@ class Minimum:
     problem: Problem
     refine: RefinePoses
     progress: Progress | None  # None: there was nothing to search
+    others: tuple[Progress, ...] = ()  # other ends of searches after rough starts
 
     @one_library_thread()
     def with_other_minima(self) -> Adjustment:
@@ -85,9 +86,7 @@ class Minimum:
         found = self.adjustment
         if self.progress is None:
             return found
-        return replace(
-            found, factor=widened(found.factor, _departures(self.problem, self.refine, self.progress, found))
-        )
+        return replace(found, factor=widened(found.factor, _departures(self, self.progress)))
 
 
 def adjust(
@@ -119,28 +118,36 @@ def find_minimum(
     if first is None:
         return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
     found, before = hopped(problem, refine, first[0]), first[1]
-    return Minimum(_result(problem, refine, found, before), problem, refine, found)
+    return Minimum(_result(problem, refine, found.best, before), problem, refine, found.best, found.others)
 
 
-def _departures(
-    problem: Problem, refine: RefinePoses, found: Progress, result: Adjustment
-) -> list[Float[Tensor, "unknowns"]]:
+def _departures(minimum: Minimum, found: Progress) -> list[Float[Tensor, "unknowns"]]:
     """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
+    result, refine = minimum.adjustment, minimum.refine
+    problem = replace(minimum.problem, unplaced=result.unplaced)
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
-    asked = s.searches > 0 and refine in FRAMES_MOVE and result.rig.frames <= s.most_frames
-    problem = replace(problem, unplaced=result.unplaced)
-    if not asked or _leads_back(problem, refine, found, result, generator):
+    if s.searches < 1 or refine not in FRAMES_MOVE or result.rig.frames > s.most_frames:
         return []
+    ends = list(minimum.others)
+    if not ends and not _leads_back(problem, refine, found, result, generator):
+        ends = _other_ends(problem, refine, result, generator)
     limits = s.worse * _misfits(problem.maps, found)
     limits[list(result.unplaced)] = float("inf")
-    departures = []
-    for _ in range(s.searches):
+    near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
+    return [_departure(problem, end, result) for end in near]
+
+
+def _other_ends(
+    problem: Problem, refine: RefinePoses, result: Adjustment, generator: torch.Generator
+) -> list[Progress]:
+    """Ends of searches from poses as uncertain as the starting ones, drawn about the result."""
+    ends = []
+    for _ in range(problem.settings.other_minima.searches):
         start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        again = replace(problem_of(start, problem.maps, problem.prior, problem.settings), unplaced=result.unplaced)
-        other = search(again, refine)
-        if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
-            departures.append(_departure(problem, other[0], result))
-    return departures
+        again = replace(problem_of(start, problem.maps, problem.prior, problem.settings), unplaced=problem.unplaced)
+        end = search(again, refine)
+        ends += [end[0]] if end else []
+    return ends
 
 
 def _departure(problem: Problem, other: Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:

@@ -140,6 +140,8 @@ class HopSettings:
 
     most: int = 12
     """Most of them; they end as soon as one leads back. 0: none."""
+    patience: int = 4
+    """Searches after the best one that end elsewhere, after which there is no further one."""
     from_deg: float = 1.5
     """Uncertainty of the starting rotations, 1 sigma per axis of the median frame in degrees, from which starts count
     as rough."""
@@ -147,8 +149,8 @@ class HopSettings:
     """Distance from the best end at which a search begins, as a share of the starting poses' uncertainty."""
     least_gain: float = 0.002
     """Share by which a search must explain more to replace the best one."""
-    same: float = 0.005
-    """Share by which it may explain less and still count as leading back."""
+    most_left: float = 0.35
+    """Share of that distance within which all frames must return for a search to lead back."""
     width_noises: float = 4.0
     """Residual that counts half, as a multiple of the noise."""
     anchors_per_frame: int = 300

@@ -5,12 +5,13 @@ them agree with each other and well enough with the rest. Poses drawn about that
 frames that are right return. (Basin hopping: Wales and Doye, J. Phys. Chem. A, 1997; only what is better is kept.)
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
+from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import departure_of, with_frames_of
 from sl_nerfstudio.bundle_adjustment.observations import place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.relocalisation import rows_of_all, unplaced_frames
@@ -24,28 +25,49 @@ from sl_nerfstudio.geometry.robust import geman_mcclure_cost
 _HALF = 0.5  # share of the frames that every second hop moves
 
 
-def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Progress:
-    """The end of the search, or a better one; ends as soon as a hop leads back to the best one.
+@dataclass(frozen=True)
+class Hopped:
+    """Where further searches have ended."""
+
+    best: Progress
+    others: tuple[Progress, ...]  # where those after the best one have ended, if it was elsewhere
+
+
+def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
+    """The end of the search, or a better one; ends as soon as a hop leads back to the best one, or none is better.
 
     Frames that agree with no others at the first end are not searched for again.
     """
     s, generator = problem.settings.hops, torch.Generator().manual_seed(problem.settings.seed)
+    best, others = found, []
     if refine not in FRAMES_MOVE or found.state.rig.frames > s.most_frames or not is_rough(problem.prior, s.from_deg):
-        return found
+        return Hopped(best, ())
     unplaced = unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
     for hop in range(s.most):
-        begin = _moved(found.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
+        begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
         again = problem_of(problem.start, problem.maps, problem.prior, problem.settings, begin)
-        other = search(replace(again, unplaced=unplaced), refine)
-        if other is None:
+        end = search(replace(again, unplaced=unplaced), refine)
+        if end is None:
             continue
-        width = s.width_noises * min(found.noise, other[0].noise)
-        now, then = (_explained(p.state.rig, problem.maps, width, problem.settings) for p in (other[0], found))
+        other = end[0]
+        width = s.width_noises * min(best.noise, other.noise)
+        now, then = (_explained(p.state.rig, problem.maps, width, problem.settings) for p in (other, best))
         if now > (1 + s.least_gain) * then:
-            found = other[0]
-        elif now > (1 - s.same) * then:
+            best, others = other, []
+        elif _leads_back(with_frames_of(other.state.rig, best.state.rig, unplaced), best.state.rig, problem):
             break
-    return found
+        else:
+            others.append(other)
+            if len(others) == s.patience:
+                break
+    return Hopped(best, tuple(others))
+
+
+def _leads_back(other: Rig, best: Rig, problem: Problem) -> bool:
+    """Whether every frame has come back, most of the way that hops take it."""
+    s = problem.settings.hops
+    departure = departure_of(other, best).reshape(2, -1, 6)[0] / (s.size * problem.prior.sigma[:, :6])
+    return float(departure.square().mean(1).max().sqrt()) <= s.most_left
 
 
 def is_rough(prior: PosePrior, from_deg: float) -> bool:
