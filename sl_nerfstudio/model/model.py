@@ -287,7 +287,7 @@ class SLModel(Model):
         ends = None
         if bundle.nears is not None and bundle.fars is not None:  # of a texture, or cropped
             ends = (bundle.nears[:, 0], bundle.fars[:, 0])
-        outputs = ray_outputs(self.renderer, origins, directions, T_projector.float()[views], ends)
+        outputs = ray_outputs(self.renderer, origins, directions, T_projector.float(), views, ends)
         if "sl_uv" not in (bundle.metadata or {}):  # batches of single pixels hold their measured coordinates
             depth = torch.where(outputs["accumulation"] > 0.5, outputs["depth"], 0.0)
             measured = self.measured.at(origins + depth * directions, views, inverse(T_camera).float())
