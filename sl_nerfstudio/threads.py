@@ -57,8 +57,15 @@ def one_torch_thread() -> Iterator[None]:
         _ours = before
 
 
+def torch_on_one_thread() -> None:
+    """`one_torch_thread` for the rest of this process."""
+    global _ours
+    _ours = threads()
+    torch.set_num_threads(1)
+
+
 def only_one_library_thread() -> None:
-    """The same for the rest of this process: one of several that share the cores."""
+    """All libraries and our loops on one thread for the rest of this process: one of several that share the cores."""
     torch.set_num_threads(1)
     threadpool_limits(limits=1, user_api="blas")
 
