@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from sl_nerfstudio.late_compiler import begin_imports, compiler_on_demand, end_imports
+from sl_nerfstudio.late_compiler import begin_imports, compiler_on_demand, end_imports, shapes_without_symbols
 
 CODE = """
 import sys
@@ -41,6 +41,17 @@ def test_a_function_is_compiled_when_it_is_called_first(monkeypatch):
     assert [twice(2.0), twice(3.0)] == [4.0, 6.0]
     assert asked == [{"dynamic": True}]
     assert twice.__doc__ == "Doubles."
+
+
+def test_shapes_are_broadcast_as_torch_does_it():
+    real = torch.broadcast_shapes
+    for shapes in (((),), ((3, 1), (4,)), ((2, 1, 5), (7, 1), ()), (torch.Size([1]), [6, 1]), (3, (2, 1))):
+        with shapes_without_symbols():
+            found = torch.broadcast_shapes(*shapes)
+        assert isinstance(found, torch.Size) and found == real(*shapes)
+    with pytest.raises(RuntimeError, match="shape"), shapes_without_symbols():
+        torch.broadcast_shapes((2,), (3,))
+    assert torch.broadcast_shapes is real
 
 
 COMMAND = """

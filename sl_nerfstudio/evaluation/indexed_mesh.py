@@ -76,6 +76,11 @@ class IndexedMesh:
         return np.cross(b - a, c - a)
 
     @cached_property
+    def vertex_normals(self) -> Float[ndarray, "v 3"]:
+        """Unit normals of the vertices."""
+        return self.mesh.vertex_normals()
+
+    @cached_property
     def area(self) -> float:
         """Total area of the triangles."""
         return float(np.linalg.norm(self.face_cross, axis=1).sum() / 2)
