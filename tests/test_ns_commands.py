@@ -44,6 +44,8 @@ SMALL = [
     "64",
     "--pipeline.model.sdf.hidden",
     "32",
+    "--pipeline.model.adjustment.other-minima.searches",
+    "0",
     "--pipeline.datamanager.train-num-rays-per-batch",
     "256",
     "--logging.steps-per-log",
