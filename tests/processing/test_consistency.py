@@ -13,7 +13,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     adjust_registered,
     find_registered_minimum,
 )
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
@@ -34,6 +34,7 @@ NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
 
 
 QUICK = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
+ONE_START = replace(QUICK, adjustment=replace(QUICK.adjustment, relocalisation=RelocalisationSettings(1, starts=1)))
 
 
 @pytest.fixture(autouse=True)
@@ -41,9 +42,9 @@ def adjusted(monkeypatch) -> list[list[int]]:
     """Adjustments are quick; the frames of each are listed."""
     groups: list[list[int]] = []
 
-    def quick(clouds, registration, _):
+    def quick(clouds, registration, settings):
         groups.append(np.flatnonzero(registration.registered).tolist())
-        return find_registered_minimum(clouds, registration, QUICK)
+        return find_registered_minimum(clouds, registration, settings or QUICK)
 
     monkeypatch.setattr(consistency, "find_registered_minimum", quick)
     return groups
@@ -138,7 +139,7 @@ def test_a_frame_that_contradicts_again_where_it_was_placed_is_not_placed_a_thir
 
     monkeypatch.setattr(consistency, "include_left_out", all_of_them)
     log = []
-    found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append)
+    found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append, ONE_START)
     assert asked == [[1, MOVED]]
     assert adjusted == [[0, *everything[2:]], rest, everything, sorted([1, *rest])]
     assert np.flatnonzero(~found.registration.registered).tolist() == [MOVED]
@@ -168,12 +169,12 @@ def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_
     search = adjustment.search
     monkeypatch.setattr(adjustment, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
     monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
-    found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None)
+    found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None, ONE_START)
     kept = [k for k in range(FRAMES) if k != MOVED]
     assert np.flatnonzero(found.registration.registered).tolist() == kept
     assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + QUICK.adjustment.other_minima.searches)]
-    wanted = adjust_registered(clouds, found.registration, QUICK)
-    alone = find_registered_minimum(clouds, found.registration, QUICK).frames
+    wanted = adjust_registered(clouds, found.registration, ONE_START)
+    alone = find_registered_minimum(clouds, found.registration, ONE_START).frames
     np.testing.assert_array_equal(found.adjusted.poses.T_world_camera, wanted.poses.T_world_camera)
     assert found.adjusted.sigma == wanted.sigma
     assert max(found.adjusted.sigma[k].camera_translation / alone.sigma[k].camera_translation for k in kept) > 1.5
