@@ -31,7 +31,7 @@ from sl_nerfstudio.bundle_adjustment.relocalisation import unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import frame_medians
-from sl_nerfstudio.bundle_adjustment.search.hops import hopped
+from sl_nerfstudio.bundle_adjustment.search.hops import Hopped, hopped
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
 from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress, kernel_of, problem_of
 from sl_nerfstudio.bundle_adjustment.search.stages import Stage, run_stage
@@ -77,16 +77,15 @@ class Minimum:
     adjustment: Adjustment  # with the covariance of this minimum alone
     problem: Problem
     refine: RefinePoses
-    progress: Progress | None  # None: there was nothing to search
-    others: tuple[Progress, ...] = ()  # other ends of searches after rough starts
+    ends: Hopped | None  # of all searches; None: there was nothing to search
 
     @one_library_thread()
     def with_other_minima(self) -> Adjustment:
         """The same poses; where they are one of several minima, their covariance covers those of other searches."""
         found = self.adjustment
-        if self.progress is None:
+        if self.ends is None:
             return found
-        return replace(found, factor=widened(found.factor, _departures(self, self.progress)))
+        return replace(found, factor=widened(found.factor, _departures(self, self.ends)))
 
 
 def adjust(
@@ -118,20 +117,20 @@ def find_minimum(
     if first is None:
         return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
     found, before = hopped(problem, refine, first[0]), first[1]
-    return Minimum(_result(problem, refine, found.best, before), problem, refine, found.best, found.others)
+    return Minimum(_result(problem, refine, found.best, before), problem, refine, found)
 
 
-def _departures(minimum: Minimum, found: Progress) -> list[Float[Tensor, "unknowns"]]:
+def _departures(minimum: Minimum, found: Hopped) -> list[Float[Tensor, "unknowns"]]:
     """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
     result, refine = minimum.adjustment, minimum.refine
     problem = replace(minimum.problem, unplaced=result.unplaced)
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
     if s.searches < 1 or refine not in FRAMES_MOVE or result.rig.frames > s.most_frames:
         return []
-    ends = list(minimum.others)
-    if not ends and not _leads_back(problem, refine, found, result, generator):
-        ends = _other_ends(problem, refine, result, generator)
-    limits = s.worse * _misfits(problem.maps, found)
+    ends = list(found.others)
+    if not found.settled or not _leads_back(problem, refine, found.best, result, generator):
+        ends += _other_ends(problem, refine, result, generator)
+    limits = s.worse * _misfits(problem.maps, found.best)
     limits[list(result.unplaced)] = float("inf")
     near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
     return [_departure(problem, end, result) for end in near]

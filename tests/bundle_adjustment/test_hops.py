@@ -76,7 +76,7 @@ def test_a_right_result_is_kept_after_one_search_that_leads_back(true, searches)
     problem = problem_from(disturbed(true, 1, degrees=1.0), true)
     first = search(problem, "known-rig")[0]
     searches.clear()
-    assert hopped(problem, "known-rig", first) == Hopped(first, ())
+    assert hopped(problem, "known-rig", first) == Hopped(first, (), True)
     assert len(searches) == 1
     begun = torch.tensor(turns_deg(searches[0], first.state.rig))
     assert float(begun.max()) > 0.1  # it did not begin where it ended
@@ -93,7 +93,7 @@ def test_searches_that_end_elsewhere_and_explain_less_are_other_ends_until_patie
 
     monkeypatch.setattr(hops, "search", nowhere)
     found = hopped(problem, "known-rig", first)
-    assert found.best is first and len(ends) == 3
+    assert found.best is first and not found.settled and len(ends) == 3
     assert all(a is b for a, b in zip(found.others, ends, strict=True))
 
 
@@ -104,7 +104,7 @@ def test_other_ends_that_fit_as_well_widen_the_covariance_by_what_they_differ(tr
     step[0, 2, 4] = 1e-3
 
     def with_another(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
-        return Hopped(found, (replace(found, state=replace(found.state, rig=found.state.rig.moved(*step))),))
+        return Hopped(found, (replace(found, state=replace(found.state, rig=found.state.rig.moved(*step))),), True)
 
     limits = OtherMinimaSettings(most_left=1e9, worse=1.4 if worse else 1e30)  # residuals are 1e-9 px
     settings = replace(SETTINGS, other_minima=limits)

@@ -31,6 +31,7 @@ class Hopped:
 
     best: Progress
     others: tuple[Progress, ...]  # where those after the best one have ended, if it was elsewhere
+    settled: bool  # the last one led back, or none was asked for
 
 
 def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
@@ -41,7 +42,7 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     s, generator = problem.settings.hops, torch.Generator().manual_seed(problem.settings.seed)
     best, others = found, []
     if refine not in FRAMES_MOVE or found.state.rig.frames > s.most_frames or not is_rough(problem.prior, s.from_deg):
-        return Hopped(best, ())
+        return Hopped(best, (), True)
     unplaced = unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
     for hop in range(s.most):
         begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
@@ -55,12 +56,12 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
         if now > (1 + s.least_gain) * then:
             best, others = other, []
         elif _leads_back(with_frames_of(other.state.rig, best.state.rig, unplaced), best.state.rig, problem):
-            break
+            return Hopped(best, tuple(others), True)
         else:
             others.append(other)
             if len(others) == s.patience:
                 break
-    return Hopped(best, tuple(others))
+    return Hopped(best, tuple(others), not s.most)
 
 
 def _leads_back(other: Rig, best: Rig, problem: Problem) -> bool:
