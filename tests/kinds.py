@@ -6,6 +6,9 @@ from collections.abc import Callable, Collection, Hashable, Iterable
 from functools import cache
 from typing import Any
 
+from numpy import ndarray
+from torch import Tensor
+
 _ITEMS = 32  # of a container; those of more are not compared
 
 
@@ -34,8 +37,10 @@ class Kinds(defaultdict[type, Callable[[Any], Hashable]]):
             return self._container
         if issubclass(of, type) or (of is str and self.literals):
             return lambda value: value
-        if hasattr(of, "shape") and hasattr(of, "dtype"):
+        if issubclass(of, ndarray | Tensor):
             return lambda value: (of, value.dtype, value.shape)
+        if hasattr(of, "shape"):  # arrays of other libraries
+            return _none
         if issubclass(of, Collection) and not issubclass(of, str | bytes | range) and not hasattr(of, "_fields"):
             return _none
         return type

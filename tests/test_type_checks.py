@@ -6,6 +6,7 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+import open3d
 import pytest
 import torch
 from jaxtyping import Float, Int, TypeCheckError
@@ -161,6 +162,7 @@ def test_kinds_tell_what_checks_ask_for():
         partial(sequences.of_all, [{1: "a", 2: 3}]),
         partial(records.of_all, [list(range(100))]),
         partial(records.of_all, [{}.keys()]),
+        partial(records.of_all, [open3d.core.Tensor([1])]),
         partial(sized.of_all, [1]),
     ):
         with pytest.raises(NotComparable):
