@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 
 _OURS = __name__.partition(".")[0]
@@ -38,6 +39,25 @@ def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
         torch.compile = real
         if not stays_out:
             _remove_placeholders()
+
+
+@contextmanager
+def shapes_without_symbols() -> Iterator[None]:
+    """`torch.broadcast_shapes`, which nerfstudio calls for every camera, without its import of sympy: half a second."""
+    real = torch.broadcast_shapes
+    torch.broadcast_shapes = _broadcast_shapes  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        torch.broadcast_shapes = real
+
+
+def _broadcast_shapes(*shapes: Any) -> torch.Size:
+    """Of plain numbers. Raises RuntimeError, as torch, for shapes that do not fit."""
+    try:
+        return torch.Size(np.broadcast_shapes(*shapes))
+    except ValueError as error:
+        raise RuntimeError(str(error)) from error
 
 
 def begin_imports(command: list[str]) -> None:

@@ -39,20 +39,33 @@ def one_library_thread() -> Iterator[None]:
     Those gain nothing from a team of threads, which spin between them: beside other busy processes the work then takes
     ten times as long and more.
     """
+    with one_torch_thread(), threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """The same without BLAS, for what is called often: looking for the process's BLAS libraries takes milliseconds."""
     global _ours
     before, count = _ours, torch.get_num_threads()
     _ours = threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(limits=1, user_api="blas"):
-            yield
+        yield
     finally:
         torch.set_num_threads(count)
         _ours = before
 
 
+def torch_on_one_thread() -> None:
+    """`one_torch_thread` for the rest of this process."""
+    global _ours
+    _ours = threads()
+    torch.set_num_threads(1)
+
+
 def only_one_library_thread() -> None:
-    """The same for the rest of this process: one of several that share the cores."""
+    """All libraries and our loops on one thread for the rest of this process: one of several that share the cores."""
     torch.set_num_threads(1)
     threadpool_limits(limits=1, user_api="blas")
 

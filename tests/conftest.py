@@ -8,24 +8,29 @@ from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from jaxtyping import install_import_hook
+from tests import type_checks
 
-import tests.type_checks  # noqa: F401  (the next line finds it by its name)
-
-install_import_hook("sl_nerfstudio", "tests.type_checks.checked")
+type_checks.install()
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
-import torch  # noqa: E402
 
-torch.set_num_threads(1)
-# While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
-# half a minute; a new thread has a short one.
-_importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))
-_importing.start()
-_importing.join()
 hypothesis.settings.register_profile("project", deadline=None, derandomize=True, max_examples=50, print_blob=True)
 hypothesis.settings.load_profile("project")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What takes long to import; not in the process that only hands out the tests to others."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return
+    import torch
+
+    torch.set_num_threads(1)
+    # While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
+    # half a minute; a new thread has a short one.
+    importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))
+    importing.start()
+    importing.join()
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from sl_nerfstudio.late_compiler import compiler_on_demand
+from sl_nerfstudio.late_compiler import begin_imports, compiler_on_demand, end_imports, shapes_without_symbols
 
 CODE = """
 import sys
@@ -43,6 +43,17 @@ def test_a_function_is_compiled_when_it_is_called_first(monkeypatch):
     assert twice.__doc__ == "Doubles."
 
 
+def test_shapes_are_broadcast_as_torch_does_it():
+    real = torch.broadcast_shapes
+    for shapes in (((),), ((3, 1), (4,)), ((2, 1, 5), (7, 1), ()), (torch.Size([1]), [6, 1]), (3, (2, 1))):
+        with shapes_without_symbols():
+            found = torch.broadcast_shapes(*shapes)
+        assert isinstance(found, torch.Size) and found == real(*shapes)
+    with pytest.raises(RuntimeError, match="shape"), shapes_without_symbols():
+        torch.broadcast_shapes((2,), (3,))
+    assert torch.broadcast_shapes is real
+
+
 COMMAND = """
 import sys
 sys.argv = {command}
@@ -61,6 +72,13 @@ print(torch._dynamo.config.suppress_errors, "torch._dynamo.eval_frame" in sys.mo
 """
 
 
+@pytest.mark.parametrize(("command", "compiler"), [("/bin/ns-train sl-neus", False), ("ns-train splatfacto", True)])
+def test_commands_of_this_package_go_without_the_compiler_until_somebody_asks(tmp_path, command, compiler):
+    code = [sys.executable, "-W", "ignore", "-c", COMMAND.format(command=command.split())]
+    done = subprocess.run(code, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.splitlines()[-2:] == [f"{compiler} True 0.999", "False True"]
+
+
 @pytest.mark.parametrize(
     ("command", "compiler"),
     [
@@ -75,9 +93,15 @@ print(torch._dynamo.config.suppress_errors, "torch._dynamo.eval_frame" in sys.mo
         (["pytest", "--load-config", "ours.yml"], True),
     ],
 )
-def test_commands_of_this_package_go_without_the_compiler_until_somebody_asks(tmp_path, command, compiler):
+def test_they_are_those_that_train_or_load_a_method_of_this_package(tmp_path, monkeypatch, command, compiler):
+    """Seen by what takes the place of `torch.compile` while nerfstudio is imported."""
     (tmp_path / "ours.yml").write_text("!!python/object:sl_nerfstudio.model.trainer.SLTrainerConfig\n")
     (tmp_path / "other.yml").write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig\n")
-    code = [sys.executable, "-W", "ignore", "-c", COMMAND.format(command=command)]
-    done = subprocess.run(code, capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert done.stdout.splitlines()[-2:] == [f"{compiler} True 0.999", "False True"]
+    monkeypatch.chdir(tmp_path)
+    real = torch.compile
+    begin_imports(command)
+    try:
+        assert (torch.compile is real) == compiler
+    finally:
+        end_imports()
+    assert torch.compile is real

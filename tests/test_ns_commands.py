@@ -30,6 +30,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     from nerfstudio.utils.eval_utils import eval_setup
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 
+import sl_nerfstudio.threads as sl_threads
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
@@ -43,6 +44,8 @@ SMALL = [
     "64",
     "--pipeline.model.sdf.hidden",
     "32",
+    "--pipeline.model.adjustment.other-minima.searches",
+    "0",
     "--pipeline.datamanager.train-num-rays-per-batch",
     "256",
     "--logging.steps-per-log",
@@ -51,6 +54,15 @@ SMALL = [
     "20",
 ]
 STEPS = 40
+
+
+@pytest.fixture(autouse=True)
+def _same_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Opening a run in ns-export sets them for the rest of the process, here of the tests."""
+    count = torch.get_num_threads()
+    monkeypatch.setattr(sl_threads, "_ours", None)
+    yield
+    torch.set_num_threads(count)
 
 
 @pytest.fixture(autouse=True)

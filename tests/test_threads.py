@@ -14,8 +14,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import sl_nerfstudio.threads as sl_threads
 from sl_nerfstudio.compiled import compiled_range
-from sl_nerfstudio.threads import one_library_thread, parallel, results, split, threads
+from sl_nerfstudio.threads import (
+    one_library_thread,
+    one_torch_thread,
+    parallel,
+    results,
+    split,
+    threads,
+    torch_on_one_thread,
+)
 
 
 @contextmanager
@@ -68,15 +77,27 @@ def test_what_a_task_raises_comes_out() -> None:
             parallel(tasks)
 
 
-def test_torch_has_one_thread_and_our_loops_all() -> None:
+@pytest.mark.parametrize("alone", [one_library_thread, one_torch_thread])
+def test_torch_has_one_thread_and_our_loops_all(alone) -> None:
     with torch_threads(3):
-        with pytest.raises(ValueError, match="inside"), one_library_thread():
+        with pytest.raises(ValueError, match="inside"), alone():
             assert (torch.get_num_threads(), threads()) == (1, 3)
-            with one_library_thread():
+            with alone():
                 assert (torch.get_num_threads(), threads()) == (1, 3)
             assert (torch.get_num_threads(), threads()) == (1, 3)
             raise ValueError("inside")
         assert (torch.get_num_threads(), threads()) == (3, 3)
+
+
+def test_torch_may_stay_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sl_threads, "_ours", None)
+    with torch_threads(3):
+        torch_on_one_thread()
+        assert (torch.get_num_threads(), threads()) == (1, 3)
+        torch_on_one_thread()
+        with one_torch_thread():
+            assert (torch.get_num_threads(), threads()) == (1, 3)
+        assert (torch.get_num_threads(), threads()) == (1, 3)
 
 
 def _add_squares(first: int, last: int, values: np.ndarray, out: np.ndarray) -> None:

@@ -9,7 +9,7 @@ rendering.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
@@ -22,30 +22,19 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     farthest_frame,
     shake,
     widened,
+    with_frames_of,
 )
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import away_from_borders, observe, partners, place_anchors
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations, rough_weight
-from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise, unplaced_frames
-from sl_nerfstudio.bundle_adjustment.residuals import (
-    Anchors,
-    Observations,
-    Residuals,
-    linearise,
-    pixels_of_rows,
-    residuals_of,
-    viewing_cosines,
-)
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
+from sl_nerfstudio.bundle_adjustment.relocalisation import unplaced_frames
+from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.robust_kernel import (
-    Kernel,
-    frame_medians,
-    narrowed,
-    noise_of,
-    noise_ratios,
-    useful_distance,
-)
+from sl_nerfstudio.bundle_adjustment.robust_kernel import frame_medians
+from sl_nerfstudio.bundle_adjustment.search.hops import hopped
+from sl_nerfstudio.bundle_adjustment.search.one_search import search
+from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress, kernel_of, problem_of
+from sl_nerfstudio.bundle_adjustment.search.stages import Stage, run_stage
 from sl_nerfstudio.bundle_adjustment.self_calibration import (
     UNKNOWNS,
     SelfCalibration,
@@ -53,12 +42,7 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import (
     with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.geometry.devices import project
-from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread
-
-_NO_GATE = float("inf")  # pixels: no residual is too large to be used
-_FRAMES_MOVE = ("free", "rigid-rig", "known-rig")
 
 
 @dataclass(frozen=True)
@@ -87,79 +71,14 @@ class Adjustment:
 
 
 @dataclass(frozen=True)
-class _Stage:
-    """A part of the adjustment."""
-
-    refine: RefinePoses
-    rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
-    iterations: int  # at most
-
-
-def _stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[_Stage]:
-    """First frames move as a whole; then everything moves; then everything moves with all residuals at full weight.
-
-    While poses are wrong, the thousands of residuals of a frame amount to only a few independent measurements. If they
-    counted as thousands, they would overrule the prior along directions that they hardly determine, and the scene would
-    drift.
-    """
-    rough = max(settings.max_iterations // 2 - settings.rigid_iterations, 1)
-    found = [_Stage(refine, True, rough), _Stage(refine, False, settings.max_iterations)]
-    if refine in ("free", "rigid-rig"):  # a static projector is already in place
-        found.insert(0, _Stage("known-rig", True, settings.rigid_iterations))
-    return found
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """What does not change during an adjustment."""
-
-    start: Rig
-    maps: CoordinateMaps
-    prior: PosePrior
-    settings: AdjustmentSettings
-    generator: torch.Generator
-    partners: Bool[Tensor, "frames frames"]
-    anchors: Anchors  # where they are with the starting poses
-    given_up: tuple[int, ...]  # frames for which an earlier search has found no place
-
-    def observe(self, state: LMState) -> Observations:
-        """A new choice of which frame looks up which anchor."""
-        s = self.settings
-        return observe(
-            state.rig, state.anchors, self.maps, s.frames_per_anchor, _NO_GATE, s.least_cosine, self.generator,
-            self.partners,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Progress:
-    """The current state of an adjustment."""
-
-    state: LMState
-    rows: Observations
-    widths: Float[Tensor, "frames"]  # of each frame's kernel
-    noise: float
-    iterations: int
-
-    @property
-    def pairs(self) -> Int[Tensor, "2 rows"]:
-        """Frame of the anchor, frame that looks it up."""
-        return self.rows.pairs(self.state.anchors)
-
-    def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "_Progress":
-        """The same with some frames at other poses; the kernels of those frames are wide again."""
-        widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
-        return replace(self, state=replace(self.state, rig=rig), widths=widths)
-
-
-@dataclass(frozen=True)
 class Minimum:
     """Where a search has ended; whether it is one of several such places has not been asked yet."""
 
     adjustment: Adjustment  # with the covariance of this minimum alone
-    problem: _Problem
+    problem: Problem
     refine: RefinePoses
-    progress: _Progress | None  # None: there was nothing to search
+    progress: Progress | None  # None: there was nothing to search
+    others: tuple[Progress, ...] = ()  # other ends of searches after rough starts
 
     @one_library_thread()
     def with_other_minima(self) -> Adjustment:
@@ -167,45 +86,7 @@ class Minimum:
         found = self.adjustment
         if self.progress is None:
             return found
-        return replace(
-            found, factor=widened(found.factor, _departures(self.problem, self.refine, self.progress, found))
-        )
-
-
-def _run(problem: _Problem, stage: _Stage, found: _Progress) -> _Progress:
-    """Take the steps of one stage, until nothing moves any more."""
-    start, maps, s = problem.start, problem.maps, problem.settings
-    found = replace(found, state=replace(found.state, damping=s.steps.damping))
-    for iteration in track(range(stage.iterations), "Adjusting poses"):
-        if stage.rough and iteration % s.observe_every == 0:
-            found = replace(found, rows=problem.observe(found.state))
-        linear = linearise(found.state.rig, found.state.anchors, found.rows, maps)
-        r = linear.residuals
-        target = s.kernel.medians * frame_medians(r, found.pairs, start.frames)
-        noise = noise_of(r, float(torch.minimum(found.widths, target).min()), s.kernel)
-        widths = narrowed(found.widths, target, s.kernel).clamp_min(s.kernel.noises * noise)
-        kernel = _kernel(found.state, found.rows, widths, r, problem)
-        per_frame = float(r.cross_valid.sum()) / start.frames
-        weight = rough_weight(noise, per_frame, s.independent_residuals) if stage.rough else noise**2
-        prior = PriorTerm(problem.prior, start, weight)
-        free = free_parameters(stage.refine, found.state.rig)
-        state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free, s.steps)
-        # a step may also be small because it was damped
-        small = state.size < s.steps.converged and (state.damping < 1 or state.size == 0)
-        settled = bool((widths >= s.steps.settled * found.widths).all()) and small
-        found = _Progress(state, found.rows, widths, noise, found.iterations + 1)
-        if settled:
-            break
-    return found
-
-
-def _kernel(
-    state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals, problem: _Problem
-) -> Kernel:
-    """The kernel with the noise that look-ups have by how obliquely a camera sees the surface."""
-    cosine = viewing_cosines(state.rig, state.anchors, rows)
-    ratio = noise_ratios(r, cosine, problem.settings.kernel)
-    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), ratio)
+        return replace(found, factor=widened(found.factor, _departures(self, self.progress)))
 
 
 def adjust(
@@ -232,85 +113,49 @@ def find_minimum(
     settings: AdjustmentSettings,
 ) -> Minimum:
     """Adjust all poses together without asking for other minima, for results that may be replaced by later ones."""
-    problem = _problem(start, maps, prior, settings)
-    first = _search(problem, refine)
+    problem = problem_of(start, maps, prior, settings)
+    first = search(problem, refine)
     if first is None:
         return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
-    found, before = first
-    return Minimum(_result(problem, refine, found, before), problem, refine, found)
+    found, before = hopped(problem, refine, first[0]), first[1]
+    return Minimum(_result(problem, refine, found.best, before), problem, refine, found.best, found.others)
 
 
-def _problem(
-    start: Rig, maps: CoordinateMaps, prior: PosePrior, settings: AdjustmentSettings, given_up: tuple[int, ...] = ()
-) -> _Problem:
-    """A search from `start`, to which the prior belongs."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    per_frame = min(settings.anchors_per_frame, settings.max_anchors // start.frames)
-    per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
-    anchors = place_anchors(start, maps, per_frame, generator)
-    together = partners(start, anchors, maps, settings.partners, settings.least_cosine, generator)
-    return _Problem(start, maps, prior, settings, generator, together, anchors, given_up)
-
-
-def _search(problem: _Problem, refine: RefinePoses) -> tuple[_Progress, float] | None:
-    """All stages, and the median residual at the start; None if there is nothing to search."""
-    start, settings = problem.start, problem.settings
-    state = LMState(start, problem.anchors, settings.steps.damping)
-    rows = problem.observe(state)
-    r = residuals_of(start, state.anchors, rows, problem.maps)
-    if settings.max_iterations < 1 or not r.cross_valid.any():
-        return None
-    before = float(r.cross[r.cross_valid].norm(dim=-1).median())
-    widths = torch.full((start.frames,), float("inf"), dtype=torch.float64)
-    found = _Progress(state, rows, widths, max(before, settings.kernel.noise_floor_px), 0)
-    *rough, last = _stages(refine, settings)
-    for stage in rough:
-        found = _run(problem, stage, found)
-    found = _relocalised(problem, refine, rough[-1], found)
-    found = _away_from_borders(problem, found)
-    found = _run(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
-    return found, before
-
-
-def _away_from_borders(problem: _Problem, found: _Progress) -> _Progress:
-    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual."""
-    state, maps, s = found.state, problem.maps, problem.settings.kernel
-    anchors, rows = state.anchors, found.rows
-    r = residuals_of(state.rig, anchors, rows, maps)
-    own = maps.border_distance(anchors.frame, project(state.rig.camera[anchors.frame], anchors.d_camera)[0])
-    seen = maps.border_distance(rows.frame, pixels_of_rows(state.rig, anchors, rows)[0])
-    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows), s)
-    nearer = torch.minimum(own[rows.anchor], seen)
-    least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
-    if least <= 0:
-        return found
-    anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
-    return replace(found, state=replace(state, anchors=anchors), rows=rows)
-
-
-def _departures(
-    problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment
-) -> list[Float[Tensor, "unknowns"]]:
-    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result.
-
-    Frames without a place are not asked: neither their poses nor their sigma hold.
-    """
+def _departures(minimum: Minimum, found: Progress) -> list[Float[Tensor, "unknowns"]]:
+    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
+    result, refine = minimum.adjustment, minimum.refine
+    problem = replace(minimum.problem, unplaced=result.unplaced)
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
-    asked = s.searches > 0 and refine in _FRAMES_MOVE and result.rig.frames <= s.most_frames
-    if not asked or _leads_back(problem, refine, found, result, generator):
+    if s.searches < 1 or refine not in FRAMES_MOVE or result.rig.frames > s.most_frames:
         return []
-    departures, limits = [], s.worse * _misfits(problem.maps, found)
+    ends = list(minimum.others)
+    if not ends and not _leads_back(problem, refine, found, result, generator):
+        ends = _other_ends(problem, refine, result, generator)
+    limits = s.worse * _misfits(problem.maps, found)
     limits[list(result.unplaced)] = float("inf")
-    for _ in range(s.searches):
+    near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
+    return [_departure(problem, end, result) for end in near]
+
+
+def _other_ends(
+    problem: Problem, refine: RefinePoses, result: Adjustment, generator: torch.Generator
+) -> list[Progress]:
+    """Ends of searches from poses as uncertain as the starting ones, drawn about the result."""
+    ends = []
+    for _ in range(problem.settings.other_minima.searches):
         start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        again = _problem(start, problem.maps, problem.prior, problem.settings, result.unplaced)
-        other = _search(again, refine)
-        if other is not None and not (_misfits(problem.maps, other[0]) > limits).any():
-            departures.append(departure_of(other[0].state.rig, result.rig))
-    return departures
+        again = replace(problem_of(start, problem.maps, problem.prior, problem.settings), unplaced=problem.unplaced)
+        end = search(again, refine)
+        ends += [end[0]] if end else []
+    return ends
 
 
-def _misfits(maps: CoordinateMaps, found: _Progress) -> Float[Tensor, "frames"]:
+def _departure(problem: Problem, other: Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:
+    """From the result to another one, of the frames that are placed."""
+    return departure_of(with_frames_of(other.state.rig, result.rig, problem.unplaced), result.rig)
+
+
+def _misfits(maps: CoordinateMaps, found: Progress) -> Float[Tensor, "frames"]:
     """Median residual of each frame's look-ups."""
     state = found.state
     r = residuals_of(state.rig, state.anchors, found.rows, maps)
@@ -318,45 +163,28 @@ def _misfits(maps: CoordinateMaps, found: _Progress) -> Float[Tensor, "frames"]:
 
 
 def _leads_back(
-    problem: _Problem, refine: RefinePoses, found: _Progress, result: Adjustment, generator: torch.Generator
+    problem: Problem, refine: RefinePoses, found: Progress, result: Adjustment, generator: torch.Generator
 ) -> bool:
     """Whether some steps lead back to the result from poses beside it."""
     s, state = problem.settings.other_minima, found.state
     delta, rho = shake(result.factor, s.shake_sigmas, generator).reshape(2, -1, 6)
     linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
-    kernel = _kernel(state, found.rows, found.widths, linear.residuals, problem)
+    kernel = kernel_of(state, found.rows, found.widths, linear.residuals, problem)
     equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
-    depth = state.anchors.depth + equations.depth_step(torch.cat([delta, rho], 1))
-    steps = problem.settings.steps
-    depth = depth.clamp(steps.least_depth * state.anchors.depth, steps.most_depth * state.anchors.depth)
-    beside = replace(state, rig=state.rig.moved(delta, rho), anchors=state.anchors.at(depth))
-    back = _run(problem, _Stage(refine, False, s.shake_steps), replace(found, state=beside))
-    left = farthest_frame(result.factor, departure_of(back.state.rig, state.rig))
+    step = torch.cat([delta, rho], 1)
+    rig, anchors = moved_together(state.rig, state.anchors, equations, step, problem.settings.steps)
+    beside = replace(state, rig=rig, anchors=anchors)
+    back = run_stage(problem, Stage(refine, False, s.shake_steps), replace(found, state=beside))
+    left = farthest_frame(result.factor, _departure(problem, back, result))
     return left <= s.most_left * s.shake_sigmas
 
 
-def _relocalised(problem: _Problem, refine: RefinePoses, stage: _Stage, found: _Progress) -> _Progress:
-    """Place lost frames again and adjust everything with them, until no frame moves any more."""
-    if refine not in _FRAMES_MOVE:
-        return found
-    for _ in range(problem.settings.relocalisation.rounds):
-        rig = relocalise(
-            found.state.rig, problem.start, problem.maps, problem.prior, refine, found.noise, problem.generator,
-            problem.settings, problem.given_up,
-        )  # fmt: skip
-        moved = (rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
-        if not moved.any():
-            break
-        found = _run(problem, stage, found.at(rig, moved))
-    return found
-
-
-def _result(problem: _Problem, refine: RefinePoses, found: _Progress, before: float) -> Adjustment:
+def _result(problem: Problem, refine: RefinePoses, found: Progress, before: float) -> Adjustment:
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     state, maps = found.state, problem.maps
     linear = linearise(state.rig, state.anchors, found.rows, maps)
     r = linear.residuals
-    kernel = _kernel(state, found.rows, found.widths, r, problem)
+    kernel = kernel_of(state, found.rows, found.widths, r, problem)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)

@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
+from torch import Tensor
+
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.damped_solution import damped_solver
 from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
-from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
+from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PriorTerm
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
@@ -51,13 +54,20 @@ def lm_step(
             damping = damping * settings.tighten
             continue
         step = free.step(x)
-        depth = anchors.depth + equations.depth_step(step)
-        depth = depth.clamp(settings.least_depth * anchors.depth, settings.most_depth * anchors.depth)
-        moved = rig.moved(step[:, :6], step[:, 6:])
-        after = residuals_of(moved, anchors.at(depth), rows, maps)
+        moved, placed = moved_together(rig, anchors, equations, step, settings)
+        after = residuals_of(moved, placed, rows, maps)
         both = r.cross_valid & after.cross_valid
         if kernel.cost(after, both) + prior.energy(moved) < kernel.cost(r, both) + energy:
             damping = max(damping / settings.relax, settings.least_damping)
-            return LMState(moved, anchors.at(depth), damping, float(step.abs().max()))
+            return LMState(moved, placed, damping, float(step.abs().max()))
         damping = damping * settings.tighten
     return LMState(rig, anchors, damping)
+
+
+def moved_together(
+    rig: Rig, anchors: Anchors, equations: NormalEquations, step: Float[Tensor, "frames 12"], settings: StepSettings
+) -> tuple[Rig, Anchors]:
+    """The rig after a step of its poses, and the anchors, whose depths follow within bounds."""
+    depth = anchors.depth + equations.depth_step(step)
+    depth = depth.clamp(settings.least_depth * anchors.depth, settings.most_depth * anchors.depth)
+    return rig.moved(step[:, :6], step[:, 6:]), anchors.at(depth)

@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.loops.poses import departures
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.devices import UNCHANGED, IntrinsicsChange
-from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3, log_so3
+from sl_nerfstudio.geometry.se3 import hat
 
 INTRINSICS_SIGMA = 0.005  # share of the focal length, if the uncertainty of the intrinsics is not stated
 
@@ -51,8 +53,7 @@ class PriorTerm:
 
     def energy(self, rig: Rig) -> float:
         """The term itself; half its gradient is that of `equations`."""
-        squares = torch.cat([_frame_departure(self.start, rig), _relative_departure(self.start, rig)], 1) ** 2
-        return self.weight * float((squares / self.prior.sigma**2).sum())
+        return self.weight * float((_departure(self.start, rig) / self.prior.sigma).square().sum())
 
     def equations(self, rig: Rig) -> tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "frames 12"]]:
         """Information matrix and gradient by the increments (delta, rho) of each frame."""
@@ -74,20 +75,20 @@ def prior_equations(
     H = torch.zeros(n, 12, 12, dtype=torch.float64)
     H[:, :6, :6] = torch.diag_embed(w_frame)
     H[:, 6:, 6:] = JtW @ J
-    g_relative = (JtW @ _relative_departure(start, rig)[..., None]).squeeze(-1)
-    return H, torch.cat([w_frame * _frame_departure(start, rig), g_relative], 1)
+    departure = _departure(start, rig)
+    g_relative = (JtW @ departure[:, 6:, None]).squeeze(-1)
+    return H, torch.cat([w_frame * departure[:, :6], g_relative], 1)
 
 
-def _frame_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
-    """Increment that moves each frame as a whole from its starting pose to its current one."""
-    return log_se3(rig.T_world_camera @ inverse(start.T_world_camera))
+def _departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 12"]:
+    """From the starting poses to the current ones.
 
-
-def _relative_departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 6"]:
-    """Change of each projector's position in camera axes, and its rotation vector."""
-    now, then = rig.T_camera_projector, start.T_camera_projector
-    turn = log_so3(now[:, :3, :3] @ then[:, :3, :3].transpose(1, 2))
-    return torch.cat([now[:, :3, 3] - then[:, :3, 3], turn], 1)
+    Increment of each frame as a whole, change of its projector's position in camera axes, and its rotation vector.
+    """
+    pairs = (start.T_world_camera, rig.T_world_camera, start.T_camera_projector, rig.T_camera_projector)
+    out = np.empty((rig.frames, 12))
+    departures(rig.frames, *(np.ascontiguousarray(T.numpy()) for T in pairs), out)
+    return torch.from_numpy(out)
 
 
 def rough_weight(noise: float, residuals_per_frame: float, independent: float) -> float:

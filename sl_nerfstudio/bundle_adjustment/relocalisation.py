@@ -4,7 +4,6 @@ With all other frames fixed, a frame has six unknowns and thousands of residuals
 a few poses around its current one, it finds the surface that the others agree on.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,10 +41,10 @@ class _Problem:
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
         """Anchors in other frames that may see them; with `around`, only of or in one frame."""
-        return _rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
+        return rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
 
 
-def _rows_of_all(
+def rows_of_all(
     rig: Rig,
     anchors: Anchors,
     maps: CoordinateMaps,
@@ -79,7 +78,7 @@ def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: Adju
     """Frames that see too little of the surface on which the others agree, in order."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = _rows_of_all(rig, anchors, maps, settings, generator)
+    rows = rows_of_all(rig, anchors, maps, settings, generator)
     support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
     wrong = support.isnan() | (support < s.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
@@ -110,14 +109,13 @@ def relocalise(
     noise: float,
     generator: torch.Generator,
     settings: AdjustmentSettings,
-    given_up: Collection[int] = (),
+    never: tuple[int, ...] = (),
 ) -> Rig:
     """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
 
-    So do frames that are `given_up`: an earlier search has found no place for them.
-
     The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
     starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
+    Frames in `never` are not searched for.
     """
     s = settings.relocalisation
     relative_free = refine == "free"
@@ -129,7 +127,7 @@ def relocalise(
     lost = find_lost_frames(support, s)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     enough = least_support(support, s)
-    for k in (k for k in lost.tolist() if k not in given_up):
+    for k in (k for k in lost.tolist() if k not in never):
         best, best_support = rig, float(support[k]) + s.least_gain
         for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)

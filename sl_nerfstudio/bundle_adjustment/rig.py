@@ -10,10 +10,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.loops.poses import inverse_poses, moved_poses
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.devices.models import MODELS
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse
+from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.geometry.similarity import Similarity
 
 
@@ -53,11 +54,14 @@ class Rig:
 
         The poses are those of the cameras, their inverses, and those of the cameras in the axes of their projectors.
         """
-        poses = self.T_world_camera, inverse(self.T_world_camera), inverse(self.T_camera_projector)
         camera, projector = self.camera, self.projector
-        T_world_camera, T_camera_world, T_projector_camera, cameras, light = (
-            np.ascontiguousarray(part.numpy()) for part in (*poses, camera.params, projector.params)
+        T_world_camera, T_camera_projector, cameras, light = (
+            np.ascontiguousarray(part.numpy())
+            for part in (self.T_world_camera, self.T_camera_projector, camera.params, projector.params)
         )
+        T_camera_world, T_projector_camera = np.empty_like(T_world_camera), np.empty_like(T_world_camera)
+        inverse_poses(self.frames, T_world_camera, T_camera_world)
+        inverse_poses(self.frames, T_camera_projector, T_projector_camera)
         codes = MODELS[camera.model].code, MODELS[projector.model].code
         return T_world_camera, T_camera_world, T_projector_camera, cameras, codes[0], light, codes[1]
 
@@ -75,8 +79,8 @@ class Rig:
         """The rig after an increment of every frame as a whole, and of its projector relative to its camera."""
         return replace(
             self,
-            T_world_camera=exp_se3(delta) @ self.T_world_camera,
-            T_camera_projector=exp_se3(rho) @ self.T_camera_projector,
+            T_world_camera=_after(delta, self.T_world_camera),
+            T_camera_projector=_after(rho, self.T_camera_projector),
         )
 
     def scaled(self, scale: float) -> "Rig":
@@ -85,3 +89,10 @@ class Rig:
         camera[:, :3, 3] *= scale
         relative[:, :3, 3] *= scale
         return replace(self, T_world_camera=camera, T_camera_projector=relative)
+
+
+def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """exp(twist) T."""
+    out = np.empty((len(T), 4, 4))
+    moved_poses(len(T), np.ascontiguousarray(T.numpy()), np.ascontiguousarray(twist.numpy()), out)
+    return torch.from_numpy(out)

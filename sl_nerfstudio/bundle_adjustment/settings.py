@@ -135,6 +135,31 @@ class OtherMinimaSettings:
 
 
 @dataclass(frozen=True)
+class HopSettings:
+    """Further searches after rough starts, each begun beside the best end so far."""
+
+    most: int = 12
+    """Most of them; they end as soon as one leads back. 0: none."""
+    patience: int = 4
+    """Searches after the best one that end elsewhere, after which there is no further one."""
+    from_deg: float = 1.5
+    """Uncertainty of the starting rotations, 1 sigma per axis of the median frame in degrees, from which starts count
+    as rough."""
+    size: float = 0.3
+    """Distance from the best end at which a search begins, as a share of the starting poses' uncertainty."""
+    least_gain: float = 0.002
+    """Share by which a search must explain more to replace the best one."""
+    most_left: float = 0.35
+    """Share of that distance within which all frames must return for a search to lead back."""
+    width_noises: float = 4.0
+    """Residual that counts half, as a multiple of the noise."""
+    anchors_per_frame: int = 300
+    """Decoded pixels of each frame that are looked up for that comparison."""
+    most_frames: int = 100
+    """Frames beyond which no further search is made: it takes time, and many frames hold each other."""
+
+
+@dataclass(frozen=True)
 class CrossValidationSettings:
     """The decision whether adjusted poses (or intrinsics) are kept, based on held-out pixels."""
 
@@ -205,6 +230,8 @@ class AdjustmentSettings:
     """Levenberg-Marquardt steps."""
     relocalisation: RelocalisationSettings = field(default_factory=RelocalisationSettings)
     """Search for frames that ended in a wrong minimum."""
+    hops: HopSettings = field(default_factory=HopSettings)
+    """Further searches after rough starts."""
     other_minima: OtherMinimaSettings = field(default_factory=OtherMinimaSettings)
     """Other poses that agree as well."""
     cross_validation: CrossValidationSettings = field(default_factory=CrossValidationSettings)

@@ -41,8 +41,7 @@ class IndexedMesh:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.vertices, self.faces = mesh.vertices, mesh.faces
-        used = self.vertices[np.unique(self.faces)]
-        self.lower, self.upper = used.min(0), used.max(0)
+        self.lower, self.upper = mesh.bounds()
         self.centre = (self.lower + self.upper) / 2
         self.diagonal = float(np.linalg.norm(self.upper - self.lower))
         self._scale = 1 / max(self.diagonal, 1e-300)
@@ -75,6 +74,11 @@ class IndexedMesh:
         """Twice the area times the unit normal of each triangle."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return np.cross(b - a, c - a)
+
+    @cached_property
+    def vertex_normals(self) -> Float[ndarray, "v 3"]:
+        """Unit normals of the vertices."""
+        return self.mesh.vertex_normals()
 
     @cached_property
     def area(self) -> float:

@@ -135,7 +135,8 @@ def typical_sigma(
         return None
     ends = np.random.default_rng(0).choice(seen, (_TYPICAL, 2))
     length = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
-    long = length > _LONG * IndexedMesh(mesh).diagonal
+    lower, upper = mesh.bounds()
+    long = length > _LONG * float(np.linalg.norm(upper - lower))
     if not long.any():
         return None
     found = length_sigma(mesh, quality.sigma_independent, ends[long], scan, poses, joint)

@@ -64,48 +64,17 @@ def exp_so3(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 def log_so3(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotation vector of `R`, with an angle in [0, pi]; via the unit quaternion, which is accurate near 0 and pi."""
-    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    candidates = torch.stack(  # each row is 4 q_i * q for one i; the one with the largest q_i is stable
-        [
-            torch.stack(
-                [
-                    1 + m00 + m11 + m22,
-                    R[..., 2, 1] - R[..., 1, 2],
-                    R[..., 0, 2] - R[..., 2, 0],
-                    R[..., 1, 0] - R[..., 0, 1],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    R[..., 2, 1] - R[..., 1, 2],
-                    1 + m00 - m11 - m22,
-                    R[..., 1, 0] + R[..., 0, 1],
-                    R[..., 0, 2] + R[..., 2, 0],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    R[..., 0, 2] - R[..., 2, 0],
-                    R[..., 1, 0] + R[..., 0, 1],
-                    1 - m00 + m11 - m22,
-                    R[..., 2, 1] + R[..., 1, 2],
-                ],
-                -1,
-            ),
-            torch.stack(
-                [
-                    R[..., 1, 0] - R[..., 0, 1],
-                    R[..., 0, 2] + R[..., 2, 0],
-                    R[..., 2, 1] + R[..., 1, 2],
-                    1 - m00 - m11 + m22,
-                ],
-                -1,
-            ),
-        ],
-        dim=-2,
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = R.flatten(-2).unbind(-1)
+    x, y, z = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m10 + m01, m02 + m20, m21 + m12
+    one_m00, one_less_m00 = 1 + m00, 1 - m00
+    rows = (  # each is 4 q_i * q for one i; the one with the largest q_i is stable
+        (one_m00 + m11 + m22, x, y, z),
+        (x, one_m00 - m11 - m22, xy, xz),
+        (y, xy, one_less_m00 + m11 - m22, yz),
+        (z, xz, yz, one_less_m00 - m11 + m22),
     )
+    candidates = torch.stack([entry for row in rows for entry in row], -1).unflatten(-1, (4, 4))
     best = torch.diagonal(candidates, dim1=-2, dim2=-1).argmax(-1)
     index = best[..., None, None].expand(*best.shape, 1, 4)
     q = torch.gather(candidates, -2, index).squeeze(-2)

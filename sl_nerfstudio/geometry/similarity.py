@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class Similarity:
         out[:3, :3] = self.scale * self.R
         out[:3, 3] = self.t
         return out
+
+
+def angle_deg(R: Float[ndarray, "3 3"]) -> float:
+    """Angle of a rotation, in degrees."""
+    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
 
 
 def centred_on(points: Float[ndarray, "n 3"], edge_percent: float) -> Similarity:

@@ -36,6 +36,15 @@ class Mesh:
         used[self.faces[chosen]] = True
         return used
 
+    def bounds(self) -> tuple[Float64[ndarray, "3"], Float64[ndarray, "3"]]:
+        """Lowest and highest corner of the box around the vertices that triangles use; there must be one."""
+        used = self.used_vertices()
+        return used.min(0), used.max(0)
+
+    def used_vertices(self) -> Float64[ndarray, "used 3"]:
+        """The vertices that triangles use."""
+        return self.vertices[self.corners_of(np.ones(len(self.faces), dtype=bool))]
+
     def edges(self) -> Int64[ndarray, "e 2"]:
         """The three sides of every triangle, in its direction: inner edges occur twice."""
         return np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])

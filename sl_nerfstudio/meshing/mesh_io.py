@@ -9,14 +9,18 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.files.atomic import write_atomic
-from sl_nerfstudio.meshing.formats.encode import encode_glb, encode_mtl, encode_obj, encode_stl
+from sl_nerfstudio.meshing.formats.encode import encode_mtl, encode_obj, encode_stl
 from sl_nerfstudio.meshing.formats.file_frame import file_from_world
+from sl_nerfstudio.meshing.formats.glb import encode_glb
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.ply import encode_ply
+from sl_nerfstudio.meshing.texture.texture import Texture
 from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.scan.file_error import FileError, check_file
+from sl_nerfstudio.scan.images import encode_png
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb")
+TEXTURE_SUFFIXES = (".glb", ".obj")
 MAX_TRIANGLES = 200_000_000  # about 10 GB once read
 
 
@@ -32,21 +36,31 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def files_of(path: Path) -> tuple[Path, ...]:
-    """All files that `write_mesh` writes for a path: OBJ has a second one for its material."""
-    return (path, path.with_suffix(".mtl")) if path.suffix.lower() == ".obj" else (path,)
+def files_of(path: Path, textured: bool = False) -> tuple[Path, ...]:
+    """All files that `write_mesh` writes for a path: OBJ has a second one for its material, a third for its texture."""
+    if path.suffix.lower() != ".obj":
+        return (path,)
+    return (path, path.with_suffix(".mtl"), *([path.with_suffix(".png")] if textured else []))
 
 
-def write_mesh(path: Path, mesh: Mesh, properties: VertexProperties | None = None, units: str = "arbitrary") -> None:
+def write_mesh(
+    path: Path,
+    mesh: Mesh,
+    properties: VertexProperties | None = None,
+    units: str = "arbitrary",
+    texture: Texture | None = None,
+) -> None:
     """Write a mesh of a scan's world, whose lengths are in `units`; each file appears complete or not at all.
 
     PLY keeps float64 and the scan's unit and axes, and holds normals and all `properties`. The others hold the colours
-    of `properties` alone (STL: nothing), and are rounded: OBJ, with a .mtl beside it, to 8 decimals, STL and GLB to
-    float32. STL, without shared vertices, is in millimetres, GLB in metres with y up: see `file_from_world`. Raises
-    UserError for an unknown suffix, a mesh without triangles, a vertex that is not a number, or a place where writing
-    is impossible.
+    of `properties` alone (STL: nothing) or the `texture` in their place, and are rounded: OBJ, with .mtl and .png
+    beside it, to 8 decimals, STL and GLB to float32. STL, without shared vertices, is in millimetres, GLB in metres
+    with y up: see `file_from_world`. Raises UserError for an unknown suffix, a mesh without triangles, a vertex that is
+    not a number, or a place where writing is impossible; ValueError for a texture where the format has none.
     """
     suffix = check_suffix(path)
+    if texture is not None and suffix not in TEXTURE_SUFFIXES:
+        raise ValueError(f"{suffix} files have no texture")
     if len(mesh.faces) == 0:
         raise UserError(
             f"{path}: not written, the mesh has no triangles\n"
@@ -64,13 +78,15 @@ def write_mesh(path: Path, mesh: Mesh, properties: VertexProperties | None = Non
     if suffix == ".ply":
         write_atomic(path, encode_ply(placed, properties, units))
     elif suffix == ".obj":
-        _, material = files_of(path)
-        write_atomic(material, encode_mtl(colour is not None))
-        write_atomic(path, encode_obj(placed, colour, material.name))
+        _, material, *image = files_of(path, texture is not None)
+        if texture is not None:
+            write_atomic(image[0], encode_png(texture.image))
+        write_atomic(material, encode_mtl(colour is not None, image[0].name if image else None))
+        write_atomic(path, encode_obj(placed, colour, None if texture is None else texture.charts, material.name))
     elif suffix == ".stl":
         write_atomic(path, encode_stl(placed, "arbitrary units" if units == "arbitrary" else "mm"))
     else:
-        write_atomic(path, encode_glb(placed, colour))
+        write_atomic(path, encode_glb(placed, colour, texture))
 
 
 def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
@@ -78,9 +94,9 @@ def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
 
     GLB, which is in metres with y up, and STL, in millimetres, are taken into a world with z up whose lengths are in
     `units`; one of their units is one arbitrary unit. PLY and OBJ stay as they are.
-    Vertices at the same place are merged only in STL, which cannot share them. Raises UserError if the file is missing,
-    empty, damaged, too large, without triangles, refers to vertices that do not exist, or holds values that are not
-    numbers.
+    Vertices at the same place are merged only in STL, which cannot share them, and where there is a texture: charts do
+    not share them. Raises UserError if the file is missing, empty, damaged, too large, without triangles, refers to
+    vertices that do not exist, or holds values that are not numbers.
     """
     suffix = check_suffix(path)
     check_file(path)
@@ -124,7 +140,7 @@ def _load(path: Path, suffix: str) -> tuple[ndarray, ndarray]:
     offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])
     vertices = np.concatenate([np.asarray(p.vertices) for p in parts])
     faces = np.concatenate([np.asarray(p.faces) + o for p, o in zip(parts, offsets[:-1], strict=True)])
-    if suffix == ".stl":
+    if suffix == ".stl" or any(getattr(p.visual, "uv", None) is not None for p in parts):
         vertices, index = np.unique(vertices, axis=0, return_inverse=True)
         faces = index.reshape(-1)[faces]
     return vertices, faces

@@ -1,6 +1,7 @@
-"""Colours of vertices, from captures that were also taken without the pattern."""
+"""Colours of a surface, from captures that were also taken without the pattern."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
@@ -14,52 +15,88 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_properties import GREY
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan.types import Frame, Scan
+from sl_nerfstudio.threads import results, threads
 
 _LEAST_COSINE = 0.2
 """Between normal and line of sight: flatter views (beyond 78 degrees) mix in what is behind the edge of the object."""
 
 
 @dataclass(frozen=True)
-class VertexColours:
-    """Colours of a mesh's vertices."""
+class Colours:
+    """Colours of points of a surface."""
 
-    rgb: UInt8[ndarray, "v 3"]  # sRGB; GREY where no picture shows the vertex
-    seen: Bool[ndarray, "v"]  # by at least one picture
+    rgb: UInt8[ndarray, "n 3"]  # sRGB; GREY where no picture shows the point
+    seen: Bool[ndarray, "n"]  # by at least one picture
     pictures: int
 
 
-def vertex_colours(mesh: Mesh, scan: Scan, poses: DevicePoses) -> VertexColours | None:
-    """The mean over all pictures that see a vertex, weighted by the squared cosine of the viewing angle.
+def vertex_colours(mesh: Mesh, scan: Scan, poses: DevicePoses) -> Colours | None:
+    """Colours of all vertices; None if no frame of the scan has a picture (`sl_color_path`)."""
+    if not has_pictures(scan):
+        return None
+    return point_colours(mesh.vertices, mesh.vertex_normals(), Occluder(mesh), scan, poses)
 
-    A picture sees a vertex that faces its camera, is inside the image, and that the mesh hides not. None if no frame
-    of the scan has a picture (`sl_color_path`). Exposure and white balance count as the same in all pictures.
+
+def has_pictures(scan: Scan) -> bool:
+    """Whether some frame was also captured without the pattern."""
+    return any(frame.color_path is not None for frame in scan.frames)
+
+
+def point_colours(
+    points: Float64[ndarray, "n 3"],
+    normals: Float64[ndarray, "n 3"],
+    occluder: Occluder,
+    scan: Scan,
+    poses: DevicePoses,
+    task: str = "colours of the surface",
+) -> Colours:
+    """The mean over all pictures that see a point, weighted by the squared cosine of the viewing angle.
+
+    A picture sees a point of the occluder's mesh that faces its camera, is inside the image, and that the mesh hides
+    not. Exposure and white balance count as the same in all pictures. `task` names the progress. As many pictures are
+    in memory at a time as there are threads.
     """
     pictures = [(k, frame) for k, frame in enumerate(scan.frames) if frame.color_path is not None]
-    if not pictures:
-        return None
-    occluder, normals = Occluder(mesh), mesh.vertex_normals()
-    total, weight = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
-    for k, frame in track(pictures, "colours of the surface"):
-        vertex, cosine, uv = _seen(mesh, normals, occluder, frame, poses.T_world_camera[k])
-        total[vertex] += cosine[:, None] ** 2 * _look_up(frame, uv)
-        weight[vertex] += cosine**2
+    total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
+    for first in track(range(0, len(pictures), threads()), task):
+        some = pictures[first : first + threads()]
+        looks = [partial(_look, points, normals, occluder, frame, poses.T_world_camera[k]) for k, frame in some]
+        for index, square, rgb in results(looks):
+            total[index] += square[:, None] * rgb
+            weight[index] += square
     seen = weight > 0
     rgb = np.where(seen[:, None], total / np.where(seen, weight, 1.0)[:, None] * 255, GREY)
-    return VertexColours(np.round(rgb).clip(0, 255).astype(np.uint8), seen, len(pictures))
+    return Colours(np.round(rgb).clip(0, 255).astype(np.uint8), seen, len(pictures))
+
+
+def _look(
+    points: Float64[ndarray, "n 3"],
+    normals: Float64[ndarray, "n 3"],
+    occluder: Occluder,
+    frame: Frame,
+    T_world_camera: Float64[ndarray, "4 4"],
+) -> tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 3"]]:
+    """Points that a picture sees, their squared cosines, and their colours in [0, 1]."""
+    index, cosine, uv = _seen(points, normals, occluder, frame, T_world_camera)
+    return index, cosine**2, _look_up(frame, uv)
 
 
 def _seen(
-    mesh: Mesh, normals: Float64[ndarray, "v 3"], occluder: Occluder, frame: Frame, T_world_camera: ndarray
-) -> tuple[Int64[ndarray, "n"], Float64[ndarray, "n"], Float64[ndarray, "n 2"]]:
-    """Vertices that the camera sees, cosine of the angle between normal and line of sight, and their pixels."""
+    points: Float64[ndarray, "n 3"],
+    normals: Float64[ndarray, "n 3"],
+    occluder: Occluder,
+    frame: Frame,
+    T_world_camera: Float64[ndarray, "4 4"],
+) -> tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 2"]]:
+    """Points that the camera sees, cosine of the angle between normal and line of sight, and their pixels."""
     eye = T_world_camera[:3, 3]
-    way = eye - mesh.vertices
+    way = eye - points
     cosine = np.einsum("vi,vi->v", way, normals) / np.linalg.norm(way, axis=1)
-    vertex = np.flatnonzero(cosine > _LEAST_COSINE)
-    uv, inside = world_pixels(frame.camera, T_world_camera, mesh.vertices[vertex])
-    vertex, uv = vertex[inside], uv[inside]
-    free = ~occluder.hidden(mesh.vertices[vertex], normals[vertex], eye)
-    return vertex[free], cosine[vertex[free]], uv[free]
+    index = np.flatnonzero(cosine > _LEAST_COSINE)
+    uv, inside = world_pixels(frame.camera, T_world_camera, points[index])
+    index, uv = index[inside], uv[inside]
+    free = ~occluder.hidden(points[index], normals[index], eye)
+    return index[free], cosine[index[free]], uv[free]
 
 
 def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:

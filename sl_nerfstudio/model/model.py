@@ -40,6 +40,7 @@ from sl_nerfstudio.rendering.renderer import Renderer
 from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at, surface_width_at
 from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.threads import one_torch_thread
 
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
 
@@ -279,13 +280,14 @@ class SLModel(Model):
         return outputs
 
     @torch.no_grad()
+    @one_torch_thread()
     def _eval_outputs(self, bundle: RayBundle) -> dict[str, Tensor]:
         origins, directions, views = self.corrected_rays(bundle)
         T_camera, T_projector = self.poses_scene()
         ends = None
         if bundle.nears is not None and bundle.fars is not None:  # of a texture, or cropped
             ends = (bundle.nears[:, 0], bundle.fars[:, 0])
-        outputs = ray_outputs(self.renderer, origins, directions, T_projector.float()[views], ends)
+        outputs = ray_outputs(self.renderer, origins, directions, T_projector.float(), views, ends)
         if "sl_uv" not in (bundle.metadata or {}):  # batches of single pixels hold their measured coordinates
             depth = torch.where(outputs["accumulation"] > 0.5, outputs["depth"], 0.0)
             measured = self.measured.at(origins + depth * directions, views, inverse(T_camera).float())

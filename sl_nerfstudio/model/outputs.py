@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.geometry.se3 import inverse
@@ -21,19 +21,21 @@ def ray_outputs(
     renderer: Renderer,
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
-    T_scene_projector: Float[Tensor, "rays 4 4"],
+    T_scene_projector: Float[Tensor, "frames 4 4"],
+    view: Int[Tensor, "rays"],
     ends: Ends | None = None,
 ) -> dict[str, Tensor]:
     """Float images of 1 or 3 channels: those that nerfstudio's viewer, renderer and exporters need, and our own.
 
-    `depth` is the distance along the unit ray, in scene units, and 1000 where there is no object. Rays that pass the
-    surface at a distance are not rendered: in most images they are most rays.
+    `view` is the frame whose projector lights each ray. `depth` is the distance along the unit ray, in scene units, and
+    1000 where there is no object. Rays that pass the surface at a distance are not rendered: in most images they are
+    most rays.
     """
     near = renderer.near_surface(origins, directions, ends)
     if near.all():
-        return _rendered(renderer, origins, directions, T_scene_projector, ends)
+        return _rendered(renderer, origins, directions, T_scene_projector, view, ends)
     some_ends = None if ends is None else (ends[0][near], ends[1][near])
-    some = _rendered(renderer, origins[near], directions[near], T_scene_projector[near], some_ends)
+    some = _rendered(renderer, origins[near], directions[near], T_scene_projector, view[near], some_ends)
     return {name: _spread(values, near, _NOTHING.get(name, 0.0)) for name, values in some.items()}
 
 
@@ -47,15 +49,16 @@ def _rendered(
     renderer: Renderer,
     o: Float[Tensor, "rays 3"],
     d: Float[Tensor, "rays 3"],
-    T_scene_projector: Float[Tensor, "rays 4 4"],
+    T_scene_projector: Float[Tensor, "frames 4 4"],
+    view: Int[Tensor, "rays"],
     ends: Ends | None,
 ) -> dict[str, Tensor]:
     samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
-    seen = renderer.render(o, d, inverse(T_scene_projector), samples, jitter=False, ends=ends)
+    seen = renderer.render(o, d, inverse(T_scene_projector)[view], samples, jitter=False, ends=ends)
     p = o + seen.depth[:, None] * d
     normal = torch.nn.functional.normalize(renderer.field.sdf_and_gradient(p)[1].detach(), dim=-1)
     opaque = seen.accumulation > _OPAQUE
-    lit = renderer.is_lit(p, normal, T_scene_projector[:, :3, 3]) & opaque
+    lit = renderer.is_lit(p, normal, T_scene_projector[view, :3, 3]) & opaque
     facing = (-(normal * d).sum(-1)).clamp(0, 1)
     shade = (0.15 + 0.35 * facing + 0.5 * facing * torch.where(lit, seen.pattern, 0.0)) * opaque
     return {

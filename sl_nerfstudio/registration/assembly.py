@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.graph_residuals import Pivots, node_at
 from sl_nerfstudio.registration.increments import log_at
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, quality, support
@@ -295,7 +294,7 @@ class Assembly:
     def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""
         s = self._settings.assembly
-        if np.degrees(Rotation.from_matrix(a.R @ b.R.T).magnitude()) > s.same_rotation_deg:
+        if angle_deg(a.R @ b.R.T) > s.same_rotation_deg:
             return True
         shifts = []
         for k, S in second.items():

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from sl_nerfstudio.geometry.similarity import angle_deg
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.pairs.edge_weights import is_accepted
@@ -100,4 +100,4 @@ class _Choice:
 
 def _angle_deg(a: FrameCloud, b: FrameCloud) -> float:
     R = a.pose.T_camera_projector[:3, :3] @ b.pose.T_camera_projector[:3, :3].T
-    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+    return angle_deg(R)

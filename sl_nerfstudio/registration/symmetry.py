@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
 from sl_nerfstudio.registration.pairs.edge_weights import quality
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
@@ -41,7 +41,7 @@ def symmetric_turns_deg(
             continue
         same_half, contradicting_half = _moved(sides, nodes, _half(turn), settings)
         if contradicting * same_half < contradicting_half * same:
-            turns.append(_angle_deg(turn))
+            turns.append(angle_deg(turn.R))
     return tuple(sorted(turns))
 
 
@@ -60,7 +60,7 @@ def _distinct(
     for turn in _said(edges, solution, settings.edge):
         known = (Similarity.identity(), *found, *(T.inverse() for T in found))
         if abs(np.log(turn.scale)) < s.largest_log_scale and all(
-            _angle_deg(turn @ T.inverse()) > s.same_rotation_deg for T in known
+            angle_deg((turn @ T.inverse()).R) > s.same_rotation_deg for T in known
         ):
             found.append(turn)
     return found
@@ -100,7 +100,3 @@ def _moved(
                 agreeing += float(found.agreeing[0])
                 contradicting += float(found.in_front[0] + pair.agreement.behind * found.behind[0])
     return agreeing, contradicting
-
-
-def _angle_deg(S: Similarity) -> float:
-    return float(np.degrees(Rotation.from_matrix(S.R).magnitude()))

@@ -15,7 +15,8 @@ from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
 from sl_nerfstudio.meshing.formats.point_files import observed_points, write_points
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.mesh_io import write_mesh
-from sl_nerfstudio.meshing.vertex_colour import VertexColours, vertex_colours
+from sl_nerfstudio.meshing.texture.colours import Textured, surface_texture
+from sl_nerfstudio.meshing.vertex_colour import Colours, has_pictures, vertex_colours
 from sl_nerfstudio.meshing.vertex_properties import VertexProperties
 from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
 from sl_nerfstudio.runs.covariance_file import write_covariance
@@ -24,7 +25,7 @@ from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.run_record import training_record
 from sl_nerfstudio.runs.surface import Surface, build_surface
 from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
-from sl_nerfstudio.scan import PoseSigma, write_transforms
+from sl_nerfstudio.scan import PoseSigma, Scan, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.writing import encode_json, sigma_fields
 from sl_nerfstudio.threads import one_library_thread
@@ -38,7 +39,8 @@ class Exported:
     properties: VertexProperties  # of the mesh's vertices
     surface: Surface  # before it was decimated
     decimated: Decimated | None
-    colours: VertexColours | None  # of the surface before it was decimated; None: no picture without the pattern
+    colours: Colours | None  # of the surface before it was decimated; None: no picture without the pattern
+    textured: Textured | None  # None: no texture was asked for
     points: int  # in the point cloud
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
     writing_seconds: float  # everything but the extraction
@@ -57,6 +59,7 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     """
     model, start = run.model, time.perf_counter()
     require_possible_files(settings, model)
+    _require_pictures(settings, model.scan)
     surface = build_surface(model, settings)
     mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()
     joint = model.joint_covariance()
@@ -69,19 +72,33 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
         points = write_points(settings.points, *observed_points(mesh, properties), scan.units)
     if settings.cameras or settings.trajectories:
         write_device_files(settings, model, mesh, properties.colour)
-    decimated = None
+    whole, decimated, textured = mesh, None, None
     if settings.target_faces is not None:
         decimated = decimate(mesh, settings.target_faces)
         mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
     if settings.watertight:
         _require_closed(mesh, settings)
-    write_mesh(settings.mesh, mesh, properties, scan.units)
+    if settings.texture is not None:
+        textured = surface_texture(mesh, settings.texture, whole, scan, poses)
+    write_mesh(settings.mesh, mesh, properties, scan.units, None if textured is None else textured.texture)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
         write_covariance(settings.pose_folder, scan, joint)
         write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
     seconds = time.perf_counter() - start - surface.extraction_seconds
-    return Exported(mesh, properties, surface, decimated, colours, points, model.pose_sigma(), seconds)
+    return Exported(mesh, properties, surface, decimated, colours, textured, points, model.pose_sigma(), seconds)
+
+
+def _require_pictures(settings: ExportSettings, scan: Scan) -> None:
+    if settings.texture is None or has_pictures(scan):
+        return
+    raise UserError(
+        f"--texture {settings.texture}: no frame of {scan.root} has a picture without the pattern\n"
+        "    cause:  a texture needs colours, and captures under the pattern have none\n"
+        "    remedy: photograph frames once more from the same place in even light, without the pattern, name these\n"
+        '            pictures in transforms.json ("sl_color_path": "color/NAME.png" in the frame) and train again;\n'
+        "            or leave --texture out"
+    )
 
 
 def _require_closed(mesh: Mesh, settings: ExportSettings) -> None:

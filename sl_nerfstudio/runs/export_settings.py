@@ -24,6 +24,7 @@ class ExportSettings:
     largest_hole: float | None = None  # holes up to this size are closed by the field; None: they stay open
     watertight: bool = False  # a closed solid
     target_faces: int | None = None
+    texture: int | None = None  # side of the texture in pixels
     points: Path | None = None  # point cloud of what was observed
     cameras: tuple[CameraKind, ...] = ()
     trajectories: tuple[TrajectoryKind, ...] = ()

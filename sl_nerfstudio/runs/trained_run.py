@@ -19,7 +19,7 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.late_compiler import compiler_on_demand
+from sl_nerfstudio.late_compiler import compiler_on_demand, shapes_without_symbols
 from sl_nerfstudio.model.training.checkpoints import checkpoints_in, read_checkpoint
 from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
 from sl_nerfstudio.scan import Scan
@@ -110,7 +110,8 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
-    pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
+    with shapes_without_symbols():
+        pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
     _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
     try:
         pipeline.load_pipeline(checkpoint.weights, checkpoint.step)

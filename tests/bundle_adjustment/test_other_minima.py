@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment import relocalisation
+from sl_nerfstudio.bundle_adjustment import adjust as adjustment
 from sl_nerfstudio.bundle_adjustment.adjust import adjust, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
@@ -16,6 +16,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     farthest_frame,
     shake,
     widened,
+    with_frames_of,
 )
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, OtherMinimaSettings
@@ -60,6 +61,30 @@ def test_a_scene_that_holds_its_frames_is_searched_once():
     assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera)
 
 
+def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkeypatch):
+    """It agrees with nothing anywhere, which says nothing about where the others are."""
+    stranger, searches = 2, []
+    maps = noisy_maps(1, 0.3)
+    monkeypatch.setattr(analytic, "BALLS", analytic.BALLS[:1])
+    values, first, last = maps.values.clone(), int(maps.offsets[stranger]), int(maps.offsets[stranger + 1])
+    values[first:last] = noisy_maps(2, 0.3).values[first:last].roll(SIZE // 5, 0)
+    start = disturbed(rig_of(FRAMES, SIZE), 1)
+    search = adjustment.search
+    monkeypatch.setattr(adjustment, "search", lambda *a: searches.append(a) or search(*a))
+    one, several = (adjust(start, replace(maps, values=values), PRIOR, "free", s) for s in (ONE_SEARCH, SETTINGS))
+    assert one.unplaced == several.unplaced == (stranger,)
+    assert len(searches) == 2 and torch.equal(one.factor, several.factor)
+
+
+def test_frames_of_another_rig_are_where_it_has_them():
+    rig, other = rig_of(FRAMES, SIZE), disturbed(rig_of(FRAMES, SIZE), 3, relative=0.5)
+    mixed = with_frames_of(rig, other, (1, 3))
+    for part in ("T_world_camera", "T_camera_projector"):
+        for k in range(FRAMES):
+            assert torch.equal(getattr(mixed, part)[k], getattr(other if k in (1, 3) else rig, part)[k])
+    assert torch.equal(with_frames_of(rig, other, ()).T_world_camera, rig.T_world_camera)
+
+
 def test_the_minimum_alone_is_an_adjustment_without_the_question_which_can_be_asked_later(monkeypatch):
     monkeypatch.setattr(analytic, "BALLS", ())
     true = rig_of(FRAMES, SIZE)
@@ -71,22 +96,6 @@ def test_the_minimum_alone_is_an_adjustment_without_the_question_which_can_be_as
     assert float((asked.sigma / one.sigma)[:, :6].max()) > 1.5
     for found in (minimum.adjustment, asked, several):
         assert torch.equal(found.rig.T_world_camera, one.rig.T_world_camera)
-
-
-def test_a_frame_without_a_place_is_not_searched_for_again_and_spoils_no_search(monkeypatch):
-    """Its image is upside down, so it fits nowhere; the others slide."""
-    monkeypatch.setattr(analytic, "BALLS", ())
-    true, lost, tried = rig_of(FRAMES, SIZE), 2, []
-    generator = torch.Generator().manual_seed(0)
-    images = [image + 0.02 * torch.randn(SIZE, SIZE, 2, generator=generator) for image in images_of(true, SIZE)]
-    images[lost] = images[lost].flip(0)
-    place_one = relocalisation._place_one
-    monkeypatch.setattr(relocalisation, "_place_one", lambda rig, k, *rest: tried.append(k) or place_one(rig, k, *rest))
-    minimum = find_minimum(disturbed(true, 0), CoordinateMaps.of(images), PRIOR, "known-rig", SETTINGS)
-    assert minimum.adjustment.unplaced == (lost,) and set(tried) == {lost}
-    tried.clear()
-    others = minimum.with_other_minima().factor.shape[1] - minimum.adjustment.factor.shape[1]
-    assert tried == [] and others == SETTINGS.other_minima.searches
 
 
 def random_factor(seed: int) -> Tensor:

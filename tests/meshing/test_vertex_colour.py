@@ -1,69 +1,29 @@
 """Colours of vertices: a ball whose colour is a function of the place, in pictures made by formula."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.vertex_colour import vertex_colours
 from sl_nerfstudio.meshing.vertex_properties import GREY
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 
-from .ray_cast_scan import pairs_around, scan_of
-
-RADIUS = 40.0
-SOLID = trimesh.creation.icosphere(4, RADIUS)
-BALL = Mesh(np.asarray(SOLID.vertices, dtype=np.float64), np.asarray(SOLID.faces, dtype=np.int64))
-PINHOLE = Device(w=128, h=112, fl_x=300.0, fl_y=310.0, cx=60.0, cy=58.0)
-
-
-def colour_at(p: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1]: three different gradients, of which none is symmetric in the image."""
-    return 0.5 + p / (2.5 * RADIUS)
-
-
-def picture(T_world_camera: np.ndarray) -> np.ndarray:
-    """What a pinhole camera sees of the ball, by the formulas of the format; black beside it."""
-    x, y = np.meshgrid(np.arange(PINHOLE.w) + 0.5, np.arange(PINHOLE.h) + 0.5)
-    d = np.stack([(x - PINHOLE.cx) / PINHOLE.fl_x, -(y - PINHOLE.cy) / PINHOLE.fl_y, -np.ones_like(x)], -1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T_world_camera[:3, :3].T
-    o = T_world_camera[:3, 3]
-    b, c = d @ o, o @ o - RADIUS**2
-    hit = b * b > c
-    p = o + (-b - np.sqrt(np.where(hit, b * b - c, 0)))[..., None] * d
-    return np.round(np.where(hit[..., None], colour_at(p), 0.0) * 255).astype(np.uint8)
+from .coloured_ball import BALL, PINHOLE, angle_cosines, colour_at, coloured_scan, picture
 
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    """Four captures from above, of which the first three were also taken without the pattern."""
-    root: Path = tmp_path_factory.mktemp("colour") / "scan"
-    scan = scan_of(BALL, pairs_around(4, 40), root, camera=PINHOLE)
-    (root / "color").mkdir()
-    frames = list(scan.frames)
-    for k, frame in enumerate(frames[:3]):
-        path = root / f"color/{frame.name}.png"
-        path.write_bytes(encode_png(picture(frame.T_world_camera)))
-        frames[k] = replace(frame, color_path=path)
-    return replace(scan, frames=tuple(frames))
-
-
-def angle_cosines(scan: Scan, frames: range) -> np.ndarray:
-    """Cosine between the ball's normal and the line of sight, of each frame and vertex."""
-    eyes = np.stack([scan.frames[k].T_world_camera[:3, 3] for k in frames])
-    way = eyes[:, None] - BALL.vertices
-    return (way * BALL.vertices).sum(2) / np.linalg.norm(way, axis=2) / RADIUS
+    return coloured_scan(tmp_path_factory.mktemp("colour") / "scan", pictures=3)
 
 
 def test_vertices_have_the_colour_of_their_place_and_unseen_ones_are_grey(scan):
     found = vertex_colours(BALL, scan, scan.poses)
     assert found is not None and found.pictures == 3
-    cosine = angle_cosines(scan, range(3))
+    cosine = angle_cosines(scan, range(3), BALL.vertices)
     clearly = (cosine > 0.3).any(0)
     assert found.seen[clearly].all() and not found.seen[(cosine < 0.1).all(0)].any()
     expected = colour_at(BALL.vertices) * 255
@@ -79,8 +39,8 @@ def test_flat_views_weigh_less(scan):
     first = replace(scan.frames[0], color_path=path)
     found = vertex_colours(BALL, replace(scan, frames=(first, *scan.frames[1:2])), scan.poses[:2])
     assert found is not None
-    squares = angle_cosines(scan, range(2)) ** 2
-    both = (angle_cosines(scan, range(2)) > 0.3).all(0)
+    squares = angle_cosines(scan, range(2), BALL.vertices) ** 2
+    both = (angle_cosines(scan, range(2), BALL.vertices) > 0.3).all(0)
     share = squares[0] / squares.sum(0)
     expected = 255 * (share[:, None] + (1 - share[:, None]) * colour_at(BALL.vertices))
     assert both.sum() > 100 and np.abs(found.rgb[both] - expected[both]).max() < 5

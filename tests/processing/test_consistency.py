@@ -166,8 +166,8 @@ def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_
     """On a plane along which frames slide; a stranger among them makes two adjustments of it."""
     monkeypatch.setattr(analytic, "BALLS", ())
     clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.02)), []
-    search = adjustment._search
-    monkeypatch.setattr(adjustment, "_search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
+    search = adjustment.search
+    monkeypatch.setattr(adjustment, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
     monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
     found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None, ONE_START)
     kept = [k for k in range(FRAMES) if k != MOVED]

@@ -1,11 +1,13 @@
 """The frame stage with a third decoder: decoding, resuming, and frames that fail."""
 
+import io
 import json
 import mmap
 import os
 import shutil
 import sys
 import tempfile
+from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from sl_nerfstudio.processing.kept.records import digest
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.ramps_decoder import RampsDecoder
+from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
 
 pytestmark = pytest.mark.long
@@ -44,11 +47,30 @@ def _captures(scan):
     return find_captures(scan.root / "images", True)
 
 
-def test_a_third_decoder_goes_all_the_way_to_a_scan(monkeypatch, ramps_registered, ramp_scan, tmp_path, capsys):
-    out = tmp_path / "scan"
-    monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(out)])
-    main()
-    assert "decoder ramps" in capsys.readouterr().out
+def _run_command(scan, out, most_in_memory):
+    """The command, with so much memory for clouds; what it said, and whether it wrote clouds to a file."""
+    written, said = [], io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        register_ramps(patch)
+        patch.setattr(large_clouds, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
+        patch.setattr(large_clouds, "largest_in_memory", lambda: most_in_memory)
+        patch.setattr(sys, "argv", ["sl-process", *scan.flags(out)])
+        main()
+    return said.getvalue(), bool(written)
+
+
+@pytest.fixture(scope="module")
+def whole(ramp_scan, tmp_path_factory):
+    """The scan of the command, with all clouds in memory, and what it said."""
+    out = tmp_path_factory.mktemp("whole") / "scan"
+    said, written = _run_command(ramp_scan, out, 10**9)
+    assert not written
+    return out, said
+
+
+def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
+    out, said = whole
+    assert "decoder ramps" in said
     assert check_scan(out) == []
     scan = read_scan(out)
     assert [frame.name for frame in scan.frames] == list(NAMES)
@@ -160,18 +182,11 @@ def _bytes_of(folder):
     return {name: content for name, content in found.items() if name.startswith(("coords", "mask", "transforms"))}
 
 
-def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, ramps_registered, ramp_scan, tmp_path):
+def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whole, ramp_scan, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    written, found = [], []
-    monkeypatch.setattr(large_clouds, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
-    for most in (10**9, 0):
-        monkeypatch.setattr(large_clouds, "largest_in_memory", lambda most=most: most)
-        out = tmp_path / str(most)
-        monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(out)])
-        main()
-        assert bool(written) == (most == 0)
-        found.append(_bytes_of(out))
-    assert len(found[0]) == 2 * len(NAMES) + 1 and found[0] == found[1]
+    assert _run_command(ramp_scan, tmp_path / "scan", 0)[1]
+    found, expected = _bytes_of(tmp_path / "scan"), _bytes_of(whole[0])
+    assert len(found) == 2 * len(NAMES) + 1 and found == expected
 
 
 def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):

@@ -15,6 +15,7 @@ from sl_nerfstudio.processing.summary import left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation, UndecidedProjector
+from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 
 
@@ -32,7 +33,7 @@ def registration(results):
 @pytest.fixture(scope="module")
 def poses(results, registration):
     clouds = clouds_of(results)
-    return find_scan_poses(clouds, registration, adjust_registered(clouds, registration), None, None)
+    return find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
+from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import LAYOUT, NAMES
 
 
@@ -27,7 +28,7 @@ def made(ramp_scan, tmp_path_factory):
     results = [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
     clouds = clouds_of(results)
     registration = register(clouds)
-    poses = find_scan_poses(clouds, registration, adjust_registered(clouds, registration), None, None)
+    poses = find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
     config = ramp_scan.config(tmp_path_factory.mktemp("s"))
     return job, results, poses, summarise(config, "ramps", results, registration, poses)
 

@@ -21,7 +21,10 @@ RIG = rig_of(FRAMES, SIZE)
 
 
 def small(anchors: int, iterations: int) -> RegisteredFramesSettings:
-    return RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations))
+    """Settings without the question whether there are other minima."""
+    alone = replace(AdjustmentSettings().other_minima, searches=0)
+    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=alone)
+    return RegisteredFramesSettings(adjustment=adjustment)
 
 
 @pytest.fixture(scope="module")

@@ -54,7 +54,7 @@ def test_stated_sigma_covers_the_errors(noisy):
 
 def test_the_aspect_is_free_where_left_out_squares_demand_it():
     squeezed = replace(SHIFTED, fl_y=0.9 * SHIFTED.fl_x)
-    found = estimate_projector(frames_of(squeezed, 6, noise=0.1), BLANK, False, 0, QUICK)
+    found = estimate_projector(frames_of(squeezed, 6, noise=0.1, points=200), BLANK, False, 0, QUICK)
     assert not isinstance(found, NoProjector) and LOG_ASPECT in found.free
     assert values_of(found.projector)[LOG_ASPECT] == pytest.approx(np.log(0.9), abs=0.02)
 
@@ -133,7 +133,7 @@ DOUBT = (0.004, 0.003, 0.005)  # of the camera, shares of its focal length
 def test_an_uncertain_camera_makes_the_projector_as_uncertain_as_it_moves_it():
     """Exact coordinates, so that nothing else moves it: within what three values of 1 sigma each can do together."""
     change = DeviceChange(-DOUBT[0], DOUBT[1], DOUBT[2])
-    frames = [replace(f, camera=change.applied(f.camera)) for f in frames_of(SHIFTED, 4)]
+    frames = [replace(f, camera=change.applied(f.camera)) for f in frames_of(SHIFTED, 4, points=200)]
     found = estimate_projector(frames, SHIFTED, True, 0, QUICK, DOUBT)
     certain = estimate_projector(frames, SHIFTED, True, 0, QUICK)
     assert not isinstance(found, NoProjector) and not isinstance(certain, NoProjector)

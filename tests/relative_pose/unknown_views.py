@@ -12,13 +12,13 @@ OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2), (0.2, 1.2, 0.6
 
 
 def frames_of(
-    projector: Device, count: int, noise: float = 0.0, alike: bool = False, relief: float = 1.0
+    projector: Device, count: int, noise: float = 0.0, alike: bool = False, relief: float = 1.0, points: int = 400
 ) -> list[FrameMatches]:
     """`alike`: all frames have the same relative pose and see other surfaces."""
     frames = []
     for k in range(count):
         which = 0 if alike else k
-        seen = view(count=400, seed=k, relief=relief)
+        seen = view(count=points, seed=k, relief=relief)
         T = aimed(OFFSETS[which], projector, 60.0 * which)
         p = (seen.p_camera - T[:3, 3]) @ T[:3, :3]
         uv, lit = project(Intrinsics.of(projector, torch.float64), torch.from_numpy(p))

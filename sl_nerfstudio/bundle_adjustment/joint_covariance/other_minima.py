@@ -47,6 +47,14 @@ def departure_of(other: Rig, rig: Rig) -> Float[Tensor, "unknowns"]:
     return step - G @ torch.linalg.solve(G.T @ G, G.T @ step)
 
 
+def with_frames_of(rig: Rig, other: Rig, frames: Sequence[int]) -> Rig:
+    """The rig with some frames where another has them."""
+    chosen = list(frames)
+    camera, relative = rig.T_world_camera.clone(), rig.T_camera_projector.clone()
+    camera[chosen], relative[chosen] = other.T_world_camera[chosen], other.T_camera_projector[chosen]
+    return replace(rig, T_world_camera=camera, T_camera_projector=relative)
+
+
 def drawn_start(rig: Rig, prior: PosePrior, with_projectors: bool, generator: torch.Generator) -> Rig:
     """Starting poses as uncertain as the stated ones, about `rig`; projectors stay in their frames, or move as well."""
     draw = torch.randn(rig.frames, 12, generator=generator, dtype=torch.float64) * prior.sigma

@@ -8,6 +8,7 @@ from sl_nerfstudio.cli.exporting.config import ExportConfig
 from sl_nerfstudio.errors import UserError
 
 _FEWEST_FACES = 4  # of a closed surface
+_TEXTURE_PX = (64, 8192)  # smallest and largest side; the largest one takes 5 GB of memory
 
 
 def check_outputs(config: ExportConfig) -> None:
@@ -40,8 +41,26 @@ def _values(config: ExportConfig) -> Iterator[str]:
         yield f"--resolution {config.resolution}: at least 2 cells are needed; 256 or 512 is usual"
     if config.target_faces is not None and config.target_faces < _FEWEST_FACES:
         yield f"--target-faces {config.target_faces}: at least {_FEWEST_FACES} triangles are needed; 100000 is usual"
+    yield from _texture(config)
     if config.fill_holes is not None and not 0 < config.fill_holes < float("inf"):
         yield f"--fill-holes {config.fill_holes:g}: must be a length greater than 0, in mm"
+
+
+def _texture(config: ExportConfig) -> Iterator[str]:
+    from sl_nerfstudio.meshing.mesh_io import SUFFIXES, TEXTURE_SUFFIXES
+
+    if config.texture is None:
+        return
+    least, most = _TEXTURE_PX
+    if not least <= config.texture <= most:
+        yield f"--texture {config.texture}: must be {least} to {most}, the side in pixels; 2048 is usual"
+    suffix = config.output.suffix.lower()
+    if suffix in SUFFIXES and suffix not in TEXTURE_SUFFIXES:
+        yield (
+            f"--texture {config.texture}: {suffix} files have no texture\n"
+            f"    remedy: end the name of --output in {' or '.join(TEXTURE_SUFFIXES)}"
+            + (", or leave --texture out: a .ply has the colours of its vertices" if suffix == ".ply" else "")
+        )
 
 
 def _contradictions(config: ExportConfig) -> Iterator[str]:
@@ -75,7 +94,7 @@ def _places(config: ExportConfig) -> Iterator[str]:
         return
     others = [] if config.points is None else [config.points]
     devices = [path for paths in config.settings("arbitrary").device_files.values() for path in paths]
-    files = [*files_of(config.output), *others, *config.pose_files, *devices]
+    files = [*files_of(config.output, config.texture is not None), *others, *config.pose_files, *devices]
     absolute = [path.absolute() for path in files]
     for path in files:
         if absolute.count(path.absolute()) > 1 and path == config.points:

@@ -28,6 +28,8 @@ class ExportConfig:
     """Cells along each side of the scene's box; the time grows with its square."""
     target_faces: int | None = None
     """Number of triangles to which the mesh is reduced (quadric decimation); what that changes is measured."""
+    texture: int | None = None
+    """Side in pixels of a square texture for .glb or .obj, from pictures without the pattern; 2048 is usual."""
     fill_holes: float | None = None
     """Size in mm (without a known length, in the scan's units) of holes that the field's own surface closes."""
     watertight: bool = False
@@ -72,6 +74,7 @@ class ExportConfig:
             largest_hole=None if self.fill_holes is None else self.fill_holes * millimetre,
             watertight=self.watertight,
             target_faces=self.target_faces,
+            texture=self.texture,
             points=self.points,
             cameras=self.cameras,
             trajectories=self.trajectory,

@@ -9,12 +9,14 @@ from sl_nerfstudio.console import command, next_steps, short_path, unit_word
 if TYPE_CHECKING:
     from numpy import ndarray
 
+    from sl_nerfstudio.meshing.texture.colours import Textured
     from sl_nerfstudio.meshing.vertex_quality import VertexQuality
     from sl_nerfstudio.runs.export import Exported
     from sl_nerfstudio.runs.surface import Surface
     from sl_nerfstudio.scan import Scan
 
 _SUSPICIOUS_PX = 3.0
+_LONG_SECONDS = 15.0
 
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
@@ -31,7 +33,7 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         *_pieces(config, surface),
         *_invented(config, exported),
         *_decimated(exported, unit),
-        *_colours(exported),
+        *(_colours(exported) if exported.textured is None else _texture(exported.textured, unit)),
         *_uncertainty(exported.properties.quality, unit),
         *_other_files(config, scan, exported, unit),
     ]
@@ -162,6 +164,19 @@ def _colours(exported: "Exported") -> list[str]:
         return []
     grey = f"; {1 - colours.seen.mean():.1%} of the vertices are in none of them and grey" * (not colours.seen.all())
     return [f"  colours from {colours.pictures} pictures without the pattern{grey}"]
+
+
+def _texture(textured: "Textured", unit: str) -> list[str]:
+    side, charts = len(textured.texture.image), textured.texture.charts.count
+    unseen = f"; {_percent(1 - textured.seen)} of the surface is in none of them and grey" * (textured.seen < 1)
+    lines = [
+        f"  texture of {side} x {side} pixels, {textured.texel:.2g} {unit} each, in {charts:,} charts, from "
+        f"{textured.pictures} pictures without the pattern{unseen}"
+    ]
+    if textured.layout_seconds > _LONG_SECONDS:
+        lines.append(f"    laying the mesh out flat took {textured.layout_seconds:.0f} s; fewer triangles "
+                     "(--target-faces 100000) take less")  # fmt: skip
+    return lines
 
 
 def _uncertainty(quality: "VertexQuality", unit: str) -> list[str]:

@@ -87,7 +87,7 @@ def render(
     """A shaded orthographic picture on white; `colours` are per vertex, None draws it in clay."""
     right, up, back = _view_axes(view)
     h, w = height * supersampling, width * supersampling
-    used = surface.vertices[np.unique(surface.faces)] - surface.centre
+    used = surface.mesh.used_vertices() - surface.centre
     x, y = used @ right, used @ up
     middle = surface.centre + right * (x.max() + x.min()) / 2 + up * (y.max() + y.min()) / 2
     pixel = max(np.ptp(x) / (w * 0.94), np.ptp(y) / (h * 0.94), 1e-12)
@@ -120,7 +120,7 @@ def _shade(
 ) -> Float[ndarray, "n 3"]:
     weights = _barycentric(surface, face, p)
     corners = surface.faces[face]
-    normal = (surface.mesh.vertex_normals()[corners] * weights[..., None]).sum(1)
+    normal = (surface.vertex_normals[corners] * weights[..., None]).sum(1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     outside = normal @ back > 0
     lamp = back + 0.45 * up - 0.35 * right

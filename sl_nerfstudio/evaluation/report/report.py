@@ -1,9 +1,10 @@
 """The report: one HTML file with which a person can judge a scan, without a network."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from sl_nerfstudio.evaluation.report.pictures import ColourScale, camera_views, 
 from sl_nerfstudio.evaluation.report.plot3d import SceneDevices, compressed_script, mesh_figure
 from sl_nerfstudio.evaluation.report.thumbnails import COORDINATE, EPIPOLAR, PATTERN, FrameThumbnails
 from sl_nerfstudio.scan import PoseSigma
+from sl_nerfstudio.threads import results
 
 _TEMPLATE = "report.html.j2"
 
@@ -62,8 +64,7 @@ class SurfacePictures:
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
-    surface = IndexedMesh(report.inputs.mesh)
-    comparisons: list[Comparison] = compare_frames(surface, scan, evaluation.agreement, report.inputs.poses)
+    surface, comparisons, script, drawn = _parts(report)
     values = {
         "report": report,
         "evaluation": evaluation,
@@ -73,24 +74,53 @@ def render_report(report: ReportInput) -> str:
         "truth_units": evaluation.truth_units,
         "judgement": report.judgement,
         "verdict": report.judgement.verdict,
-        "surface": _surface_pictures(report, surface),
+        "surface": surface,
         "comparisons": comparisons,
         "coordinate_scale": COORDINATE,
         "epipolar_scale": EPIPOLAR,
         "pattern_scale": PATTERN,
-        "residual_chart": _residual_chart(evaluation),
+        "residual_chart": drawn.residuals,
         "outliers": _outliers(evaluation),
-        "changes": _pose_changes(report),
+        "changes": drawn.changes,
         "lengths": report.lengths,
         "truth": _truth_rows(evaluation),
-        "training": _training(report.inputs.training),
+        "training": drawn.training,
         "summary": _summary(report),
-        "plotly": compressed_script(),
+        "plotly": script,
     }
     return page(_TEMPLATE, values)
 
 
-def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictures:
+def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "DrawnCharts"]:
+    """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
+    surface = IndexedMesh(report.inputs.mesh)
+    compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
+    tasks: list[Callable[[], Any]] = [
+        partial(_surface_pictures, report, surface), partial(_charts, report), compare, compressed_script,
+    ]  # fmt: skip
+    (pictures, errors), drawn, comparisons, script = results(tasks)
+    if errors is not None and pictures.scale is not None:
+        title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
+        histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
+        pictures = replace(pictures, histogram=histogram)
+    return pictures, comparisons, script, drawn
+
+
+@dataclass(frozen=True)
+class DrawnCharts:
+    """All charts but the histogram, as SVG."""
+
+    residuals: str
+    changes: "PoseChanges | None"
+    training: "TrainingSection | None"
+
+
+def _charts(report: ReportInput) -> DrawnCharts:
+    return DrawnCharts(_residual_chart(report.evaluation), _pose_changes(report), _training(report.inputs.training))
+
+
+def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
+    """The pictures without the histogram, and the errors that it shows."""
     values, scale = _errors(report, surface, surface.vertices)
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
@@ -100,19 +130,9 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> SurfacePictu
     devices = SceneDevices([f.name for f in scan.frames], [f.camera for f in scan.frames], scan.projector)
     sigma = None if quality is None else quality.sigma
     figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses, devices, sigma)
-    histogram = ""
-    if scale is not None:
-        errors, _ = _errors(report, surface, surface.sample(50_000, 0)[0])
-        if errors is not None:
-            title = "Signed distance of the surface from the reference"
-            histogram = charts.histogram(title, units, errors, scale.lower, scale.upper)
-    return SurfacePictures(
-        [data_uri(render(surface, v, colours)) for v in views],
-        figure,
-        scale,
-        [layer.name for layer in layers],
-        histogram,
-    )
+    errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
+    drawn = [data_uri(render(surface, v, colours)) for v in views]
+    return SurfacePictures(drawn, figure, scale, [layer.name for layer in layers], ""), errors
 
 
 def _errors(

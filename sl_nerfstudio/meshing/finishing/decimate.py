@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.meshing.finishing.closest import ClosestSurface
 from sl_nerfstudio.meshing.mesh import Mesh
 
 _BORDERS = 100.0  # weight of errors across borders beside those across the surface: 1 lets jagged borders recede
@@ -40,29 +41,13 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
         after = before.simplify_quadric_decimation(triangles, boundary_weight=_BORDERS)
         fewer = Mesh(np.asarray(after.vertices) * scale + centre, np.asarray(after.triangles).astype(np.int64))
         fewer = fewer.with_faces(np.ones(len(fewer.faces), dtype=bool))
-    distance, triangle, corner = _closest(mesh, fewer.vertices, centre, scale)
-    back, _, _ = _closest(fewer, mesh.vertices, centre, scale)
+    found = ClosestSurface(mesh).closest(fewer.vertices)
+    back = ClosestSurface(fewer).closest(mesh.vertices).distance
     return Decimated(
         fewer,
-        mesh.faces[triangle, corner],
-        distance,
+        mesh.faces[found.triangle, found.weights.argmax(1)],
+        found.distance,
         len(mesh.faces),
         float(np.sqrt((back**2).mean())),
-        float(max(back.max(), distance.max())),
+        float(max(back.max(), found.distance.max())),
     )
-
-
-def _closest(
-    mesh: Mesh, points: Float64[ndarray, "n 3"], centre: Float64[ndarray, "3"], scale: float
-) -> tuple[Float64[ndarray, "n"], Int64[ndarray, "n"], Int64[ndarray, "n"]]:
-    """Distance of points from a surface, the nearest triangle, and which of its corners (0, 1, 2) is nearest."""
-    from sl_nerfstudio.geometry.open3d_core import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    vertices = ((mesh.vertices - centre) / scale).astype(np.float32)
-    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-    found = scene.compute_closest_points(o3d.core.Tensor(((points - centre) / scale).astype(np.float32)))
-    triangle = found["primitive_ids"].numpy().astype(np.int64)
-    u, v = found["primitive_uvs"].numpy().T
-    distance = np.linalg.norm(points - (found["points"].numpy() * scale + centre), axis=1).astype(np.float64)
-    return distance, triangle, np.stack([1 - u - v, u, v], 1).argmax(1)

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ def settings(root: Path, output: Path, name: str = "first", steps: int = STEPS, 
     config.data, config.output_dir, config.timestamp, config.max_num_iterations = root, output, name, steps
     config.steps_per_eval_batch = 3
     config.pipeline.datamanager.train_num_rays_per_batch = 64
-    sdf = config.pipeline.model.sdf
+    model = config.pipeline.model
+    model.adjustment = replace(model.adjustment, other_minima=replace(model.adjustment.other_minima, searches=0))
+    sdf = model.sdf
     sdf.log2_table_size, sdf.max_resolution, sdf.hidden = 10, 64, 16
     for key, value in more.items():
         setattr(config, key, value)

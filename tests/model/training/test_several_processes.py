@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
+from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import comms
 from torch import nn
 
@@ -32,6 +33,7 @@ forked = functools.partial(mp.start_processes, start_method="fork")
 
 @pytest.fixture(autouse=True)
 def _two_cores_and_forks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ns_train, "launch", ns_train.launch)  # what takes its place would start all later trainings
     monkeypatch.setattr(launching.mp, "spawn", forked)
     monkeypatch.setattr("sl_nerfstudio.model.trainer.cores", lambda: 2)
     monkeypatch.setattr(launching, "cores", lambda: 2)  # one thread each: OpenMP teams do not survive a fork

@@ -58,7 +58,7 @@ def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
 
 def test_without_the_flag_the_table_stays(on_a_table, ramps_registered, tmp_path):
     captures, truth = on_a_table
-    result = process(captures.config(tmp_path / "s"), render_processing_report, lambda _: None)
+    result = process(captures.config(tmp_path / "s", no_adjust=True), render_processing_report, lambda _: None)
     assert result.object_only is None
     assert json.loads((tmp_path / "s" / "processing.json").read_text())["object_only"] is None
     frame = read_scan(tmp_path / "s").frames[0]

@@ -93,7 +93,7 @@ def test_a_changed_mask_counts_in_the_next_run_and_needs_no_decoding(ramp_scan, 
 
 
 def test_the_scan_holds_only_what_is_inside_the_masks(ramp_scan, ramps_registered, tmp_path):
-    config = ramp_scan.config(tmp_path / "s", masks=_write(tmp_path / "m", UPPER))
+    config = ramp_scan.config(tmp_path / "s", masks=_write(tmp_path / "m", UPPER), no_adjust=True)
     process(config, lambda *_: "", lambda _: None)
     for frame in read_scan(tmp_path / "s").frames:
         outside = ~UPPER[frame.name]
@@ -104,7 +104,8 @@ def test_the_scan_holds_only_what_is_inside_the_masks(ramp_scan, ramps_registere
 def test_a_frame_whose_mask_holds_nothing_decoded_is_left_out_by_name(ramp_scan, ramps_registered, tmp_path):
     corner = np.zeros(SIZE, dtype=bool)
     corner[:2, :2] = True
-    config = ramp_scan.config(tmp_path / "s", masks=_write(tmp_path / "m", UPPER | {NAMES[3]: corner}))
+    masks = _write(tmp_path / "m", UPPER | {NAMES[3]: corner})
+    config = ramp_scan.config(tmp_path / "s", masks=masks, no_adjust=True)
     result = process(config, lambda *_: "", lambda _: None)
     assert [frame.in_scan for frame in result.frames] == [True, True, True, False]
     assert result.frames[3].stage == "decoding" and "no decoded pixel is inside its mask" in result.frames[3].reason

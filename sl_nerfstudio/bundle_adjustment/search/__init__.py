@@ -1,0 +1,1 @@
+"""The search for the poses with the smallest residuals: stages, lost frames, further searches after rough starts."""

@@ -1,0 +1,47 @@
+"""Rays of a texture's pixels, for `ns-export` with its default `--texture-method nerf`.
+
+nerfstudio compares every pixel of the texture with every triangle of the mesh: with its defaults (2048 x 2048 pixels,
+50,000 triangles) hours without a GPU. Here each triangle is drawn into the texture: a second.
+"""
+
+import numpy as np
+import torch
+import xatlas
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from sl_nerfstudio.meshing.texture.charts import MANY_CHARTS, laid_out
+from sl_nerfstudio.meshing.texture.drawing import draw_triangles
+
+_OUTSIDE = 10.0  # scene units: rays of pixels without a triangle start here and lead away from the scene
+
+Unwrapped = tuple[Float[Tensor, "faces 3 2"], Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]
+
+
+def unwrap_mesh_with_xatlas(
+    vertices: Float[Tensor, "vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    vertex_normals: Float[Tensor, "vertices 3"],
+    num_pixels_per_side: int = 1024,
+    num_faces_per_barycentric_chunk: int = 10,
+) -> Unwrapped:
+    """Stands in for nerfstudio's function of this name (exporter/texture_utils.py, 1.1.5): same arguments, same result.
+
+    Returns the texture coordinates of every face's corners, and origin and unit direction (against the normal) of the
+    ray of every texture pixel. Pixels that no triangle covers get a ray that misses the scene; nerfstudio gives them
+    the ray of some triangle far away. The last argument has no meaning here.
+    """
+    v, f, n = (x.detach().cpu().numpy() for x in (vertices, faces, vertex_normals))
+    area = 0.5 * np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1).sum()
+    charts = laid_out(v, f, n, float(area) / MANY_CHARTS, xatlas.PackOptions())
+    corner_uv = charts.uv[charts.corners]
+    triangle, weights = draw_triangles(corner_uv.astype(np.float64), num_pixels_per_side)
+    covered = triangle >= 0
+    origins = np.full((*triangle.shape, 3), _OUTSIDE, np.float32)
+    directions = np.ones_like(origins)
+    mine = f[triangle[covered]]
+    origins[covered] = (weights[covered][..., None] * v[mine]).sum(1)
+    directions[covered] = -(weights[covered][..., None] * n[mine]).sum(1)
+    rays = [torch.from_numpy(x).to(vertices.device) for x in (origins, directions)]
+    return torch.from_numpy(corner_uv).to(vertices.device), rays[0], F.normalize(rays[1], dim=-1)
