@@ -42,6 +42,14 @@ def signals_as_in_a_terminal() -> Iterator[None]:
     yield
 
 
+@pytest.fixture(autouse=True)
+def threads_of_this_test_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What opens a run for `ns-export` keeps torch on one thread, and our loops on as many as they had, for good."""
+    from sl_nerfstudio import threads
+
+    monkeypatch.setattr(threads, "_ours", threads._ours)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files marked as long come first."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)

@@ -63,12 +63,11 @@ def require_given_poses(
             "    remedy: give poses of other frames, capture these again, or leave --poses out"
         )
     chosen = np.array([name in usable for name in (r.name for r in results)])
-    positions = given.T_world_camera[chosen, :3, 3]
-    if not np.ptp(positions, axis=0).any():
+    if not given.at_different_places(chosen):
         raise UserError(
             f"{path}: the given poses of the registered frames are all at the same place\n"
-            "    cause:  the file holds rotations only\n"
-            "    remedy: give the cameras' positions, too, or leave --poses out"
+            "    cause:  frames with other positions are among those that cannot be used\n"
+            "    remedy: give poses of other frames, capture those again, or leave --poses out"
         )
 
 

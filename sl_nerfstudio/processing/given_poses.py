@@ -29,6 +29,10 @@ class GivenPoses:
         """Frames that have a pose."""
         return np.isfinite(self.T_world_camera).all((1, 2))
 
+    def at_different_places(self, frames: Bool[ndarray, "n"]) -> bool:
+        """Whether some of the frames, all with poses, have more than one position."""
+        return bool(np.ptp(self.T_world_camera[frames, :3, 3], axis=0).any())
+
     def chosen(self, frames: Sequence[bool]) -> "GivenPoses":
         """The poses of some of the frames."""
         return GivenPoses(self.T_world_camera[np.array(frames, dtype=bool)], self.units)
@@ -37,7 +41,7 @@ class GivenPoses:
 def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
     """`transform_matrix` of every frame in the file whose image has the name of a capture.
 
-    Raises FileError if the file is faulty or has poses for fewer than two captures.
+    Raises FileError if the file is faulty, has poses for fewer than two captures, or all at one place.
     """
     document = read_document(path)
     faults = Faults()
@@ -66,6 +70,13 @@ def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
             "has poses for fewer than two of the captures",
             "its images have other names than the captures",
             "frames are matched by the image's name without folder and ending: rename the images in the file",
+        )
+    if not given.at_different_places(given.known):
+        raise FileError(
+            path,
+            "has all captures at the same place",
+            "the file holds rotations only",
+            "give the cameras' positions, too, or leave --poses out",
         )
     return given
 

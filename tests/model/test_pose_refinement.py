@@ -105,7 +105,7 @@ def test_a_rig_in_the_scene_is_the_scan_in_other_units(scan, true):
 def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
     start = disturbed(true, 1)
     found = adjust_scan(with_poses(scan, start), S_SCENE_WORLD, build_samples(scan), "known-rig", PriorConfig(), QUICK)
-    assert found.adjusted and found.cross_validation.after_px < 0.8 * found.cross_validation.before_px
+    assert found.adjusted and found.cross_validation.after_px < 0.82 * found.cross_validation.before_px
     assert poses_message(found).startswith("Poses adjusted: held-out pixels agree to ")
     relative = found.rig.T_camera_projector
     assert torch.allclose(relative, true.T_camera_projector, atol=1e-9)

@@ -8,6 +8,8 @@ import pytest
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.given_poses import GivenPoses, align_to, read_given_poses
 
+AT_PLACE, TURNED = np.eye(4).tolist(), np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+
 
 def _poses(n=3, seed=0):
     rng = np.random.default_rng(seed)
@@ -56,6 +58,11 @@ def test_alignment_recovers_axes_and_scale(count):
     [
         ({"a": np.eye(4).tolist()}, {}, "has poses for fewer than two of the captures"),
         ({"a": (2 * np.eye(4)).tolist(), "b": np.eye(4).tolist()}, {}, "a: transform_matrix"),
+        (
+            {"a": AT_PLACE, "b": TURNED},
+            {},
+            "has all captures at the same place\n.*cause:  the file holds rotations only",
+        ),
         ({"a": np.eye(4).tolist(), "b": np.eye(4).tolist()}, {"units": "furlong"}, "units is 'furlong'"),
     ],
 )

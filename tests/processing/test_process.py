@@ -1,16 +1,20 @@
 """The stages of sl-process, one after the other, and the errors between them."""
 
+import inspect
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.similarity import fit_similarity
-from sl_nerfstudio.processing import consistency
+from sl_nerfstudio.processing import consistency, failures
 from sl_nerfstudio.processing import process as stages
+from sl_nerfstudio.processing.failures import require_given_poses
+from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import frames_by_name, read_inputs
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.registration.known_length import parse_known_length
@@ -190,11 +194,25 @@ def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tm
 
 
 def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
+    """Which is said before anything is decoded."""
     turned = ramp_scan.T_world_camera.copy()
     turned[:, :3, 3] = (1, 2, 3)
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES, turned, strict=True)))
-    with pytest.raises(UserError, match=r"are all at the same place\n.*cause:  the file holds rotations only"):
-        _run(ramp_scan.config(tmp_path / "s", poses=rough))
+    config, log = ramp_scan.config(tmp_path / "s", poses=rough), []
+    with pytest.raises(UserError, match=r"has all captures at the same place\n.*cause:  the file holds rotations only"):
+        process(config, lambda *_: "", log.append)
+    assert log == []
+
+
+def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_path, monkeypatch):
+    T = ramp_scan.T_world_camera.copy()
+    T[:3, :3, 3] = (1, 2, 3)
+    lost = SimpleNamespace(stage="registering", reason="alone")
+    monkeypatch.setattr(failures, "left_out", lambda result, _: lost if result.name == NAMES[3] else None)
+    results = [SimpleNamespace(name=name) for name in NAMES]
+    config = ramp_scan.config(tmp_path / "s", poses=tmp_path / "r.json")
+    with pytest.raises(UserError, match=r"registered frames are all at the same place\n.*frames with other positions"):
+        inspect.unwrap(require_given_poses)(config, GivenPoses(T, "mm"), results, None)
 
 
 @pytest.mark.parametrize("units", ["mm", "arbitrary"])
