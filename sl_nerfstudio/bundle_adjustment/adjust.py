@@ -143,8 +143,7 @@ def _other_ends(
     ends = []
     for _ in range(problem.settings.other_minima.searches):
         start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        again = replace(problem_of(start, problem.maps, problem.prior, problem.settings), unplaced=problem.unplaced)
-        end = search(again, refine)
+        end = search(problem.again(start, start, problem.unplaced), refine)
         ends += [end[0]] if end else []
     return ends
 

@@ -76,19 +76,7 @@ def _look(
     frame: Frame,
     T_world_camera: Float64[ndarray, "4 4"],
 ) -> tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 3"]]:
-    """Points that a picture sees, their squared cosines, and their colours in [0, 1]."""
-    index, cosine, uv = _seen(points, normals, occluder, frame, T_world_camera)
-    return index, cosine**2, _look_up(frame, uv)
-
-
-def _seen(
-    points: Float64[ndarray, "n 3"],
-    normals: Float64[ndarray, "n 3"],
-    occluder: Occluder,
-    frame: Frame,
-    T_world_camera: Float64[ndarray, "4 4"],
-) -> tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 2"]]:
-    """Points that the camera sees, cosine of the angle between normal and line of sight, and their pixels."""
+    """Points that a picture sees, squared cosines between their normals and lines of sight, and colours in [0, 1]."""
     eye = T_world_camera[:3, 3]
     way = eye - points
     cosine = np.einsum("vi,vi->v", way, normals) / np.linalg.norm(way, axis=1)
@@ -96,7 +84,7 @@ def _seen(
     uv, inside = world_pixels(frame.camera, T_world_camera, points[index])
     index, uv = index[inside], uv[inside]
     free = ~occluder.hidden(points[index], normals[index], eye)
-    return index[free], cosine[index[free]], uv[free]
+    return index[free], cosine[index[free]] ** 2, _look_up(frame, uv[free])
 
 
 def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:

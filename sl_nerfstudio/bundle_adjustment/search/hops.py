@@ -5,7 +5,7 @@ them agree with each other and well enough with the rest. Poses drawn about that
 frames that are right return. (Basin hopping: Wales and Doye, J. Phys. Chem. A, 1997; only what is better is kept.)
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.relocalisation import rows_of_all, unplaced
 from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
-from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress, problem_of
+from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.robust import geman_mcclure_cost
 
@@ -40,14 +40,14 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     Frames that agree with no others at the first end are not searched for again.
     """
     s, generator = problem.settings.hops, torch.Generator().manual_seed(problem.settings.seed)
+    possible = refine in FRAMES_MOVE and found.state.rig.frames <= s.most_frames
+    if s.most < 1 or not possible or not is_rough(problem.prior, s.from_deg):
+        return Hopped(found, (), True)
     best, others = found, []
-    if refine not in FRAMES_MOVE or found.state.rig.frames > s.most_frames or not is_rough(problem.prior, s.from_deg):
-        return Hopped(best, (), True)
     unplaced = unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
     for hop in range(s.most):
         begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
-        again = problem_of(problem.start, problem.maps, problem.prior, problem.settings, begin)
-        end = search(replace(again, unplaced=unplaced), refine)
+        end = search(problem.again(problem.start, begin, unplaced), refine)
         if end is None:
             continue
         other = end[0]
@@ -61,7 +61,7 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
             others.append(other)
             if len(others) == s.patience:
                 break
-    return Hopped(best, tuple(others), not s.most)
+    return Hopped(best, tuple(others), False)
 
 
 def _leads_back(other: Rig, best: Rig, problem: Problem) -> bool:

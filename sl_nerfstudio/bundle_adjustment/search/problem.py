@@ -42,6 +42,10 @@ class Problem:
             self.partners,
         )  # fmt: skip
 
+    def again(self, start: Rig, begin: Rig, unplaced: tuple[int, ...]) -> "Problem":
+        """The same problem for another search, in which some frames are not searched for."""
+        return replace(problem_of(start, self.maps, self.prior, self.settings, begin), unplaced=unplaced)
+
 
 @dataclass(frozen=True)
 class Progress:
