@@ -25,9 +25,10 @@ from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consis
 from sl_nerfstudio.processing.projector.estimation import sigma_of_fields
 from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth, frame_cloud
+from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.relative_pose.camera_depth import camera_depth
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
 from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector

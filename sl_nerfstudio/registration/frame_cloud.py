@@ -10,9 +10,9 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.registration.settings import FRAME_CLOUD_DEFAULTS, REGISTRATION_DEFAULTS, FrameCloudSettings
+from sl_nerfstudio.relative_pose.camera_depth import camera_depth_by_pose
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, ray_pairs
-from sl_nerfstudio.relative_pose.sampson import moved
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def frame_cloud(
         uv_camera[keep],
         points,
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
-        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose, settings),
+        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
         alternatives=tuple(
             frame_cloud(name, coords, camera, projector, other, settings)
             for other in pose.alternatives
@@ -109,22 +109,12 @@ def _pose_errors(
     camera: Device,
     projector: Device,
     pose: RelativePose,
-    settings: FrameCloudSettings,
 ) -> Float64[ndarray, "n 5"]:
-    """Changes of depth by one sigma of the pose along each principal axis of its covariance.
-
-    From differences of the rays' closest approach.
-    """
-    rays, _ = ray_pairs(uv_camera, uv_projector, camera, projector)
+    """Changes of depth by one sigma of the pose along each principal axis of its covariance."""
     R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
-    slopes = []
-    h = settings.difference_step_rad
-    for k in range(5):
-        step = h * np.eye(5)[k]
-        ahead, behind = (camera_depth(*moved(R, t, s), rays.d_camera, rays.d_projector) for s in (step, -step))
-        slopes.append((ahead - behind) / (2 * h))
+    slopes = camera_depth_by_pose(R, t, directions(camera, uv_camera), directions(projector, uv_projector))
     variance, axes = np.linalg.eigh(pose.covariance)
-    return np.stack(slopes, 1) @ (axes * np.sqrt(variance.clip(0)))
+    return slopes @ (axes * np.sqrt(variance.clip(0)))
 
 
 def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
@@ -140,21 +130,6 @@ def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
     turns = np.cross(np.eye(3), p[:, None, :]).transpose(0, 2, 1)  # columns e_k x p
     similarity = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns, p[:, :, None]], 2)
     return np.linalg.lstsq(similarity.reshape(-1, 7), moved.reshape(-1, 5), rcond=None)[0]
-
-
-def camera_depth(
-    R: Float64[ndarray, "3 3"],
-    t: Float64[ndarray, "3"],
-    d_camera: Float64[ndarray, "n 3"],
-    d_projector: Float64[ndarray, "n 3"],
-) -> Float64[ndarray, "n"]:
-    """Depth along camera rays where they come nearest to projector rays, each in its device's axes.
-
-    `R`, `t` map from the projector to the camera.
-    """
-    d_p = d_projector @ R.T
-    normal = np.cross(d_camera, d_p)
-    return (np.cross(t, d_p) * normal).sum(-1) / (normal * normal).sum(-1).clip(1e-300)
 
 
 def reliable_points(

@@ -9,8 +9,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, camera_depth
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
+from sl_nerfstudio.relative_pose.camera_depth import camera_depth
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}

@@ -9,8 +9,6 @@ class FrameCloudSettings:
 
     fewest_points: int = 50
     """points that a frame must have"""
-    difference_step_rad: float = 1e-4
-    """step of the differences of depth by the relative pose, radian"""
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ def sampson_jacobian(
     r = a / g
     along = np.einsum("nik,nk->ni", rays.d_projector_by_uv, h / g[:, None])
     p = ((rays.d_projector - r[:, None] * along) / g[:, None]) @ R.T
-    by_b = _cross(p, rays.d_camera) @ np.cross(t, direction_basis(t), axisb=0, axisc=0)
-    return r, np.concatenate([_cross(p, n), by_b], 1)
+    by_b = cross(p, rays.d_camera) @ np.cross(t, direction_basis(t), axisb=0, axisc=0)
+    return r, np.concatenate([cross(p, n), by_b], 1)
 
 
 def _parts(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs) -> tuple[ndarray, ndarray, ndarray]:
@@ -68,7 +68,7 @@ def _length(h: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n"]:
     return np.sqrt((h * h).sum(-1)).clip(1e-300)
 
 
-def _cross(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
-    """As numpy's, which takes twice as long."""
+def cross(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+    """As numpy's, in half of its time."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
