@@ -7,6 +7,7 @@ rendering.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -27,7 +28,7 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.relocalisation import unplaced_frames
+from sl_nerfstudio.bundle_adjustment.relocalisation import frame_support, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import frame_medians
@@ -42,7 +43,7 @@ from sl_nerfstudio.bundle_adjustment.self_calibration import (
     with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.threads import one_library_thread
+from sl_nerfstudio.threads import one_library_thread, results
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def find_minimum(
 def _departures(minimum: Minimum, found: Hopped) -> list[Float[Tensor, "unknowns"]]:
     """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
     result, refine = minimum.adjustment, minimum.refine
-    problem = replace(minimum.problem, unplaced=result.unplaced)
+    problem = minimum.problem
     s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
     if s.searches < 1 or refine not in FRAMES_MOVE or result.rig.frames > s.most_frames:
         return []
@@ -133,24 +134,28 @@ def _departures(minimum: Minimum, found: Hopped) -> list[Float[Tensor, "unknowns
     limits = s.worse * _misfits(problem.maps, found.best)
     limits[list(result.unplaced)] = float("inf")
     near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
-    return [_departure(problem, end, result) for end in near]
+    return [_departure(end, result) for end in near]
 
 
 def _other_ends(
     problem: Problem, refine: RefinePoses, result: Adjustment, generator: torch.Generator
 ) -> list[Progress]:
-    """Ends of searches from poses as uncertain as the starting ones, drawn about the result."""
-    ends = []
-    for _ in range(problem.settings.other_minima.searches):
-        start = drawn_start(result.rig, problem.prior, refine == "free", generator)
-        end = search(problem.again(start, start, problem.unplaced), refine)
-        ends += [end[0]] if end else []
-    return ends
+    """Ends of searches from poses as uncertain as the starting ones, drawn about the result.
+
+    No frame has to agree better with the others than it does there; those that are not placed are not searched for.
+    """
+    support = frame_support(result.rig, problem.maps, result.noise_px, problem.settings)
+    expected = support.nan_to_num() - problem.settings.relocalisation.least_gain
+    expected[list(result.unplaced)] = float("-inf")
+    searches = problem.settings.other_minima.searches
+    starts = [drawn_start(result.rig, problem.prior, refine == "free", generator) for _ in range(searches)]
+    ends = results([partial(search, problem.again(start, start, expected), refine) for start in starts])
+    return [end[0] for end in ends if end]
 
 
-def _departure(problem: Problem, other: Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:
+def _departure(other: Progress, result: Adjustment) -> Float[Tensor, "unknowns"]:
     """From the result to another one, of the frames that are placed."""
-    return departure_of(with_frames_of(other.state.rig, result.rig, problem.unplaced), result.rig)
+    return departure_of(with_frames_of(other.state.rig, result.rig, result.unplaced), result.rig)
 
 
 def _misfits(maps: CoordinateMaps, found: Progress) -> Float[Tensor, "frames"]:
@@ -173,7 +178,7 @@ def _leads_back(
     rig, anchors = moved_together(state.rig, state.anchors, equations, step, problem.settings.steps)
     beside = replace(state, rig=rig, anchors=anchors)
     back = run_stage(problem, Stage(refine, False, s.shake_steps), replace(found, state=beside))
-    left = farthest_frame(result.factor, _departure(problem, back, result))
+    left = farthest_frame(result.factor, _departure(back, result))
     return left <= s.most_left * s.shake_sigmas
 
 
@@ -200,7 +205,7 @@ def _result(problem: Problem, refine: RefinePoses, found: Progress, before: floa
         iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
-        unplaced=unplaced_frames(state.rig, problem.maps, found.noise, problem.settings),
+        unplaced=unplaced_frames(frame_support(state.rig, maps, found.noise, s), s.relocalisation),
     )
 
 

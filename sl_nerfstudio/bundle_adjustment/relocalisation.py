@@ -35,9 +35,9 @@ class _Problem:
     settings: AdjustmentSettings
     projector_steps: int  # after those of the frame as a whole
 
-    def support(self, rig: Rig, rows: Observations) -> Float[Tensor, "frames"]:
+    def support(self, rig: Rig, rows: Observations, anchors: Anchors) -> Float[Tensor, "frames"]:
         """See support_of."""
-        return support_of(rig, self.anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
+        return support_of(rig, anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
 
     def rows(self, rig: Rig, around: int | None = None) -> Observations:
         """Anchors in other frames that may see them; with `around`, only of or in one frame."""
@@ -74,13 +74,19 @@ def support_of(
     return counts[0] / counts[1]
 
 
-def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
-    """Frames that see too little of the surface on which the others agree, in order."""
+def frame_support(
+    rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings
+) -> Float[Tensor, "frames"]:
+    """Share of residuals within the noise of each frame, the same ones of the same poses; NaN where there are none."""
     s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
     rows = rows_of_all(rig, anchors, maps, settings, generator)
-    support = support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
-    wrong = support.isnan() | (support < s.least_share * support.nanmedian())
+    return support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
+
+
+def unplaced_frames(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> tuple[int, ...]:
+    """Frames that see too little of the surface on which the others agree, in order."""
+    wrong = support.isnan() | (support < settings.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
 
 
@@ -100,6 +106,15 @@ def find_lost_frames(support: Float[Tensor, "frames"], settings: RelocalisationS
     return lost[support[lost].argsort(descending=True)]
 
 
+@dataclass(frozen=True)
+class Relocalised:
+    """What a search for lost frames has found."""
+
+    rig: Rig
+    found: tuple[int, ...]  # frames that the others support now
+    in_vain: tuple[int, ...]  # frames that they do not, even where they are supported better than before
+
+
 def relocalise(
     rig: Rig,
     start: Rig,
@@ -109,13 +124,13 @@ def relocalise(
     noise: float,
     generator: torch.Generator,
     settings: AdjustmentSettings,
-    never: tuple[int, ...] = (),
-) -> Rig:
+    expected: Float[Tensor, "frames"],
+) -> Relocalised:
     """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
 
     The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
     starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
-    Frames in `never` are not searched for.
+    A frame with the support that is `expected` of it, or with enough of it, is not searched for.
     """
     s = settings.relocalisation
     relative_free = refine == "free"
@@ -123,11 +138,12 @@ def relocalise(
     problem = _Problem(
         anchors, maps, start, prior, noise, generator, settings, s.projector_steps if relative_free else 0
     )
-    support = problem.support(rig, problem.rows(rig))
+    support = problem.support(rig, problem.rows(rig), anchors)
     lost = find_lost_frames(support, s)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
-    enough = least_support(support, s)
-    for k in (k for k in lost.tolist() if k not in never):
+    searched = [k for k in lost.tolist() if support[k] < expected[k]]
+    for k in searched:
+        enough = min(least_support(support, s), float(expected[k]))
         best, best_support = rig, float(support[k]) + s.least_gain
         for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)
@@ -144,7 +160,7 @@ def relocalise(
                 break
         rig = best
         placed[k] = best_support > enough
-    return rig
+    return Relocalised(rig, tuple(k for k in searched if placed[k]), tuple(k for k in searched if not placed[k]))
 
 
 def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Problem) -> tuple[Rig, float]:
@@ -154,33 +170,46 @@ def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Probl
     allowed = placed.clone()
     allowed[k] = True
     width = torch.full((n,), float("inf"), dtype=torch.float64)
-    state = LMState(rig, problem.anchors, settings.steps.damping)
-    rows = _rows_of(rig, k, allowed, problem)
+    anchors, near = problem.anchors, _near(rig, k, allowed, problem)
+    state = LMState(rig, anchors.chosen(near.number), settings.steps.damping)
     for step in range(s.frame_steps + problem.projector_steps):
         if step and step % s.observe_every == 0:
-            rows = _rows_of(state.rig, k, allowed, problem)
-        linear = linearise(state.rig, state.anchors, rows, problem.maps)
+            anchors = anchors.at(anchors.depth.index_copy(0, near.number, state.anchors.depth))
+            near = _near(state.rig, k, allowed, problem)
+            state = replace(state, anchors=anchors.chosen(near.number))
+        linear = linearise(state.rig, state.anchors, near.rows, problem.maps)
         if not linear.residuals.cross_valid.any():
             return rig, 0.0
-        pair = rows.pairs(problem.anchors)
+        pair = near.rows.pairs(state.anchors)
         target = settings.kernel.medians * float(frame_medians(linear.residuals, pair, n)[k])
         width = narrowed(width, torch.full_like(width, target), settings.kernel)
         width = width.clamp_min(settings.kernel.noises * problem.noise)
         residuals = float(linear.residuals.cross_valid.sum())
         weight = rough_weight(problem.noise, residuals, settings.independent_residuals)
         term = PriorTerm(problem.prior, problem.start, weight)
-        kernel = Kernel(width, problem.anchors.frame, pair)
+        kernel = Kernel(width, state.anchors.frame, pair)
         free = of_one_frame(k, n, with_projector=step >= s.frame_steps)
-        state = lm_step(state, linear, rows, problem.maps, kernel, term, free, settings.steps)
-    support = problem.support(state.rig, _rows_of(state.rig, k, allowed, problem))[k]
+        state = lm_step(state, linear, near.rows, problem.maps, kernel, term, free, settings.steps)
+    near = _near(state.rig, k, allowed, problem)
+    support = problem.support(state.rig, near.rows, problem.anchors.chosen(near.number))[k]
     return state.rig, float(support.nan_to_num())
 
 
-def _rows_of(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], problem: _Problem) -> Observations:
+@dataclass(frozen=True)
+class _Near:
+    """The part of the problem that changes while one frame moves alone."""
+
+    number: Int[Tensor, "n"]  # of its anchors among all, in order: those of the frame and those that are looked up
+    rows: Observations  # anchors of the frame in others, and of others in the frame
+
+
+def _near(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], problem: _Problem) -> _Near:
     """Residuals of frame k with the frames that are allowed; a random subset if there are too many."""
-    rows = problem.rows(rig, k)
-    mine = allowed[problem.anchors.frame[rows.anchor]] & allowed[rows.frame]
-    chosen = mine.nonzero().squeeze(-1)
+    rows, frame = problem.rows(rig, k), problem.anchors.frame
+    chosen = (allowed[frame[rows.anchor]] & allowed[rows.frame]).nonzero().squeeze(-1)
     most = problem.settings.relocalisation.most_residuals
     chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:most]]
-    return Observations(rows.anchor[chosen], rows.frame[chosen])
+    taking_part = frame == k
+    taking_part[rows.anchor[chosen]] = True
+    number = torch.cumsum(taking_part, 0) - 1
+    return _Near(taking_part.nonzero().squeeze(-1), Observations(number[rows.anchor[chosen]], rows.frame[chosen]))

@@ -7,6 +7,7 @@ that surfaces could not tell from a right one stands out.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration, SeparatePoses
+from sl_nerfstudio.threads import one_library_thread, results
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
 from sl_nerfstudio.verdict.scan_agreement import compare_frames
@@ -117,20 +119,25 @@ def _agrees_well(found: _Group, k: int) -> bool:
     return frame.excess <= limits.good_excess and frame.share >= limits.good_share
 
 
+@one_library_thread()
 def _placed(clouds: Sequence[FrameCloud], found: _Group, candidates: Sequence[int]) -> Registration:
     """The registration with those of the frames that can be placed against the adjusted ones."""
     if not candidates:
         return found.registration
-    frames, known = found.minimum.frames, found.registration.registered
-    sharper, kept = [], LargeClouds()
-    for k, cloud in enumerate(clouds):
-        sigma = frames.sigma[k]
-        if known[k] and sigma is not None:
-            direction = sigma.relative_translation / float(frames.poses.baseline[k])
-            turn = float(np.radians(sigma.relative_rotation_deg))
-            cloud = kept.kept(with_relative_pose(cloud, frames.poses.T_camera_projector[k], turn, direction))
-        sharper.append(cloud)
-    return include_left_out(sharper, found.registration, frames.poses, candidates)
+    kept = LargeClouds()
+    sharper = results([partial(_sharper, cloud, found, k, kept) for k, cloud in enumerate(clouds)])
+    return include_left_out(sharper, found.registration, found.minimum.frames.poses, candidates)
+
+
+def _sharper(cloud: FrameCloud, found: _Group, k: int, kept: LargeClouds) -> FrameCloud:
+    """The surface of a frame with its adjusted relative pose, which is known far better than by itself."""
+    frames = found.minimum.frames
+    sigma = frames.sigma[k]
+    if sigma is None or not found.registration.registered[k]:
+        return cloud
+    direction = sigma.relative_translation / float(frames.poses.baseline[k])
+    turn = float(np.radians(sigma.relative_rotation_deg))
+    return kept.kept(with_relative_pose(cloud, frames.poses.T_camera_projector[k], turn, direction))
 
 
 def _without_contradictions(

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.relocalisation import find_lost_frames, relocalise, unplaced_frames
+from sl_nerfstudio.bundle_adjustment.relocalisation import (
+    Relocalised,
+    find_lost_frames,
+    frame_support,
+    relocalise,
+    unplaced_frames,
+)
+from sl_nerfstudio.bundle_adjustment.search import one_search
+from sl_nerfstudio.bundle_adjustment.search.problem import problem_of
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
 
@@ -15,6 +23,7 @@ from .analytic import ExactMaps, rig_of
 
 FRAMES, SIZE, LOST = 6, 100, 2
 SETTINGS = RelocalisationSettings()
+WHATEVER = torch.full((FRAMES,), float("inf"), dtype=torch.float64)
 PRIOR = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in (0.05, radians(3.0), 0.01, radians(0.3))))
 
 
@@ -23,9 +32,12 @@ def true():
     return rig_of(FRAMES, SIZE)
 
 
-def relocalised(rig, true, mode="free"):
+def relocalised(rig, true, mode="free", expected=WHATEVER):
+    """After a search for lost frames."""
     generator = torch.Generator().manual_seed(0)
-    return relocalise(rig, rig, ExactMaps.around(true, SIZE), PRIOR, mode, 0.05, generator, AdjustmentSettings())
+    return relocalise(
+        rig, rig, ExactMaps.around(true, SIZE), PRIOR, mode, 0.05, generator, AdjustmentSettings(), expected
+    )
 
 
 @pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig"])
@@ -33,8 +45,9 @@ def test_a_lost_frame_is_placed_and_no_other_moves(true, mode):
     away = exp_se3(torch.tensor([0.08, -0.05, 0.04, 0.06, 0.05, -0.1], dtype=torch.float64))
     cameras = true.T_world_camera.clone()
     cameras[LOST] = away @ cameras[LOST]
-    rig = relocalised(replace(true, T_world_camera=cameras), true, mode)
-    found = rig.T_world_camera
+    search = relocalised(replace(true, T_world_camera=cameras), true, mode)
+    rig, found = search.rig, search.rig.T_world_camera
+    assert (search.found, search.in_vain) == ((LOST,), ())
     if mode != "free":
         assert torch.equal(rig.T_camera_projector, true.T_camera_projector)
     others = torch.arange(FRAMES) != LOST
@@ -44,7 +57,8 @@ def test_a_lost_frame_is_placed_and_no_other_moves(true, mode):
 
 
 def test_no_frame_is_searched_if_all_agree(true):
-    assert torch.equal(relocalised(true, true).T_world_camera, true.T_world_camera)
+    search = relocalised(true, true)
+    assert torch.equal(search.rig.T_world_camera, true.T_world_camera) and search.found == search.in_vain == ()
 
 
 def test_lost_frames_are_those_with_little_support_best_first():
@@ -56,10 +70,43 @@ def test_lost_frames_are_those_with_little_support_best_first():
     assert find_lost_frames(alike, SETTINGS).tolist() == [2]
 
 
-def test_a_frame_that_is_far_off_is_named_and_no_other(true):
-    maps = ExactMaps.around(true, SIZE)
-    assert unplaced_frames(true, maps, 0.05, AdjustmentSettings()) == ()
+def away(true, degrees: float):
+    """The rig with one frame turned about the scene."""
     cameras = true.T_world_camera.clone()
-    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(60)
+    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(degrees)
     cameras[LOST] = exp_se3(turn) @ cameras[LOST]
-    assert unplaced_frames(replace(true, T_world_camera=cameras), maps, 0.05, AdjustmentSettings()) == (LOST,)
+    return replace(true, T_world_camera=cameras)
+
+
+def support(rig, true):
+    return frame_support(rig, ExactMaps.around(true, SIZE), 0.05, AdjustmentSettings())
+
+
+def test_a_frame_that_is_far_off_is_named_and_no_other(true):
+    assert unplaced_frames(support(true, true), SETTINGS) == ()
+    assert unplaced_frames(support(away(true, 60), true), SETTINGS) == (LOST,)
+
+
+def test_a_frame_that_agrees_as_well_as_is_expected_is_not_searched_for(true):
+    rig = away(true, 5)
+    expected = WHATEVER.clone()
+    expected[LOST] = float(support(rig, true)[LOST]) - 0.01
+    assert relocalised(rig, true, expected=expected) == Relocalised(rig, (), ())
+    expected[LOST] += 0.3
+    assert relocalised(rig, true, expected=expected).found == (LOST,)
+
+
+def test_a_frame_that_was_searched_for_in_vain_is_searched_for_again_only_when_others_were_found(true, monkeypatch):
+    outcomes = [((), (1, 2)), ((3,), (4,)), ((), ())]
+    asked = []
+
+    def searched(rig, *others):
+        asked.append(others[-1].isinf() & (others[-1] < 0))
+        found, in_vain = outcomes[len(asked) - 1]
+        moved = replace(rig, T_world_camera=exp_se3(torch.full((FRAMES, 6), 1e-3)).double() @ rig.T_world_camera)
+        return Relocalised(moved if len(asked) < 3 else rig, found, in_vain)
+
+    monkeypatch.setattr(one_search, "relocalise", searched)
+    problem = problem_of(true, ExactMaps.around(true, SIZE), PRIOR, AdjustmentSettings())
+    one_search.search(problem, "known-rig")
+    assert [skipped.nonzero().squeeze(-1).tolist() for skipped in asked] == [[], [1, 2], [4]]

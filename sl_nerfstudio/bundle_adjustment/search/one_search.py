@@ -52,16 +52,23 @@ def _away_from_borders(problem: Problem, found: Progress) -> Progress:
 
 
 def _relocalised(problem: Problem, refine: RefinePoses, stage: Stage, found: Progress) -> Progress:
-    """Place lost frames again and adjust everything with them, until no frame moves any more."""
+    """Place lost frames again and adjust everything with them, until no frame moves any more.
+
+    A frame that was searched for in vain is searched for again only when others were found.
+    """
     if refine not in FRAMES_MOVE:
         return found
+    expected = problem.expected.clone()
     for _ in range(problem.settings.relocalisation.rounds):
-        rig = relocalise(
+        again = relocalise(
             found.state.rig, problem.start, problem.maps, problem.prior, refine, found.noise, problem.generator,
-            problem.settings, problem.unplaced,
+            problem.settings, expected,
         )  # fmt: skip
-        moved = (rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
+        moved = (again.rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():
             break
-        found = run_stage(problem, stage, found.at(rig, moved))
+        found = run_stage(problem, stage, found.at(again.rig, moved))
+        if again.found:
+            expected = problem.expected.clone()
+        expected[list(again.in_vain)] = float("-inf")
     return found

@@ -32,7 +32,7 @@ class Problem:
     generator: torch.Generator
     partners: Bool[Tensor, "frames frames"]
     anchors: Anchors  # where they are at its beginning
-    unplaced: tuple[int, ...] = ()  # frames that are known to agree with no others: they are not searched for
+    expected: Float[Tensor, "frames"]  # support of each frame with which it is not lost; -inf: it is never searched for
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor."""
@@ -42,9 +42,9 @@ class Problem:
             self.partners,
         )  # fmt: skip
 
-    def again(self, start: Rig, begin: Rig, unplaced: tuple[int, ...]) -> "Problem":
-        """The same problem for another search, in which some frames are not searched for."""
-        return replace(problem_of(start, self.maps, self.prior, self.settings, begin), unplaced=unplaced)
+    def again(self, start: Rig, begin: Rig, expected: Float[Tensor, "frames"]) -> "Problem":
+        """The same problem for another search, which expects that support of each frame."""
+        return replace(problem_of(start, self.maps, self.prior, self.settings, begin), expected=expected)
 
 
 @dataclass(frozen=True)
@@ -87,4 +87,5 @@ def problem_of(
     per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
     anchors = place_anchors(begin, maps, per_frame, generator)
     together = partners(begin, anchors, maps, settings.partners, settings.least_cosine, generator)
-    return Problem(start, begin, maps, prior, settings, generator, together, anchors)
+    whatever = torch.full((start.frames,), float("inf"), dtype=torch.float64)
+    return Problem(start, begin, maps, prior, settings, generator, together, anchors, whatever)
