@@ -6,6 +6,7 @@ torch's own. Callers may be several threads (training, viewer) at once.
 
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,10 +26,13 @@ if torch.get_num_threads() > cores():  # torch does not know of quotas
 keep_freed_memory()
 
 _ours: int | None = None  # threads of our own loops while torch has one
+_this_thread = threading.local()  # `one_of_many`: it works on one of as many tasks as there are threads, or more
 
 
 def threads() -> int:
-    """Number of threads that take part."""
+    """Number of threads that take part; one in a task of `parallel` whose other threads are busy with other tasks."""
+    if getattr(_this_thread, "one_of_many", False):
+        return 1
     return torch.get_num_threads() if _ours is None else _ours
 
 
@@ -79,13 +83,14 @@ def _pool(process: int) -> ThreadPoolExecutor:
 def parallel(tasks: Sequence[Callable[[], object]]) -> None:
     """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises.
 
-    Tasks may themselves call this: a thread that has not begun when the tasks are done is not waited for.
+    Tasks may themselves call this: a thread that has not begun when the tasks are done is not waited for. Where there
+    are enough tasks for all threads, what they call stays on their own thread.
     """
-    queue = itertools.count()
-    others = min(threads(), len(tasks)) - 1
-    futures = [_pool(os.getpid()).submit(_work, tasks, queue) for _ in range(others)]
+    queue, count = itertools.count(), threads()
+    others, many = min(count, len(tasks)) - 1, len(tasks) >= count > 1
+    futures = [_pool(os.getpid()).submit(_work, tasks, queue, many) for _ in range(others)]
     try:
-        _work(tasks, queue)
+        _work(tasks, queue, many)
     finally:
         errors = [future.exception() for future in futures if not future.cancel()]
     for error in errors:
@@ -107,10 +112,15 @@ def _keep(found: dict[int, T], k: int, task: Callable[[], T]) -> None:
     found[k] = task()
 
 
-def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int]) -> None:
+def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: bool) -> None:
     """Run tasks until none is left; `queue` gives each number once, whichever thread asks."""
-    while (i := next(queue)) < len(tasks):
-        tasks[i]()
+    before = getattr(_this_thread, "one_of_many", False)
+    _this_thread.one_of_many = before or many
+    try:
+        while (i := next(queue)) < len(tasks):
+            tasks[i]()
+    finally:
+        _this_thread.one_of_many = before
 
 
 def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:

@@ -15,7 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sl_nerfstudio.threads as sl_threads
+from sl_nerfstudio import side_by_side
 from sl_nerfstudio.compiled import compiled_range
+from sl_nerfstudio.side_by_side import tracked
 from sl_nerfstudio.threads import (
     one_library_thread,
     one_torch_thread,
@@ -122,15 +124,56 @@ def test_results_are_in_the_order_of_the_tasks() -> None:
 
 
 def test_tasks_may_have_tasks_of_their_own() -> None:
-    """More than there are threads, at two levels: a thread that waited for another's place would wait for ever."""
+    """More than there are workers, at two levels: a thread that waited for another's place would wait for ever."""
     many = 4 * (os.cpu_count() or 1)
     found: list[list[int]] = []
-    with torch_threads(many):
+    with torch_threads(many + 1):
         thread = threading.Thread(target=lambda: found.extend(results([partial(row, many, k) for k in range(many)])))
         thread.daemon = True
         thread.start()
         thread.join(20)
     assert found == [[many * k + j for j in range(many)] for k in range(many)]
+
+
+@pytest.mark.parametrize(("tasks", "left"), [(2, 3), (3, 1), (7, 1)])
+def test_what_tasks_call_stays_on_their_thread_where_all_threads_have_one(tasks: int, left: int) -> None:
+    with torch_threads(3):
+        assert results([threads] * tasks) == [left] * tasks
+        inner = results([lambda: results([threading.get_ident] * 20)] * tasks)
+        assert left > 1 or all(len(set(idents)) == 1 for idents in inner)
+        with pytest.raises(ZeroDivisionError):
+            results([partial(divmod, 1, 0)] * tasks)
+        assert threads() == 3
+
+
+def test_a_task_that_is_alone_has_all_threads() -> None:
+    with torch_threads(3):
+        assert results([threads]) == [3]
+    with torch_threads(1):
+        assert results([lambda: results([threads])[0]]) == [1]
+
+
+@pytest.mark.parametrize("used", [1, 3])
+@pytest.mark.parametrize("count", [0, 1, 11, 12, 13, 100])
+def test_tracked_results_are_in_order_and_their_progress_reaches_the_end(
+    monkeypatch: pytest.MonkeyPatch, used: int, count: int
+) -> None:
+    seen = []
+
+    def track(batches: list[list[object]], words: str) -> Iterator[list[object]]:
+        for batch in batches:
+            yield batch
+            seen.append((words, len(batch)))
+
+    monkeypatch.setattr(side_by_side, "track", track)
+    with torch_threads(used):
+        assert tracked([partial(pow, k, 2) for k in range(count)], "squares") == [k * k for k in range(count)]
+    assert sum(n for _, n in seen) == count and {words for words, _ in seen} <= {"squares"}
+
+
+def test_an_error_of_a_piece_of_tracked_work_is_raised() -> None:
+    with pytest.raises(ZeroDivisionError):
+        tracked([partial(divmod, 1, k) for k in range(3)], "quotients")
 
 
 def row(many: int, k: int) -> list[int]:

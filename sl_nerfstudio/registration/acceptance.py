@@ -1,6 +1,7 @@
 """Which frames are registered in the end, why the others are not, and what is uncertain."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -27,6 +28,7 @@ from sl_nerfstudio.registration.result import (
 )
 from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.threads import results
 
 
 def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
@@ -37,7 +39,10 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
     component = _numbers(components, len(names))
     solution = graph.solve(components[0])
     connected = component == 0
-    fitness = np.array([_fitness_of(k, solution, connected, graph) for k in range(len(names))])
+    rngs = graph.rng.spawn(len(names))
+    fitness = np.array(
+        results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
+    )
     registered = connected & (fitness >= settings.acceptance.least_fitness)
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
@@ -83,7 +88,9 @@ def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
     return number
 
 
-def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph) -> float:
+def _fitness_of(
+    k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
+) -> float:
     """Of a frame's points that other frames can judge, the share that agrees."""
     S, settings = solution.S_world_camera[k], graph.settings.pair
     if S is None or not connected[k]:
@@ -94,7 +101,7 @@ def _fitness_of(k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n
         if j == k or other is None or not graph.see_same_side(S, other):
             continue
         maps = graph.maps[k], graph.maps[j]
-        found = agreement_at(maps, other.inverse() @ S, graph.rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
+        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
         agreeing += found.agreeing[0]
         judged += found.judged[0]
     return agreeing / judged if judged else 0.0

@@ -5,6 +5,7 @@ A wrong pose of the projector bends the surface of its frame, so it agrees less 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from sl_nerfstudio.registration.pairs.pair_registration import register_pair, se
 from sl_nerfstudio.registration.result import UndecidedProjector
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
-from sl_nerfstudio.threads import one_library_thread
+from sl_nerfstudio.threads import one_library_thread, results
 
 
 @dataclass(frozen=True)
@@ -63,15 +64,20 @@ class _Choice:
         self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator, settings: RegistrationSettings
     ) -> None:
         self.choices = [(c, *c.alternatives) for c in clouds]
-        self._maps: list[list[SurfaceMap]] = [
-            [build_surface_map(c, settings.surface_map) for c in choice] for choice in self.choices
-        ]
+        maps = iter(
+            results([partial(build_surface_map, c, settings.surface_map) for all_ in self.choices for c in all_])
+        )
+        self._maps = [[next(maps) for _ in choice] for choice in self.choices]
         self._sequence, self._rng, self._settings = sequence, rng, settings
 
     def support(self, k: int) -> list[float]:
         """For every cloud of a frame the sum of what agrees with its neighbours, less what contradicts."""
         partners = self._partners(k)
-        return [sum(self._agreement(m, j) for j in partners) for m in self._maps[k]]
+        pairs = [(m, j) for m in self._maps[k] for j in partners]
+        tasks = [
+            partial(self._agreement, *pair, rng) for pair, rng in zip(pairs, self._rng.spawn(len(pairs)), strict=True)
+        ]
+        return np.reshape(results(tasks), (len(self._maps[k]), -1)).sum(1).tolist()
 
     def _partners(self, k: int) -> list[int]:
         """Frames taken shortly before and after; of an unordered set those that look most alike."""
@@ -79,19 +85,19 @@ class _Choice:
         if self._sequence:
             return [j for j in range(max(0, k - s.reach), min(n, k + s.reach + 1)) if j != k]
         search = self._settings.pair.anywhere
-        scores = {
-            j: search_score((self._maps[k][0], self._maps[j][0]), search, self._rng, self._settings.pair)
-            for j in range(n)
-            if j != k
-        }
-        return sorted(scores, key=lambda j: -scores[j])[: 2 * s.reach]
+        others = [j for j in range(n) if j != k]
+        tasks = [
+            partial(search_score, (self._maps[k][0], self._maps[j][0]), search, rng, self._settings.pair)
+            for j, rng in zip(others, self._rng.spawn(len(others)), strict=True)
+        ]
+        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * s.reach]]
 
-    def _agreement(self, own: SurfaceMap, partner: int) -> float:
+    def _agreement(self, own: SurfaceMap, partner: int, rng: np.random.Generator) -> float:
         pair = self._settings.pair
         search = pair.neighbours if self._sequence else pair.anywhere
         best = 0.0
         for other in self._maps[partner]:
-            match = register_pair((own, other), (0, 1), search, self._rng, None, pair)
+            match = register_pair((own, other), (0, 1), search, rng, None, pair)
             if match is not None and is_accepted(match, self._settings.edge):
                 contradicting = match.overlap * (1 / match.fitness - 1)
                 best = max(best, match.overlap - pair.agreement.penalty * contradicting)

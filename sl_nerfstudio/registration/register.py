@@ -5,13 +5,13 @@ the registered frames' baselines is 1 until `known_length` says how long one of 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.acceptance import accept_frames
 from sl_nerfstudio.registration.assembly import Component
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
@@ -20,6 +20,7 @@ from sl_nerfstudio.registration.rough_poses import starting_similarities, with_c
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.registration.view_graph import ViewGraph
+from sl_nerfstudio.side_by_side import tracked
 from sl_nerfstudio.threads import one_library_thread
 
 
@@ -44,7 +45,7 @@ def register(
     """
     report = progress or (lambda _: None)
     n, selection = len(clouds), settings.selection
-    maps = [build_surface_map(c, settings.surface_map) for c in track(clouds, "averaging surfaces")]
+    maps = tracked([partial(build_surface_map, c, settings.surface_map) for c in clouds], "averaging surfaces")
     rough: list[Similarity | None] = [None] * n
     if start is not None:
         rough = starting_similarities(start, maps, settings.start)

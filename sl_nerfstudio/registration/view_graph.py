@@ -1,13 +1,13 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.progress import track
 from sl_nerfstudio.registration.assembly import Assembly, Component
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, quality
@@ -17,6 +17,7 @@ from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, 
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings, Search
 from sl_nerfstudio.registration.surface_map import SurfaceMap
+from sl_nerfstudio.side_by_side import tracked
 
 Pair = tuple[int, int]
 
@@ -48,17 +49,18 @@ class ViewGraph:
 
     def try_pairs(self, pairs: Sequence[Pair], search: Search) -> None:
         """Register pairs without a guess, or from the rough poses of both where there are any."""
-        for pair in track([p for p in pairs if (p, search) not in self._searched], "registering pairs"):
-            self._searched.add((pair, search))
-            guess = _relative(self._start, pair)
-            self._register(pair, search if guess is None else self.settings.pair.rough, guess)
+        new = [p for p in pairs if (p, search) not in self._searched]
+        self._searched |= {(p, search) for p in new}
+        guesses = [_relative(self._start, p) for p in new]
+        trials = [(p, self.settings.pair.rough if g else search, g) for p, g in zip(new, guesses, strict=True)]
+        self._register(trials, "registering pairs")
 
     def try_overlapping(self, S_world_camera: Nodes) -> None:
         """Register pairs that should overlap by the given poses, starting from there."""
-        for pair in track(self._overlapping(S_world_camera), "closing loops"):
-            guess = _relative(S_world_camera, pair)
-            if guess is not None:
-                self._register(pair, self.settings.pair.nearby, guess)
+        pairs = self._overlapping(S_world_camera)
+        guesses = [_relative(S_world_camera, p) for p in pairs]
+        nearby = self.settings.pair.nearby
+        self._register([(p, nearby, g) for p, g in zip(pairs, guesses, strict=True) if g], "closing loops")
 
     def try_all(self) -> None:
         """Register every frame with those that look most like it, wherever they are in the order."""
@@ -66,8 +68,9 @@ class ViewGraph:
         likeness = np.full((n, n), -np.inf)
         most = self.settings.selection.compared_frames
         rank = np.zeros((n, n)) if n - 1 <= most else self.rng.random((n, n))
-        for i, j in track(compared_pairs(rank, most), "comparing frames"):
-            likeness[i, j] = likeness[j, i] = self._likeness((i, j))
+        compared = compared_pairs(rank, most)
+        for (i, j), score in zip(compared, self._likeness(compared), strict=True):
+            likeness[i, j] = likeness[j, i] = score
         pairs = {
             (min(i, j), max(i, j))
             for i in range(n)
@@ -91,8 +94,8 @@ class ViewGraph:
         nearby = sorted(pairs, key=lambda p: p[1] - p[0])[: selection.bridges_nearby]
         others = [p for p in pairs if p not in nearby]
         some = [others[k] for k in self.rng.permutation(len(others))[: selection.most_compared]]
-        alike = sorted(some, key=lambda p: -self._likeness(p))
-        return nearby + alike[: selection.bridges - len(nearby)]
+        alike = np.argsort(-np.array(self._likeness(some)), kind="stable")
+        return nearby + [some[k] for k in alike[: selection.bridges - len(nearby)]]
 
     def assemble(self) -> list[Component]:
         """Components of frames whose connection is certain, the largest first.
@@ -116,16 +119,29 @@ class ViewGraph:
         largest = np.radians(self.settings.selection.largest_view_angle_deg)
         return bool(a.R[:, 2] @ b.R[:, 2] > np.cos(largest))
 
-    def _register(self, pair: Pair, search: Search, guess: Similarity | None) -> None:
-        maps, settings = (self.maps[pair[0]], self.maps[pair[1]]), self.settings
-        match = register_pair(maps, pair, search, self.rng, guess, settings.pair)
-        known = self._tried.get(pair)
-        if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
-            self._tried[pair] = match
+    def _register(self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str) -> None:
+        """Register pairs, and keep the better result of a pair that was tried before."""
+        settings, rngs = self.settings, self.rng.spawn(len(trials))
+        tasks = [
+            partial(register_pair, self._maps(pair), pair, search, rng, guess, settings.pair)
+            for (pair, search, guess), rng in zip(trials, rngs, strict=True)
+        ]
+        for (pair, _, _), match in zip(trials, tracked(tasks, words), strict=True):
+            known = self._tried.get(pair)
+            if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
+                self._tried[pair] = match
 
-    def _likeness(self, pair: Pair) -> float:
-        maps = self.maps[pair[0]], self.maps[pair[1]]
-        return search_score(maps, self.settings.pair.anywhere, self.rng, self.settings.pair)
+    def _likeness(self, pairs: Sequence[Pair]) -> list[float]:
+        """How well the best of all starts agrees, of each pair."""
+        search, rngs = self.settings.pair.anywhere, self.rng.spawn(len(pairs))
+        tasks = [
+            partial(search_score, self._maps(pair), search, rng, self.settings.pair)
+            for pair, rng in zip(pairs, rngs, strict=True)
+        ]
+        return tracked(tasks, "comparing frames")
+
+    def _maps(self, pair: Pair) -> tuple[SurfaceMap, SurfaceMap]:
+        return self.maps[pair[0]], self.maps[pair[1]]
 
     def _overlapping(self, S_world_camera: Nodes) -> list[Pair]:
         """For every frame the pairs with the largest expected overlap, without those that are edges already."""
