@@ -19,6 +19,7 @@ from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
 from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress
+from sl_nerfstudio.bundle_adjustment.search.registered_start import registered_start
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.robust import geman_mcclure_cost
 
@@ -37,7 +38,8 @@ class Hopped:
 def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     """The end of the search, or a better one; ends as soon as a hop leads back to the best one, or none is better.
 
-    Frames that agree with no others at the first end are not searched for again.
+    The first hop begins where a registration of the frames' surfaces puts them. Frames that agree with no others at the
+    first end are not searched for again.
     """
     s, generator = problem.settings.hops, torch.Generator().manual_seed(problem.settings.seed)
     possible = refine in FRAMES_MOVE and found.state.rig.frames <= s.most_frames
@@ -48,9 +50,13 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     unplaced = unplaced_frames(support, problem.settings.relocalisation)
     expected = problem.expected.clone()
     expected[list(unplaced)] = float("-inf")
+    registered = registered_start(problem, refine)
     for hop in range(s.most):
-        begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
-        end = search(problem.again(problem.start, begin, expected), refine)
+        if hop == 0 and registered is not None:
+            end = search(problem.again(problem.start, registered, problem.expected), refine)
+        else:
+            begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
+            end = search(problem.again(problem.start, begin, expected), refine)
         if end is None:
             continue
         other = end[0]
