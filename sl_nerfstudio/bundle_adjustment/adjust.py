@@ -33,6 +33,7 @@ from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.robust_kernel import frame_medians
 from sl_nerfstudio.bundle_adjustment.search.hops import Hopped, hopped
+from sl_nerfstudio.bundle_adjustment.search.lost_frames import with_lost_frames
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
 from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress, kernel_of, problem_of
 from sl_nerfstudio.bundle_adjustment.search.stages import Stage, run_stage
@@ -118,6 +119,9 @@ def find_minimum(
     if first is None:
         return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
     found, before = hopped(problem, refine, first[0]), first[1]
+    again = with_lost_frames(problem, refine, found.best)
+    if again is not None:
+        problem, found = again[0], Hopped(again[1], (), found.settled)
     return Minimum(_result(problem, refine, found.best, before), problem, refine, found)
 
 

@@ -15,7 +15,7 @@ from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.unknowns import by_frame
 from sl_nerfstudio.geometry.se3 import hat, pose, rotate
-from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
 
 _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
 
@@ -48,11 +48,16 @@ def agreeing_scale(start: Rig, rig: Rig, prior: PosePrior) -> float:
 
 def restore(start: Rig, rig: Rig, scale: float) -> Rig:
     """The adjusted rig, `scale` times as large, aligned with the position and orientation of the start."""
-    scaled = rig.scaled(scale)
-    ahead = start.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
-    S = fit_similarity(_axes_points(scaled, ahead).numpy(), _axes_points(start, ahead).numpy(), with_scale=False)
+    S, scaled = alignment(start, rig, scale), rig.scaled(scale)
     T = pose(torch.from_numpy(S.R), torch.from_numpy(S.t))
     return Rig(rig.camera, rig.projector, T @ scaled.T_world_camera, scaled.T_camera_projector)
+
+
+def alignment(start: Rig, rig: Rig, scale: float) -> Similarity:
+    """The motion that aligns the rig, after it is made `scale` times as large, with the cameras of the start."""
+    ahead = start.T_world_camera[:, :3, 3].norm(dim=-1, keepdim=True)
+    points = _axes_points(rig.scaled(scale), ahead).numpy(), _axes_points(start, ahead).numpy()
+    return fit_similarity(*points, with_scale=False)
 
 
 def gauge_directions(rig: Rig) -> Float[Tensor, "unknowns 7"]:

@@ -16,7 +16,7 @@ from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
@@ -56,8 +56,10 @@ class RegisteredFramesSettings:
     """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
     projector: ProjectorKnowledge | None = None
     """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
-    adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
-    """The bundle adjustment itself."""
+    adjustment: AdjustmentSettings = field(
+        default_factory=lambda: AdjustmentSettings(hops=HopSettings(lost_by_surface=False))
+    )
+    """The bundle adjustment itself; surfaces were registered before."""
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,8 @@ class HopSettings:
     """Decoded pixels of each frame that are looked up for that comparison."""
     most_frames: int = 100
     """Frames beyond which no further search is made: it takes time, and many frames hold each other."""
+    lost_by_surface: bool = True
+    """Whether frames that agree with no others after all searches are looked for by their surfaces."""
     registered_side: int = 240
     """Pixels along the longer side of an image that are used to register surfaces, before the first of them."""
     registered_pixels: int = 300

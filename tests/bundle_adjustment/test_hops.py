@@ -34,6 +34,12 @@ def true():
     return rig_of(FRAMES, SIZE)
 
 
+@pytest.fixture(autouse=True)
+def without_surfaces(monkeypatch):
+    """Hops from drawn poses alone; for those from surfaces see test_registered_start."""
+    monkeypatch.setattr(hops, "registered_start", lambda *_: None)
+
+
 def problem_from(start, true, degrees: float = 3.0, **changed) -> Problem:
     settings = replace(SETTINGS, hops=replace(HopSettings(), **changed))
     return problem_of(start, ExactMaps.around(true, SIZE), prior_of(degrees), settings)

@@ -50,7 +50,7 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     unplaced = unplaced_frames(support, problem.settings.relocalisation)
     expected = problem.expected.clone()
     expected[list(unplaced)] = float("-inf")
-    registered = registered_start(problem, refine)
+    registered = registered_start(problem, refine, problem.start, range(problem.start.frames))
     for hop in range(s.most):
         if hop == 0 and registered is not None:
             end = search(problem.again(problem.start, registered, problem.expected), refine)

@@ -1,60 +1,75 @@
-"""After rough starts: where the surfaces of single frames fit together, as another place to begin a search.
+"""Where the surfaces of single frames fit together, as another place to begin a search: for rough starts, lost frames.
 
 Look-ups compare coordinates at one place and lead a frame home from about its own details away. Each frame alone shows
 a surface, too, from its coordinates and the pose of its projector, and surfaces can be registered from much farther.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
+from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.gauge import alignment, baseline_scale
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.search.problem import Problem
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.devices.device import PARAMETERS
+from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, relative_pose_near
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.threads import results
 
+_FEWEST = 2  # frames that a registration may join
 
-def registered_start(problem: Problem, refine: RefinePoses) -> Rig | None:
-    """The starting rig with frames where the registration of their surfaces puts them; None if it joins no two.
 
-    A frame that it does not join stays at its starting pose. Projectors move only where they are free.
+def registered_start(problem: Problem, refine: RefinePoses, beside: Rig, known: Sequence[int]) -> Rig | None:
+    """A rig with frames where the registration of their surfaces puts them; None if it joins too few.
+
+    `known` frames of the rig `beside` give the axes and the scale; the others may be anywhere. A frame that was not
+    joined stays where it is there.
+    Projectors move only where they are free.
     """
     start = problem.start
     clouds = [c for c in results([partial(_cloud, problem, k) for k in range(start.frames)]) if c is not None]
-    chosen = [int(c.name) for c in clouds]
-    if len(chosen) < 2:
+    frame = np.array([int(c.name) for c in clouds])
+    if len(clouds) < _FEWEST:
         return None
-    cameras = start.T_world_camera[chosen].numpy()
-    found = register(clouds, False, problem.settings.seed, cameras)
-    joined = np.flatnonzero(found.registered).tolist()
-    if len(joined) < 2:
+    roughly = start.T_world_camera.numpy()[frame]
+    roughly[~np.isin(frame, list(known))] = np.nan
+    found = register(clouds, False, problem.settings.seed, roughly)
+    joined = np.flatnonzero(found.registered)
+    common = np.isin(frame[joined], list(known))
+    if common.sum() < _FEWEST:
         return None
-    relative = np.stack([clouds[k].pose.T_camera_projector for k in joined])
+    cameras, relative = found.T_world_camera[joined], np.stack([clouds[k].pose.T_camera_projector for k in joined])
     relative[:, :3, 3] *= found.baseline[joined, None]
-    index = torch.tensor([chosen[k] for k in joined])
-    known = _part(start, index)
-    placed = replace(
-        known,
-        T_world_camera=torch.from_numpy(found.T_world_camera[joined]),
-        T_camera_projector=torch.from_numpy(relative),
-    )
-    placed = restore(known, placed, baseline_scale(known, placed, None))
-    camera, projector = start.T_world_camera.clone(), start.T_camera_projector.clone()
-    camera[index] = placed.T_world_camera
+    reference = _frames(beside, frame[joined][common])
+    same = replace(reference, **_poses(cameras[common], relative[common]))
+    scale = baseline_scale(reference, same, None)
+    S = alignment(reference, same, scale) @ Similarity.scaling(scale)
+    camera, projector = beside.T_world_camera.numpy().copy(), beside.T_camera_projector.numpy().copy()
+    camera[frame[joined]] = S.poses(cameras)
     if refine == "free":
-        projector[index] = placed.T_camera_projector
-    return replace(start, T_world_camera=camera, T_camera_projector=projector)
+        relative[:, :3, 3] *= scale
+        projector[frame[joined]] = relative
+    return replace(beside, **_poses(camera, projector))
+
+
+def _poses(camera: Float64[ndarray, "n 4 4"], relative: Float64[ndarray, "n 4 4"]) -> dict[str, Tensor]:
+    return {"T_world_camera": torch.from_numpy(camera), "T_camera_projector": torch.from_numpy(relative)}
+
+
+def _frames(rig: Rig, index: Int64[ndarray, "n"]) -> Rig:
+    chosen = torch.from_numpy(index)
+    return Rig(rig.camera[chosen], rig.projector, rig.T_world_camera[chosen], rig.T_camera_projector[chosen])
 
 
 def _cloud(problem: Problem, k: int) -> FrameCloud | None:
@@ -85,7 +100,3 @@ def _thinned(image: ndarray, side: int) -> Float32[ndarray, "h w 2"]:
 def _device(intrinsics: Intrinsics, w: int, h: int) -> Device:
     values = dict(zip(PARAMETERS, intrinsics.params.tolist(), strict=True))
     return Device(w, h, **values, model=intrinsics.model)
-
-
-def _part(rig: Rig, index: torch.Tensor) -> Rig:
-    return Rig(rig.camera[index], rig.projector, rig.T_world_camera[index], rig.T_camera_projector[index])
