@@ -19,6 +19,8 @@ CACHE_SAMPLES = 64  # along a ray, to find the surface
 _SHADOW_SAMPLES = 32
 _NEAR_SAMPLES = 32  # along a ray, to find out whether it passes the surface
 _FEWEST_SAMPLES = 6
+_ALONG_RAYS = 24  # samples of images, where they do not follow the surface
+_AROUND_SURFACE = 12  # likewise, where they do: the fewest
 
 Ends = tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]
 """Distances at which rays begin and end, for textures and cropped views."""
@@ -34,6 +36,17 @@ class Renderer:
     pattern: Float[Tensor, "h w"]
     sampling: SamplingConfig
     kappa: Float[Tensor, ""] | float  # sharpness, per scene unit
+
+    @property
+    def image_samples(self) -> int:
+        """Samples per ray of images, which have no jitter.
+
+        Around the surface they are at most 2 / kappa apart: the weights are differences of a logistic curve at equal
+        distances, and already with these the depth of a plane is within 0.02 / kappa of its limit.
+        """
+        if self.sampling.strategy == "uniform":
+            return max(self.sampling.samples, _ALONG_RAYS)
+        return max(_AROUND_SURFACE, ceil(self._reach * self.kappa))
 
     def render(
         self,
