@@ -50,8 +50,7 @@ class LitVertices:
     """Vertices that a frame should see and light, and where."""
 
     vertex: Int64[ndarray, "m"]
-    uv_camera: Float[ndarray, "m 2"]  # camera pixels
-    uv_projector: Float[ndarray, "m 2"]  # pattern pixels
+    uv: Float[ndarray, "m 2 2"]  # camera pixels and pattern pixels
 
 
 def lit_vertices(
@@ -65,17 +64,16 @@ def lit_vertices(
 ) -> LitVertices:
     """The vertices that face both devices and project into image and pattern, and that the mesh hides from neither."""
     views = ((camera, T_world_camera), (projector, T_world_projector))
-    packed = np.stack([_packed(device, T) for device, T in views])
+    packed = np.stack([packed_device(device, T) for device, T in views])
     uv, faces = np.empty((len(vertices), 2, 2)), np.empty(len(vertices), np.bool_)
     _project_facing(len(vertices), vertices, normals, packed, uv, faces)
     vertex = np.flatnonzero(faces)
     for _, T in views:
         vertex = vertex[~occluder.hidden(vertices[vertex], normals[vertex], np.asarray(T[:3, 3], dtype=np.float64))]
-    uv = uv[vertex]
-    return LitVertices(vertex, uv[:, 0], uv[:, 1])
+    return LitVertices(vertex, uv[vertex])
 
 
-def _packed(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
+def packed_device(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
     """A device for compiled loops: its pose's inverse, where it is, parameters, code, and size of the image."""
     T = np.asarray(T_world_device, dtype=np.float64)
     R, t = T[:3, :3], T[:3, 3]
