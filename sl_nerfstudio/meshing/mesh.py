@@ -1,6 +1,7 @@
 """The mesh type of this package."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -62,7 +63,14 @@ class Mesh:
         return np.unique(label[self.faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.int64)
 
     def vertex_normals(self) -> Float64[ndarray, "v 3"]:
-        """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""
+        """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area.
+
+        The same array at each call, which is not to be changed.
+        """
+        return self._normals
+
+    @cached_property
+    def _normals(self) -> Float64[ndarray, "v 3"]:
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         out = np.stack(

@@ -68,10 +68,8 @@ def count_frames(
     frames = list(zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True))
     for frame, T_camera, T_projector in track(frames, "trimming to what was observed"):
         checked = np.flatnonzero(always | ~counts.decided)
-        view = visible_vertices(
-            mesh.vertices[checked], normals[checked], occluder, frame, scan.projector, T_camera, T_projector
-        )
-        vertex = checked[view.vertex]
+        view = visible_vertices(mesh.vertices, normals, checked, occluder, frame, scan.projector, T_camera, T_projector)
+        vertex = view.vertex
         known = view.most[always[vertex] & np.isfinite(view.most)]
         medians.append(float(np.median(known)) if len(known) else float("nan"))
         threshold = np.clip(MEDIANS * medians[-1], LEAST_PX, MOST_PX)
@@ -108,15 +106,16 @@ class VisibleVertices:
 def visible_vertices(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
+    chosen: Int64[ndarray, "c"],
     occluder: Occluder,
     frame: Frame,
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
 ) -> VisibleVertices:
-    """The vertices that a frame should see and light (see `lit_vertices`), compared with what it decoded."""
+    """Chosen vertices that a frame should see and light (see `lit_vertices`), compared with what it decoded."""
     views = ((frame.camera, T_world_camera), (projector, T_world_projector))
-    lit = lit_vertices(vertices, normals, occluder, frame.camera, projector, T_world_camera, T_world_projector)
+    lit = lit_vertices(vertices, normals, chosen, occluder, frame.camera, projector, T_world_camera, T_world_projector)
     mask, coords, count = frame.read_mask(), frame.read_coords(), len(lit.vertex)
     offsets, outside = np.full((count, 2), np.nan), np.empty((count, 2), np.bool_)
     packed = np.stack([packed_device(device, T) for device, T in views])
