@@ -63,11 +63,8 @@ class Mesh:
         return np.unique(label[self.faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.int64)
 
     def vertex_normals(self) -> Float64[ndarray, "v 3"]:
-        """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area.
-
-        The same array at each call, which is not to be changed.
-        """
-        return self._normals
+        """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""
+        return self._normals.copy()
 
     @cached_property
     def _normals(self) -> Float64[ndarray, "v 3"]:
