@@ -9,7 +9,6 @@ import open3d as o3d
 import pytest
 from scipy.spatial import KDTree
 
-from sl_nerfstudio import threads
 from sl_nerfstudio.model import exporters
 
 
@@ -36,7 +35,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> Any:
     class Mesh(o3d.geometry.TriangleMesh):
         pass
 
-    monkeypatch.setattr(threads, "_ours", None)
     monkeypatch.setattr(exporters, "torch_on_one_thread", lambda: None)
     geometry = SimpleNamespace(PointCloud=Cloud, TriangleMesh=Mesh)
     exporter = SimpleNamespace(o3d=SimpleNamespace(geometry=geometry), texture_utils=SimpleNamespace())
