@@ -44,10 +44,13 @@ def signals_as_in_a_terminal() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def threads_of_this_test_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What opens a run for `ns-export` keeps torch on one thread, and our loops on as many as they had, for good."""
+    """What opens a run for `ns-export` keeps torch on one thread, and our loops on as many as they had, for good.
+
+    It may be a fixture of a whole file, which comes before this one: so each test begins anew.
+    """
     from sl_nerfstudio import threads
 
-    monkeypatch.setattr(threads, "_ours", threads._ours)
+    monkeypatch.setattr(threads, "_ours", None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -33,15 +33,19 @@ class Occluder:
         )  # builds the index, before threads share it
 
     def hidden(
-        self, points: Float[ndarray, "n 3"], normals: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]
+        self,
+        points: Float[ndarray, "v 3"],
+        normals: Float[ndarray, "v 3"],
+        chosen: Int64[ndarray, "n"],
+        eye: Float[ndarray, "3"],
     ) -> Bool[ndarray, "n"]:
-        """Whether the mesh is between `eye` and points on the mesh that face `eye`.
+        """Whether the mesh is between `eye` and some points on the mesh, all of which face `eye`.
 
         Rays start two edge lengths away from the surface, along the normal and towards the eye, so that they do not hit
         the triangles they start from.
         """
-        rays = np.empty((len(points), 6), np.float32)
-        _write_rays(len(points), points, normals, eye, self._start, self._centre, self._scale, rays)
+        rays = np.empty((len(chosen), 6), np.float32)
+        _write_rays(len(chosen), points, normals, chosen, eye, self._start, self._centre, self._scale, rays)
         return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
@@ -50,32 +54,31 @@ class LitVertices:
     """Vertices that a frame should see and light, and where."""
 
     vertex: Int64[ndarray, "m"]
-    uv_camera: Float[ndarray, "m 2"]  # camera pixels
-    uv_projector: Float[ndarray, "m 2"]  # pattern pixels
+    uv: Float[ndarray, "m 2 2"]  # camera pixels and pattern pixels
 
 
 def lit_vertices(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
+    chosen: Int64[ndarray, "c"],
     occluder: Occluder,
     camera: Device,
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
 ) -> LitVertices:
-    """The vertices that face both devices and project into image and pattern, and that the mesh hides from neither."""
+    """Chosen vertices that face both devices, project into image and pattern, and are hidden from neither."""
     views = ((camera, T_world_camera), (projector, T_world_projector))
-    packed = np.stack([_packed(device, T) for device, T in views])
-    uv, faces = np.empty((len(vertices), 2, 2)), np.empty(len(vertices), np.bool_)
-    _project_facing(len(vertices), vertices, normals, packed, uv, faces)
-    vertex = np.flatnonzero(faces)
+    packed = np.stack([packed_device(device, T) for device, T in views])
+    uv, faces = np.empty((len(chosen), 2, 2)), np.empty(len(chosen), np.bool_)
+    _project_facing(len(chosen), vertices, normals, chosen, packed, uv, faces)
+    left = np.flatnonzero(faces)
     for _, T in views:
-        vertex = vertex[~occluder.hidden(vertices[vertex], normals[vertex], np.asarray(T[:3, 3], dtype=np.float64))]
-    uv = uv[vertex]
-    return LitVertices(vertex, uv[:, 0], uv[:, 1])
+        left = left[~occluder.hidden(vertices, normals, chosen[left], np.asarray(T[:3, 3], dtype=np.float64))]
+    return LitVertices(chosen[left], uv[left])
 
 
-def _packed(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
+def packed_device(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
     """A device for compiled loops: its pose's inverse, where it is, parameters, code, and size of the image."""
     T = np.asarray(T_world_device, dtype=np.float64)
     R, t = T[:3, :3], T[:3, 3]
@@ -85,14 +88,14 @@ def _packed(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndar
 
 
 @compiled_range
-def _project_facing(first, last, vertices, normals, devices, uv, faces):
-    """Pixels `uv` (v, devices, 2) of vertices, and whether they face all devices (26 numbers each) and are inside."""
+def _project_facing(first, last, vertices, normals, chosen, devices, uv, faces):
+    """Pixels `uv` (c, devices, 2) of chosen vertices; whether they face all devices (26 numbers) and are inside."""
     for i in range(first, last):
         faces[i] = True
+        x, y, z = vertices[chosen[i]]
+        a, b, c = normals[chosen[i]]
         for k in range(len(devices)):
             d = devices[k]
-            x, y, z = vertices[i]
-            a, b, c = normals[i]
             if not (d[12] - x) * a + (d[13] - y) * b + (d[14] - z) * c > 0:
                 faces[i] = False
                 break
@@ -100,7 +103,6 @@ def _project_facing(first, last, vertices, normals, devices, uv, faces):
             continue
         for k in range(len(devices)):
             d = devices[k]
-            x, y, z = vertices[i]
             X = d[0] * x + d[1] * y + d[2] * z + d[3]
             Y = d[4] * x + d[5] * y + d[6] * z + d[7]
             Z = d[8] * x + d[9] * y + d[10] * z + d[11]
@@ -113,13 +115,14 @@ def _project_facing(first, last, vertices, normals, devices, uv, faces):
 
 
 @compiled_range
-def _write_rays(first, last, points, normals, eye, start, centre, scale, rays):
-    """Rays (n, 6) from beside points of the surface to the eye, in units of `scale` around `centre`."""
+def _write_rays(first, last, points, normals, chosen, eye, start, centre, scale, rays):
+    """Rays (n, 6) from beside chosen points of the surface to the eye, in units of `scale` around `centre`."""
     for i in range(first, last):
-        x, y, z = eye[0] - points[i, 0], eye[1] - points[i, 1], eye[2] - points[i, 2]
+        j = chosen[i]
+        x, y, z = eye[0] - points[j, 0], eye[1] - points[j, 1], eye[2] - points[j, 2]
         distance = (x * x + y * y + z * z) ** 0.5
         for k in range(3):
-            begin = points[i, k] + start * (normals[i, k] + (eye[k] - points[i, k]) / distance)
+            begin = points[j, k] + start * (normals[j, k] + (eye[k] - points[j, k]) / distance)
             rays[i, k] = (begin - centre[k]) * scale
             rays[i, 3 + k] = (eye[k] - begin) * scale
 

@@ -1,6 +1,7 @@
 """The mesh type of this package."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -63,6 +64,10 @@ class Mesh:
 
     def vertex_normals(self) -> Float64[ndarray, "v 3"]:
         """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""
+        return self._normals.copy()
+
+    @cached_property
+    def _normals(self) -> Float64[ndarray, "v 3"]:
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         out = np.stack(

@@ -18,7 +18,7 @@ from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.se3 import hat, inverse, transform
-from sl_nerfstudio.meshing import compiled_derivatives as loops
+from sl_nerfstudio.meshing.loops import derivatives as loops
 
 
 @dataclass(frozen=True)

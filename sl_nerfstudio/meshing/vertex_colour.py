@@ -83,7 +83,7 @@ def _look(
     index = np.flatnonzero(cosine > _LEAST_COSINE)
     uv, inside = world_pixels(frame.camera, T_world_camera, points[index])
     index, uv = index[inside], uv[inside]
-    free = ~occluder.hidden(points[index], normals[index], eye)
+    free = ~occluder.hidden(points, normals, index, eye)
     return index[free], cosine[index[free]] ** 2, _look_up(frame, uv[free])
 
 

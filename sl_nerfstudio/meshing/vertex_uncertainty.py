@@ -18,8 +18,8 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import is_exact
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.spacing import evenly_spaced
-from sl_nerfstudio.meshing.compiled_derivatives import write_rows
 from sl_nerfstudio.meshing.lit_vertices import dot
+from sl_nerfstudio.meshing.loops.derivatives import write_rows
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.surface_derivatives import packed_devices
 from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, independent_variance

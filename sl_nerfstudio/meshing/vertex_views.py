@@ -1,7 +1,7 @@
 """For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -72,12 +72,13 @@ def views_by_frame(
     As many frames are in memory at a time as there are threads.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
-    points, normals = mesh.vertices[chosen], mesh.vertex_normals()[chosen]
+    points, normals = mesh.vertices, mesh.vertex_normals()
     occluder, all_frames = Occluder(mesh), list(enumerate(scan.frames))
     for first in track(range(0, len(all_frames), threads()), task):
         frames = all_frames[first : first + threads()]
-        for found in results([partial(_views_of, points, normals, occluder, f, scan, poses, k) for k, f in frames]):
-            yield replace(found, vertex=chosen[found.vertex])
+        yield from results(
+            [partial(_views_of, points, normals, chosen, occluder, f, scan, poses, k) for k, f in frames]
+        )
 
 
 def collect_views(
@@ -121,6 +122,7 @@ def correlation_of(window_ratios: Sequence[float]) -> float:
 def _views_of(
     points: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
+    chosen: Int64[ndarray, "c"],
     occluder: Occluder,
     frame: Frame,
     scan: Scan,
@@ -128,7 +130,14 @@ def _views_of(
     k: int,
 ) -> FrameViews:
     seen = lit_vertices(
-        points, normals, occluder, frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k]
+        points,
+        normals,
+        chosen,
+        occluder,
+        frame.camera,
+        scan.projector,
+        poses.T_world_camera[k],
+        poses.T_world_projector[k],
     ).vertex
     devices, coords = devices_of(scan, poses, k), frame.read_coords()
     view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))

@@ -118,6 +118,11 @@ class SLModel(Model):
         return None if bool(sigma.isnan().any()) else sigmas_in_scan_units(sigma, self.S_scene_world)
 
     @property
+    def step(self) -> int:
+        """The step of the training."""
+        return self._step
+
+    @property
     def cell(self) -> float:
         """Length of the field's finest cells, in the scan's unit; the scene's box is two scene units wide."""
         return 2 / self.config.sdf.max_resolution / self.S_scene_world.scale

@@ -9,7 +9,6 @@ from torch import Tensor
 from sl_nerfstudio.geometry.se3 import inverse
 from sl_nerfstudio.rendering.renderer import Ends, Renderer
 
-_EVAL_SAMPLES = 24
 _OPAQUE = 0.5
 _MODULO = 128.0  # pattern pixels of one cycle of the coordinate colours
 _RESIDUAL_WHITE_PX = 5.0
@@ -53,8 +52,7 @@ def _rendered(
     view: Int[Tensor, "rays"],
     ends: Ends | None,
 ) -> dict[str, Tensor]:
-    samples = max(renderer.sampling.samples, _EVAL_SAMPLES)
-    seen = renderer.render(o, d, inverse(T_scene_projector)[view], samples, jitter=False, ends=ends)
+    seen = renderer.render(o, d, inverse(T_scene_projector)[view], renderer.image_samples, jitter=False, ends=ends)
     p = o + seen.depth[:, None] * d
     normal = torch.nn.functional.normalize(renderer.field.sdf_and_gradient(p)[1].detach(), dim=-1)
     opaque = seen.accumulation > _OPAQUE

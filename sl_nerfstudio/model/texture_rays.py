@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.meshing.texture.charts import MANY_CHARTS, laid_out
 from sl_nerfstudio.meshing.texture.drawing import draw_triangles
 
@@ -37,11 +38,23 @@ def unwrap_mesh_with_xatlas(
     charts = laid_out(v, f, n, float(area) / MANY_CHARTS, xatlas.PackOptions())
     corner_uv = charts.uv[charts.corners]
     triangle, weights = draw_triangles(corner_uv.astype(np.float64), num_pixels_per_side)
-    covered = triangle >= 0
     origins = np.full((*triangle.shape, 3), _OUTSIDE, np.float32)
     directions = np.ones_like(origins)
-    mine = f[triangle[covered]]
-    origins[covered] = (weights[covered][..., None] * v[mine]).sum(1)
-    directions[covered] = -(weights[covered][..., None] * n[mine]).sum(1)
+    _write_rays(len(triangle), triangle, weights, f, v, n, origins, directions)
     rays = [torch.from_numpy(x).to(vertices.device) for x in (origins, directions)]
     return torch.from_numpy(corner_uv).to(vertices.device), rays[0], F.normalize(rays[1], dim=-1)
+
+
+@compiled_range
+def _write_rays(first, last, triangle, weights, faces, vertices, normals, origins, directions):
+    """Fill origins and directions (h, w, 3) of the pixels that a triangle covers, in the rows of a range."""
+    for row in range(first, last):
+        for column in range(triangle.shape[1]):
+            face = triangle[row, column]
+            if face < 0:
+                continue
+            a, b, c = faces[face]
+            x, y, z = weights[row, column]
+            for k in range(3):
+                origins[row, column, k] = x * vertices[a, k] + y * vertices[b, k] + z * vertices[c, k]
+                directions[row, column, k] = -(x * normals[a, k] + y * normals[b, k] + z * normals[c, k])

@@ -17,7 +17,7 @@ from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
 from sl_nerfstudio.field.table_gradient import TableGradient
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.rendering.compiled_measuring import measured
-from sl_nerfstudio.rendering.compiled_rendering import first_crossings, least_values, render_rays
+from sl_nerfstudio.rendering.compiled_rendering import comes_below, first_crossings, render_rays
 from sl_nerfstudio.threads import threads
 
 _LONGEST = 120  # seconds that `finish` waits; what is missing then is compiled here, when it is used
@@ -57,7 +57,7 @@ def compile_step() -> None:
         rays, T, one = torch.ones(1, 3), torch.eye(4)[None], torch.ones(1)
         interval = torch.zeros(2, 2, 2), rays, rays, one, one, 2
         first_crossings(*interval)
-        least_values(*interval)
+        comes_below(*interval, one)
         device = Intrinsics.of(Device(w=2, h=2, fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0))
         measured((rays, rays), T, rays, one > 0, device, 1.0, 1.0, 1.0)
         render_rays(torch.ones(1, 2), torch.ones(1, 2), rays, rays, T, device, torch.ones(2, 2), 1.0)

@@ -6,7 +6,6 @@ as all samples, they take ten times as long.
 
 import math
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -42,19 +41,20 @@ def render_rays(
     return found
 
 
-def least_values(
+def comes_below(
     grid: Float[Tensor, "n n n"],
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
     near: Float[Tensor, "rays"],
     far: Float[Tensor, "rays"],
     count: int,
-) -> Float[Tensor, "rays"]:
-    """The least of a cached grid's values at the middles of `count` equal parts of each ray's interval."""
-    least = torch.empty_like(near)
-    arrays = [tensor.detach().contiguous().numpy() for tensor in (grid, origins, directions, near, far)]
-    _least(len(near), *arrays, count, least.numpy())
-    return least
+    limit: Float[Tensor, "rays"],
+) -> Bool[Tensor, "rays"]:
+    """Whether a cached grid's value is at most the limit in the middle of any of `count` equal parts of each ray."""
+    found = torch.zeros(len(near), dtype=torch.bool)
+    arrays = [tensor.detach().contiguous().numpy() for tensor in (grid, origins, directions, near, far, limit)]
+    _come_below(len(near), *arrays, count, found.numpy())
+    return found
 
 
 def first_crossings(
@@ -156,12 +156,13 @@ def _value_at(grid, origin, direction, t):
 
 
 @compiled_range
-def _least(first, last, grid, origins, directions, near, far, count, least):
+def _come_below(first, last, grid, origins, directions, near, far, limit, count, found):
     for k in range(first, last):
-        step, lowest = (far[k] - near[k]) / count, np.inf
+        step = (far[k] - near[k]) / count
         for i in range(count):
-            lowest = min(lowest, _value_at(grid, origins[k], directions[k], near[k] + step * (i + 0.5)))
-        least[k] = lowest
+            if _value_at(grid, origins[k], directions[k], near[k] + step * (i + 0.5)) <= limit[k]:
+                found[k] = True
+                break
 
 
 @compiled_range

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import DEVICES, generator, points_in_view, seeds
 
-from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project, project_jacobian
-from sl_nerfstudio.geometry.devices.compiled_view import view_of
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project, project_jacobian, unproject
+from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
 from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
 
 
@@ -41,6 +41,18 @@ def test_derivatives_are_those_of_tensors_in_view_and_the_rest_everywhere(seed, 
         assert [u, v] == pytest.approx(uv[k].tolist(), rel=1e-9, abs=1e-9)
         if in_front:
             assert derivatives == pytest.approx(J[k].flatten().tolist(), rel=1e-9, abs=1e-9)
+
+
+@given(seeds, st.sampled_from(sorted(DEVICES)))
+def test_pixels_have_the_same_rays(seed, name):
+    device, rng = DEVICES[name], generator(seed)
+    parameters = np.array([getattr(device, key) for key in PARAMETERS])
+    reach = 1.0 if device.k1 else 2.4  # beyond the image, Newton's method need not end anywhere
+    uv = torch.rand(8, 2, generator=rng, dtype=torch.float64) * torch.tensor([reach * device.w, reach * device.h])
+    rays = unproject(Intrinsics.of(device, torch.float64), uv)  # NaN where a DOE has none
+    for k in range(8):
+        found = ray_of(MODELS[device.model].code, *uv[k].tolist(), parameters)
+        assert found == pytest.approx(rays[k].tolist(), rel=1e-9, abs=1e-9, nan_ok=True)
 
 
 @given(st.sampled_from(sorted(DEVICES)), st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
-from sl_nerfstudio.meshing.compiled_derivatives import VIEW, derive_residual, view_point
+from sl_nerfstudio.meshing.loops.derivatives import VIEW, derive_residual, view_point
 from sl_nerfstudio.meshing.surface_derivatives import (
     FrameDevices,
     packed_devices,

@@ -44,7 +44,9 @@ def scan(tmp_path_factory) -> Scan:
 
 
 def seen(mesh: Mesh, scan: Scan):
-    return visible_vertices(mesh.vertices, mesh.vertex_normals(), Occluder(mesh), scan.frames[0], PROJECTOR, *POSES)
+    everything = np.arange(len(mesh.vertices))
+    occluder, frame = Occluder(mesh), scan.frames[0]
+    return visible_vertices(mesh.vertices, mesh.vertex_normals(), everything, occluder, frame, PROJECTOR, *POSES)
 
 
 def test_every_vertex_of_the_true_plate_is_seen_and_predicted_exactly(scan):

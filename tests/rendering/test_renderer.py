@@ -95,3 +95,33 @@ def test_lit_is_what_faces_the_projector_with_nothing_between() -> None:
     assert (expected & certain).sum() > 200 and (shaded & (cosine > 0.15) & certain).sum() > 20
     lit = renderer("surface").is_lit(p.float(), normal, PROJECTOR_CENTRE.expand(len(p), 3))
     assert torch.equal(lit[certain], expected[certain])
+
+
+class Plane:
+    """Distance from a plane across the view."""
+
+    def __init__(self, height: float) -> None:
+        self.height = height
+
+    def sdf(self, p: Tensor) -> Tensor:
+        return p[:, 2] - self.height
+
+    def sdf_and_gradient(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self.sdf(p), torch.tensor([0.0, 0.0, 1.0]).expand_as(p)
+
+
+@pytest.mark.parametrize("kappa", [32.0, 400.0, 3000.0])
+def test_images_have_samples_enough_for_the_depth_at_any_sharpness(kappa: float) -> None:
+    """Wherever the samples are beside the surface: the cached grid is wrong by up to half of its cell."""
+    o, d = torch.tensor([[0.1, 0.0, 0.9]]), torch.tensor([[0.3, 0.0, -(0.91**0.5)]])
+    T = inverse(torch.from_numpy(look_at(PROJECTOR_CENTRE.tolist())).float())[None]
+    errors = []
+    for share in torch.linspace(-0.5, 0.5, 41).tolist():
+        cache = CachedGrid(96)
+        cache.refresh(Plane(0.123 + share * cache.cell))
+        r = Renderer(Plane(0.123), cache, PROJECTOR, torch.ones(48, 64), SamplingConfig(), kappa)
+        with torch.no_grad():
+            depths = [float(r.render(o, d, T, count, jitter=False).depth) for count in (r.image_samples, 1000)]
+        errors.append(depths[0] - depths[1])
+    assert max(map(abs, errors)) * kappa < 0.02
+    assert r.image_samples <= 12 + kappa * cache.cell

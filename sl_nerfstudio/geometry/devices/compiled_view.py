@@ -1,8 +1,15 @@
-"""Pixels of single points with their derivatives, for compiled loops."""
+"""Pixels of single points with their derivatives, and rays of single pixels, for compiled loops."""
+
+import math
 
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.geometry.devices import doe, pinhole
-from sl_nerfstudio.geometry.devices.distortion import distort, distortion_jacobian
+from sl_nerfstudio.geometry.devices.distortion import (
+    LEAST_DETERMINANT,
+    UNDISTORT_STEPS,
+    distort,
+    distortion_jacobian,
+)
 
 _distort, _distortion_jacobian = compiled(distort), compiled(distortion_jacobian)
 _pinhole_in_front, _doe_in_front = compiled(pinhole.in_front), compiled(doe.in_front)
@@ -43,3 +50,25 @@ def view_of(code, x, y, z, parameters):
         fx * xn + parameters[2], fy * yn + parameters[3], front,
         fx * ux, fx * uy, fx * uz, fy * vx, fy * vy, fy * vz,
     )  # fmt: skip
+
+
+@compiled
+def ray_of(code, u, v, parameters):
+    """`unproject` for one pixel: x, y, z of the unit direction; NaN where the model has none."""
+    xd, yd = (u - parameters[2]) / parameters[0], (v - parameters[3]) / parameters[1]
+    k1, k2, p1, p2 = parameters[4], parameters[5], parameters[6], parameters[7]
+    x, y = xd, yd
+    if k1 != 0 or k2 != 0 or p1 != 0 or p2 != 0:
+        for _ in range(UNDISTORT_STEPS):
+            ex, ey = _distort(x, y, k1, k2, p1, p2)
+            ex, ey = ex - xd, ey - yd
+            a, b, d = _distortion_jacobian(x, y, k1, k2, p1, p2)
+            det = a * d - b * b
+            if abs(det) < LEAST_DETERMINANT:
+                det = LEAST_DETERMINANT
+            x, y = x - (d * ex - b * ey) / det, y - (a * ey - b * ex) / det
+    if code == 0:
+        q = 1 / (x * x + y * y + 1) ** 0.5
+        return x * q, -y * q, -q
+    square = 1 - x * x - y * y
+    return x, -y, -(square**0.5) if square >= 0 else math.nan

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 Number = Any  # a tensor, or a float in compiled loops
+UNDISTORT_STEPS, LEAST_DETERMINANT = 12, 1e-9
 
 
 def distort(x: Number, y: Number, k1: Number, k2: Number, p1: Number, p2: Number) -> tuple[Number, Number]:
@@ -34,7 +35,7 @@ def distortion_jacobian(
 
 
 def undistort(
-    xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, iterations: int = 12
+    xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, iterations: int = UNDISTORT_STEPS
 ) -> tuple[Tensor, Tensor]:
     """Ideal normalised coordinates, from distorted ones: Newton's method, started at the distorted point."""
     x, y = xd, yd
@@ -43,7 +44,7 @@ def undistort(
         ex, ey = ex - xd, ey - yd
         a, b, d = distortion_jacobian(x, y, k1, k2, p1, p2)
         det = a * d - b * b
-        det = torch.where(det.abs() < 1e-9, torch.full_like(det, 1e-9), det)
+        det = torch.where(det.abs() < LEAST_DETERMINANT, torch.full_like(det, LEAST_DETERMINANT), det)
         x = x - (d * ex - b * ey) / det
         y = y - (a * ey - b * ex) / det
     return x, y

@@ -125,7 +125,7 @@ class SceneView(ViewerControl):
             self.panel.show_legend(None)
             return
         try:
-            if self._surface is None or self._surface.step != int(self._model.step_now):
+            if self._surface is None or self._surface.step != self._model.step:
                 self.panel.say("Extracting the surface …")
                 self._surface = Surface(self._model)
             coloured = self._surface.coloured(mode, self.panel.chosen_frame)

@@ -39,7 +39,7 @@ class Surface:
     def __init__(self, model: ViewedModel, resolution: int = RESOLUTION) -> None:
         """Raises UserError if there is no surface."""
         self._model = model
-        self.step = int(model.step_now)
+        self.step = model.step
         self.mesh: Mesh = extract_mesh(model.sdf, resolution, device=model.device)
 
     @cached_property

@@ -18,8 +18,12 @@ class ViewedModel(Protocol):
 
     scan: Scan
     S_scene_world: Similarity
-    step_now: Tensor
     viewed_frame: int  # whose projector lights what is rendered from a free viewpoint
+
+    @property
+    def step(self) -> int:
+        """The step of the training."""
+        ...
 
     @property
     def device(self) -> torch.device:

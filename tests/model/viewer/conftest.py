@@ -33,7 +33,7 @@ class SphereModel:
 
     def __init__(self, scan: Scan) -> None:
         self.scan, self.S_scene_world = scan, Similarity.scaling(SCALE)
-        self.step_now, self.viewed_frame = torch.tensor(7), 0
+        self.step, self.viewed_frame = 7, 0
         self.current, self.lost, self.offset = scan.poses, [False] * len(scan.frames), 0.0
 
     def sdf(self, p_scene: torch.Tensor) -> torch.Tensor:

@@ -171,7 +171,7 @@ def test_the_surface_in_all_colours(view: SceneView) -> None:
     found = view._surface
     choose(view, surface="views")
     assert view._surface is found  # of one step, there is one mesh
-    model_of(view).step_now += 1
+    model_of(view).step += 1
     choose(view, surface="sigma")
     assert view._surface is not found and "Step 8" in view.panel._legend.content
     choose(view, surface=MODES[0])
