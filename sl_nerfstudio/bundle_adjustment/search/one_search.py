@@ -3,15 +3,12 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState
-from sl_nerfstudio.bundle_adjustment.observations import away_from_borders, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import away_from_borders
 from sl_nerfstudio.bundle_adjustment.relocalisation import relocalise
-from sl_nerfstudio.bundle_adjustment.residuals import Observations, pixels_of_rows, residuals_of, viewing_cosines
+from sl_nerfstudio.bundle_adjustment.residuals import pixels_of_rows, residuals_of, viewing_cosines
 from sl_nerfstudio.bundle_adjustment.robust_kernel import noise_ratios, useful_distance
 from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress
 from sl_nerfstudio.bundle_adjustment.search.stages import Stage, run_stage, stages
@@ -39,36 +36,19 @@ def search(problem: Problem, refine: RefinePoses) -> tuple[Progress, float] | No
 
 
 def _away_from_borders(problem: Problem, found: Progress) -> Progress:
-    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual.
-
-    Those whose windows reach into that strip fall away, too: they average its errors, which are alike all along the
-    border. New anchors take the place of those that are lost.
-    """
+    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual."""
     state, maps, s = found.state, problem.maps, problem.settings.kernel
-    r = residuals_of(state.rig, state.anchors, found.rows, maps)
-    own, seen = distances = _border_distances(state, found.rows, maps)
-    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, state.anchors, found.rows), s)
-    nearer = torch.minimum(own[found.rows.anchor], seen)
+    anchors, rows = state.anchors, found.rows
+    r = residuals_of(state.rig, anchors, rows, maps)
+    own = maps.border_distance(anchors.frame, project(state.rig.camera[anchors.frame], anchors.d_camera)[0])
+    seen = maps.border_distance(rows.frame, pixels_of_rows(state.rig, anchors, rows)[0])
+    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows), s)
+    nearer = torch.minimum(own[rows.anchor], seen)
     least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
     if least <= 0:
         return found
-    least += maps.settings.half_window
-    left, _ = away_from_borders(state.anchors, found.rows, distances, least, state.rig.frames)
-    per_frame = round(len(own) / state.rig.frames * len(own) / len(left.frame))
-    state = replace(state, anchors=place_anchors(state.rig, maps, per_frame, problem.generator))
-    rows = problem.observe(state)
-    distances = _border_distances(state, rows, maps)
-    anchors, rows = away_from_borders(state.anchors, rows, distances, least, state.rig.frames)
+    anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
-
-
-def _border_distances(
-    state: LMState, rows: Observations, maps: CoordinateMaps
-) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
-    """Pixels from the border of what was decoded: of anchors in their own frame, of rows in the one that looks up."""
-    rig, anchors = state.rig, state.anchors
-    own = maps.border_distance(anchors.frame, project(rig.camera[anchors.frame], anchors.d_camera)[0])
-    return own, maps.border_distance(rows.frame, pixels_of_rows(rig, anchors, rows)[0])
 
 
 def _relocalised(problem: Problem, refine: RefinePoses, stage: Stage, found: Progress) -> Progress:
