@@ -59,6 +59,7 @@ class Adjustment:
     median_before_px: float
     median_after_px: float
     unplaced: tuple[int, ...]  # frames that do not agree with the others: neither their poses nor their sigma hold
+    start: Rig  # to which the prior belongs: the given one, but for frames whose starting pose proved to be wrong
 
     @property
     def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
@@ -210,6 +211,7 @@ def _result(problem: Problem, refine: RefinePoses, found: Progress, before: floa
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
         unplaced=unplaced_frames(frame_support(state.rig, maps, found.noise, s), s.relocalisation),
+        start=problem.start,
     )
 
 
@@ -219,4 +221,4 @@ def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters, settings: Adjus
     nan = float("nan")
     noise = settings.kernel.noise_floor_px
     factor = torch.block_diag(gauge_free(start, free, H), prior.intrinsics_sigma.diag())
-    return Adjustment(start, factor, None, noise, 0, nan, nan, ())
+    return Adjustment(start, factor, None, noise, 0, nan, nan, (), start)

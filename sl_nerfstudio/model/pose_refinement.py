@@ -1,6 +1,6 @@
 """From the table of pixels to adjusted poses: the link between a training run and the bundle adjustment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -161,7 +161,12 @@ def adjusted(
     settings: AdjustmentSettings,
 ) -> Found:
     """Adjust the scan's poses from `start`, and restore the scan's lengths."""
-    found: Adjustment = adjust(constrained(refine, start), maps, prior, refine, settings)
+    begin = constrained(refine, start)
+    found: Adjustment = adjust(begin, maps, prior, refine, settings)
+    # a frame whose starting pose proved to be wrong must not turn or stretch the scene
+    wrong = (found.start.T_world_camera != begin.T_world_camera).flatten(1).any(1)
+    cameras = torch.where(wrong[:, None, None], found.start.T_world_camera, start.T_world_camera)
+    start = replace(start, T_world_camera=cameras)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(_motion(found.rig, rig)).factor)
     known = known_length(scan, S_scene_world, refine, rig, prior)

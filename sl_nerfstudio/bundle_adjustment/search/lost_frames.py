@@ -13,7 +13,8 @@ from sl_nerfstudio.bundle_adjustment.search.registered_start import registered_s
 def with_lost_frames(problem: Problem, refine: RefinePoses, found: Progress) -> tuple[Problem, Progress] | None:
     """The problem and the end of a search with lost frames where their surfaces put them; None if none is found there.
 
-    The stated uncertainty of such a frame's starting pose was wrong: from now on it holds about the new place.
+    The stated uncertainty of such a frame's starting pose was wrong: from now on it holds about the new place. What was
+    known of its projector against its camera stays.
     """
     s = problem.settings.hops
     if not s.lost_by_surface or refine not in FRAMES_MOVE or problem.start.frames > s.most_frames:
@@ -23,7 +24,8 @@ def with_lost_frames(problem: Problem, refine: RefinePoses, found: Progress) -> 
     rig = registered_start(problem, refine, found.state.rig, others) if lost else None
     if rig is None:
         return None
-    start, begin = (with_frames_of(other, rig, lost) for other in (problem.start, found.state.rig))
+    begin = with_frames_of(found.state.rig, rig, lost)
+    start = replace(problem.start, T_world_camera=with_frames_of(problem.start, rig, lost).T_world_camera)
     end = search(problem.again(start, begin, problem.expected), refine)
     if end is None or not set(_lost(problem, end[0])) < set(lost):
         return None
