@@ -210,7 +210,7 @@ def _result(problem: Problem, refine: RefinePoses, found: Progress, before: floa
         iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
-        unplaced=unplaced_frames(frame_support(state.rig, maps, found.noise, s), s.relocalisation),
+        unplaced=unplaced_frames(state.rig, maps, found.noise, s),
         start=problem.start,
     )
 

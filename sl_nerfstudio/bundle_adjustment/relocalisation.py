@@ -84,9 +84,10 @@ def frame_support(
     return support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
 
 
-def unplaced_frames(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> tuple[int, ...]:
+def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
     """Frames that see too little of the surface on which the others agree, in order."""
-    wrong = support.isnan() | (support < settings.least_share * support.nanmedian())
+    support = frame_support(rig, maps, noise, settings)
+    wrong = support.isnan() | (support < settings.relocalisation.least_share * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
 
 
@@ -142,8 +143,9 @@ def relocalise(
     lost = find_lost_frames(support, s)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     searched = [k for k in lost.tolist() if support[k] < expected[k]]
+    usual = least_support(support, s)
     for k in searched:
-        enough = min(least_support(support, s), float(expected[k]))
+        enough = min(usual, float(expected[k]))
         best, best_support = rig, float(support[k]) + s.least_gain
         for attempt in range(s.starts):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)

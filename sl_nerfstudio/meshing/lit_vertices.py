@@ -11,6 +11,8 @@ from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.devices.compiled_view import view_of
 from sl_nerfstudio.geometry.devices.models import MODELS
+from sl_nerfstudio.meshing.loops.decoded_offset import CODE, EYE, HEIGHT, PARAMETERS, WIDTH, WORLD
+from sl_nerfstudio.meshing.loops.derivatives import moved
 from sl_nerfstudio.meshing.mesh import Mesh
 
 
@@ -96,20 +98,18 @@ def _project_facing(first, last, vertices, normals, chosen, devices, uv, faces):
         a, b, c = normals[chosen[i]]
         for k in range(len(devices)):
             d = devices[k]
-            if not (d[12] - x) * a + (d[13] - y) * b + (d[14] - z) * c > 0:
+            if not (d[EYE] - x) * a + (d[EYE + 1] - y) * b + (d[EYE + 2] - z) * c > 0:
                 faces[i] = False
                 break
         if not faces[i]:
             continue
         for k in range(len(devices)):
             d = devices[k]
-            X = d[0] * x + d[1] * y + d[2] * z + d[3]
-            Y = d[4] * x + d[5] * y + d[6] * z + d[7]
-            Z = d[8] * x + d[9] * y + d[10] * z + d[11]
-            found = view_of(d[23], X, Y, Z, d[15:23])
+            X, Y, Z = moved(d, WORLD, x, y, z)
+            found = view_of(d[CODE], X, Y, Z, d[PARAMETERS:CODE])
             u, v = found[0], found[1]
             uv[i, k, 0], uv[i, k, 1] = u, v
-            if not (found[2] and 0 <= u < d[24] and 0 <= v < d[25]):
+            if not (found[2] and 0 <= u < d[WIDTH] and 0 <= v < d[HEIGHT]):
                 faces[i] = False
                 break
 

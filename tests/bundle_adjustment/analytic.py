@@ -1,6 +1,6 @@
 """Analytic rigs and coordinate maps: balls over a disk, with exact ray intersections in float64."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, radians, sin
 
 import torch
@@ -8,12 +8,13 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
+from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, pose, transform
+from sl_nerfstudio.geometry.se3 import exp_se3, inverse, pose, transform
 
 BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
 DISK_HEIGHT, DISK_RADIUS = -0.3, 0.9
@@ -135,6 +136,20 @@ def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03
     x = x / x.reshape(2, -1, 2, 3).pow(2).sum(-1).mean(1).sqrt().repeat_interleave(3, -1)[:, None]
     size = torch.tensor([shift] * 3 + [radians(degrees)] * 3, dtype=torch.float64)
     return rig.moved(x[0] * size, x[1] * size * relative)
+
+
+def turned(rig: Rig, frame: int, degrees: float) -> Rig:
+    """One frame turned as a whole about the scene."""
+    cameras = rig.T_world_camera.clone()
+    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(degrees)
+    cameras[frame] = exp_se3(turn) @ cameras[frame]
+    return replace(rig, T_world_camera=cameras)
+
+
+def rough_prior(frames: int, degrees: float) -> PosePrior:
+    """Starting poses whose rotations are known to some degrees."""
+    sigmas = (0.05, radians(degrees), 0.003, radians(0.1))
+    return PosePrior(*(torch.full((frames,), s, dtype=torch.float64) for s in sigmas))
 
 
 def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:

@@ -18,15 +18,10 @@ from sl_nerfstudio.bundle_adjustment.search.problem import Problem, Progress, pr
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
 
-from .analytic import ExactMaps, disturbed, rig_of
+from .analytic import ExactMaps, disturbed, rig_of, rough_prior
 
 FRAMES, SIZE = 6, 100
 SETTINGS = AdjustmentSettings(anchors_per_frame=100, frames_per_anchor=3, max_iterations=20)
-
-
-def prior_of(degrees: float) -> PosePrior:
-    sigmas = (0.05, radians(degrees), 0.003, radians(0.1))
-    return PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in sigmas))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +37,7 @@ def without_surfaces(monkeypatch):
 
 def problem_from(start, true, degrees: float = 3.0, **changed) -> Problem:
     settings = replace(SETTINGS, hops=replace(HopSettings(), **changed))
-    return problem_of(start, ExactMaps.around(true, SIZE), prior_of(degrees), settings)
+    return problem_of(start, ExactMaps.around(true, SIZE), rough_prior(FRAMES, degrees), settings)
 
 
 @pytest.fixture()

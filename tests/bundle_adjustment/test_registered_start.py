@@ -1,7 +1,6 @@
 """Where surfaces of single frames fit together: a start that is near the truth however far off the given one is."""
 
 from dataclasses import replace
-from math import radians
 
 import numpy as np
 import pytest
@@ -10,27 +9,21 @@ import torch
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
 from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings
 from sl_nerfstudio.bundle_adjustment.search import hops
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
 from sl_nerfstudio.bundle_adjustment.search.problem import problem_of
 from sl_nerfstudio.bundle_adjustment.search.registered_start import registered_start
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
+from sl_nerfstudio.geometry.se3 import inverse, log_so3
 
-from .analytic import disturbed, images_of, rig_of
+from .analytic import disturbed, images_of, rig_of, rough_prior, turned
 
 FRAMES, SIZE, LOST = 6, 100, 2
 _EXACT = 0.5  # degrees: what images of 100 pixels and 100 look-ups of each frame allow
 SETTINGS = AdjustmentSettings(
     anchors_per_frame=100, frames_per_anchor=3, max_iterations=20, other_minima=OtherMinimaSettings(searches=0)
 )
-
-
-def prior_of(degrees: float) -> PosePrior:
-    sigmas = (0.05, radians(degrees), 0.003, radians(0.1))
-    return PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in sigmas))
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +43,10 @@ def turns_deg(rig, true) -> list[float]:
     return torch.rad2deg(log_so3(turn[:, :3, :3]).norm(dim=-1)).tolist()
 
 
-def turned(rig, degrees: float):
-    """One frame turned about the scene."""
-    cameras = rig.T_world_camera.clone()
-    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(degrees)
-    cameras[LOST] = exp_se3(turn) @ cameras[LOST]
-    return replace(rig, T_world_camera=cameras)
-
-
 @pytest.mark.parametrize("refine", ["free", "known-rig"])
 def test_frames_that_are_8_degrees_off_begin_within_one(true, maps, refine):
     start = disturbed(true, 3, degrees=8.0, shift=0.1, relative=0.03)
-    problem = problem_of(start, maps, prior_of(8.0), SETTINGS)
+    problem = problem_of(start, maps, rough_prior(FRAMES, 8.0), SETTINGS)
     found = registered_start(problem, refine, start, range(FRAMES))
     assert found is not None
     assert max(turns_deg(start, true)) > 5 and max(turns_deg(found, true)) < 1
@@ -77,7 +62,7 @@ def test_frames_of_which_hardly_anything_was_decoded_stay_where_they_are(true, m
     images = [maps.image(k).clone() for k in range(FRAMES)]
     images[LOST][:] = float("nan")
     start = disturbed(true, 3, degrees=4.0, shift=0.05)
-    problem = problem_of(start, CoordinateMaps.of(images), prior_of(4.0), SETTINGS)
+    problem = problem_of(start, CoordinateMaps.of(images), rough_prior(FRAMES, 4.0), SETTINGS)
     found = registered_start(problem, "free", start, range(FRAMES))
     assert found is not None
     assert torch.equal(found.T_world_camera[LOST], start.T_world_camera[LOST])
@@ -96,7 +81,7 @@ def test_the_first_hop_begins_there(true, maps, monkeypatch):
 
     monkeypatch.setattr(hops, "search", counted)
     start = disturbed(true, 5, degrees=12.0, shift=0.2)
-    problem = problem_of(start, maps, prior_of(12.0), replace(SETTINGS, hops=HopSettings(most=2)))
+    problem = problem_of(start, maps, rough_prior(FRAMES, 12.0), replace(SETTINGS, hops=HopSettings(most=2)))
     first = search(problem, "known-rig")
     assert first is not None
     found = hops.hopped(problem, "known-rig", first[0]).best
@@ -106,8 +91,8 @@ def test_the_first_hop_begins_there(true, maps, monkeypatch):
 
 @pytest.mark.parametrize("degrees", [90.0, 150.0])
 def test_a_frame_that_is_far_off_is_found_by_its_surface(true, maps, degrees):
-    start = turned(disturbed(true, 4, degrees=0.5, shift=0.01), degrees)
-    prior = prior_of(1.0)
+    start = turned(disturbed(true, 4, degrees=0.5, shift=0.01), LOST, degrees)
+    prior = rough_prior(FRAMES, 1.0)
     named = adjust(start, maps, prior, "free", replace(SETTINGS, hops=HopSettings(lost_by_surface=False)))
     assert named.unplaced == (LOST,)
     found = adjust(start, maps, prior, "free", SETTINGS)

@@ -19,7 +19,7 @@ from sl_nerfstudio.bundle_adjustment.search.problem import problem_of
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
 
-from .analytic import ExactMaps, rig_of
+from .analytic import ExactMaps, rig_of, turned
 
 FRAMES, SIZE, LOST = 6, 100, 2
 SETTINGS = RelocalisationSettings()
@@ -70,27 +70,16 @@ def test_lost_frames_are_those_with_little_support_best_first():
     assert find_lost_frames(alike, SETTINGS).tolist() == [2]
 
 
-def away(true, degrees: float):
-    """The rig with one frame turned about the scene."""
-    cameras = true.T_world_camera.clone()
-    turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(degrees)
-    cameras[LOST] = exp_se3(turn) @ cameras[LOST]
-    return replace(true, T_world_camera=cameras)
-
-
-def support(rig, true):
-    return frame_support(rig, ExactMaps.around(true, SIZE), 0.05, AdjustmentSettings())
-
-
 def test_a_frame_that_is_far_off_is_named_and_no_other(true):
-    assert unplaced_frames(support(true, true), SETTINGS) == ()
-    assert unplaced_frames(support(away(true, 60), true), SETTINGS) == (LOST,)
+    maps = ExactMaps.around(true, SIZE)
+    assert unplaced_frames(true, maps, 0.05, AdjustmentSettings()) == ()
+    assert unplaced_frames(turned(true, LOST, 60), maps, 0.05, AdjustmentSettings()) == (LOST,)
 
 
 def test_a_frame_that_agrees_as_well_as_is_expected_is_not_searched_for(true):
-    rig = away(true, 5)
+    rig, maps = turned(true, LOST, 5), ExactMaps.around(true, SIZE)
     expected = WHATEVER.clone()
-    expected[LOST] = float(support(rig, true)[LOST]) - 0.01
+    expected[LOST] = float(frame_support(rig, maps, 0.05, AdjustmentSettings())[LOST]) - 0.01
     assert relocalised(rig, true, expected=expected) == Relocalised(rig, (), ())
     expected[LOST] += 0.3
     assert relocalised(rig, true, expected=expected).found == (LOST,)

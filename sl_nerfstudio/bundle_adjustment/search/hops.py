@@ -14,7 +14,7 @@ from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import departure_of, with_frames_of
 from sl_nerfstudio.bundle_adjustment.observations import place_anchors
 from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.relocalisation import frame_support, rows_of_all, unplaced_frames
+from sl_nerfstudio.bundle_adjustment.relocalisation import rows_of_all, unplaced_frames
 from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
@@ -46,17 +46,17 @@ def hopped(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
     if s.most < 1 or not possible or not is_rough(problem.prior, s.from_deg):
         return Hopped(found, (), True)
     best, others = found, []
-    support = frame_support(found.state.rig, problem.maps, found.noise, problem.settings)
-    unplaced = unplaced_frames(support, problem.settings.relocalisation)
+    unplaced = unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
     expected = problem.expected.clone()
     expected[list(unplaced)] = float("-inf")
     registered = registered_start(problem, refine, problem.start, range(problem.start.frames))
     for hop in range(s.most):
         if hop == 0 and registered is not None:
-            end = search(problem.again(problem.start, registered, problem.expected), refine)
+            again = problem.again(problem.start, registered, problem.expected)
         else:
             begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
-            end = search(problem.again(problem.start, begin, expected), refine)
+            again = problem.again(problem.start, begin, expected)
+        end = search(again, refine)
         if end is None:
             continue
         other = end[0]

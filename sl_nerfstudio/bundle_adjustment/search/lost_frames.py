@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import with_frames_of
-from sl_nerfstudio.bundle_adjustment.relocalisation import frame_support, unplaced_frames
+from sl_nerfstudio.bundle_adjustment.relocalisation import unplaced_frames
 from sl_nerfstudio.bundle_adjustment.search.one_search import search
 from sl_nerfstudio.bundle_adjustment.search.problem import FRAMES_MOVE, Problem, Progress
 from sl_nerfstudio.bundle_adjustment.search.registered_start import registered_start
@@ -33,5 +33,4 @@ def with_lost_frames(problem: Problem, refine: RefinePoses, found: Progress) -> 
 
 
 def _lost(problem: Problem, found: Progress) -> tuple[int, ...]:
-    support = frame_support(found.state.rig, problem.maps, found.noise, problem.settings)
-    return unplaced_frames(support, problem.settings.relocalisation)
+    return unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)

@@ -18,8 +18,7 @@ from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.gauge import alignment, baseline_scale
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.search.problem import Problem
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.devices.device import PARAMETERS
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
@@ -34,8 +33,7 @@ def registered_start(problem: Problem, refine: RefinePoses, beside: Rig, known: 
     """A rig with frames where the registration of their surfaces puts them; None if it joins too few.
 
     `known` frames of the rig `beside` give the axes and the scale; the others may be anywhere. A frame that was not
-    joined stays where it is there.
-    Projectors move only where they are free.
+    joined stays where it is there. Projectors move only where they are free.
     """
     start = problem.start
     clouds = [c for c in results([partial(_cloud, problem, k) for k in range(start.frames)]) if c is not None]

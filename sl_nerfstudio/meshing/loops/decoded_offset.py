@@ -12,18 +12,10 @@ import numpy as np
 
 from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
+from sl_nerfstudio.meshing.loops.derivatives import moved
 
 # A device as one row: world to device (a 3 x 4 matrix), where it is, parameters, code, width and height.
 WORLD, EYE, PARAMETERS, CODE, WIDTH, HEIGHT = 0, 12, 15, 23, 24, 25
-
-
-@compiled
-def _moved(device, x, y, z):
-    return (
-        device[0] * x + device[1] * y + device[2] * z + device[3],
-        device[4] * x + device[5] * y + device[6] * z + device[7],
-        device[8] * x + device[9] * y + device[10] * z + device[11],
-    )
 
 
 @compiled
@@ -43,7 +35,7 @@ def _on_tangent_plane(camera, projector, point, normal, u, v):
     towards = x * normal[0] + y * normal[1] + z * normal[2]
     away = (point[0] - ox) * normal[0] + (point[1] - oy) * normal[1] + (point[2] - oz) * normal[2]
     distance = away / (towards if towards < 0 else -1e-12)
-    X, Y, Z = _moved(projector, ox + distance * x, oy + distance * y, oz + distance * z)
+    X, Y, Z = moved(projector, WORLD, ox + distance * x, oy + distance * y, oz + distance * z)
     found = view_of(projector[CODE], X, Y, Z, projector[PARAMETERS:CODE])
     return found[0], found[1]
 

@@ -16,7 +16,8 @@ P_CAMERA, BY_POINT, UV_CAMERA, UV_PROJECTOR, SLOPE, BY_PIXEL, AREA, ANGLE, VIEW 
 
 
 @compiled
-def _moved(T, first, x, y, z):
+def moved(T, first, x, y, z):
+    """A point moved by the 3 x 4 matrix whose numbers begin at `first`."""
     a = T[first] * x + T[first + 1] * y + T[first + 2] * z + T[first + 3]
     b = T[first + 4] * x + T[first + 5] * y + T[first + 6] * z + T[first + 7]
     c = T[first + 8] * x + T[first + 9] * y + T[first + 10] * z + T[first + 11]
@@ -25,19 +26,19 @@ def _moved(T, first, x, y, z):
 
 @compiled
 def _turned(T, first, x, y, z):
-    a, b, c = _moved(T, first, x, y, z)
+    a, b, c = moved(T, first, x, y, z)
     return a - T[first + 3], b - T[first + 7], c - T[first + 11]
 
 
 @compiled
 def view_point(devices, point, normal, view):
     """Fill `view` (VIEW,) for a point and its unit normal in the world, seen by `devices` (DEVICES,)."""
-    x, y, z = _moved(devices, CAMERA_POSE, point[0], point[1], point[2])
+    x, y, z = moved(devices, CAMERA_POSE, point[0], point[1], point[2])
     a, b, c = _turned(devices, CAMERA_POSE, normal[0], normal[1], normal[2])
     view[P_CAMERA], view[P_CAMERA + 1], view[P_CAMERA + 2] = x, y, z
     u, v, _, k0, k1, k2, k3, k4, k5 = view_of(devices[CODES], x, y, z, devices[CAMERA:PROJECTOR])
     view[UV_CAMERA], view[UV_CAMERA + 1] = u, v
-    X, Y, Z = _moved(devices, PROJECTOR_POSE, x, y, z)
+    X, Y, Z = moved(devices, PROJECTOR_POSE, x, y, z)
     u, v, _, j0, j1, j2, j3, j4, j5 = view_of(devices[CODES + 1], X, Y, Z, devices[PROJECTOR:CODES])
     view[UV_PROJECTOR], view[UV_PROJECTOR + 1] = u, v
     R = devices[PROJECTOR_POSE:CENTRE]

@@ -1,5 +1,6 @@
 """Clouds of many frames: beyond a share of the memory their arrays are in temporary files, mapped into memory."""
 
+import threading
 from collections.abc import Sequence
 
 from numpy import ndarray
@@ -15,16 +16,19 @@ _CLASSES = (FrameCloud, RelativePose, Degeneracy, Device)
 
 
 class LargeClouds:
-    """Takes clouds one after the other. Files are gone with the process, whatever ends it."""
+    """Takes clouds, also from several threads. Files are gone with the process, whatever ends it."""
 
     def __init__(self, most_bytes: int | None = None) -> None:
         """`most_bytes` of clouds stay in memory; default: a share of it."""
         self._left = largest_in_memory() if most_bytes is None else most_bytes
+        self._counting = threading.Lock()
 
     def kept(self, cloud: FrameCloud) -> FrameCloud:
         """An equal cloud. Raises UserError if there is no space for the file."""
         return with_arrays(cloud, _CLASSES, self._arrays)
 
     def _arrays(self, arrays: Sequence[ndarray]) -> Sequence[ndarray]:
-        self._left -= sum(array.nbytes for array in arrays)
-        return arrays if self._left >= 0 else in_file(arrays)
+        with self._counting:
+            self._left -= sum(array.nbytes for array in arrays)
+            fits = self._left >= 0
+        return arrays if fits else in_file(arrays)
