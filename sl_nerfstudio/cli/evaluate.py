@@ -87,7 +87,7 @@ def _evaluate(config: EvalConfig) -> None:
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
     capture = _next_capture(evaluation, inputs)
     sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
-    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma)
+    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed)
     results: dict[Path, str] = {}
     if config.json:
         document = to_json(evaluation, judgement.verdict, capture, lengths)

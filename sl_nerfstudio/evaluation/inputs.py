@@ -30,6 +30,7 @@ from sl_nerfstudio.scan import (
 from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import TRANSFORMS, read_document
 from sl_nerfstudio.scan.file_error import check_file
+from sl_nerfstudio.verdict.departed_frames import DepartedFrame, departed_frames
 
 _FEWEST_POINTS = 100
 
@@ -58,6 +59,11 @@ class EvaluationInputs:
         Refined poses count as exact, so that their errors show.
         """
         return [None if self.poses_path is not None else frame.pose_sigma for frame in self.scan.frames]
+
+    @property
+    def departed(self) -> list[DepartedFrame]:
+        """Frames that ended far from their starting poses; none where those are evaluated."""
+        return [] if self.poses_path is None else departed_frames(self.scan, self.poses)
 
 
 def read_inputs(

@@ -12,6 +12,7 @@ from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.figures import JudgedFigure, judged
 from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.evaluation.training_steps import TrainedSteps, training_figure
+from sl_nerfstudio.verdict.departed_frames import DepartedFrame, departed_reasons
 from sl_nerfstudio.verdict.judge import cross_reasons
 from sl_nerfstudio.verdict.settings import VerdictSettings
 from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, worst
@@ -44,12 +45,14 @@ def judge(
     capture: NextView | None = None,
     unplaced: Sequence[str] = (),
     length_sigma: float | None = None,
+    departed: Sequence[DepartedFrame] = (),
 ) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
     `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
     `unplaced`: frames that the training could not place; a surface that they took part in is poor. `length_sigma`: 1
     sigma of distances across the surface, as a share of them (`lengths.typical_sigma`), None if it is not known.
+    `departed`: frames that ended far from their starting poses.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -95,6 +98,7 @@ def judge(
         Reason("poor", f"{name}: could not be placed; leave it out or register it again, and train again")
         for name in unplaced
     ]
+    reasons += departed_reasons([one for one in departed if one.name not in unplaced])
     verdict = worst(reasons)
     return Judgement(
         verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),

@@ -8,6 +8,7 @@ from sl_nerfstudio.calibration.changes import describe_change
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.model.intrinsics_refinement import RefinedIntrinsics
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment
+from sl_nerfstudio.verdict.departed_frames import DepartedFrame, describe_departed
 
 
 def poses_message(found: ScanAdjustment) -> str:
@@ -28,6 +29,18 @@ def unplaced_message(names: Sequence[str]) -> str:
         f"Frames that cannot be placed: {', '.join(names)}. They do not see the surface on which the others agree.\n"
         "    cause:  their starting poses are far off, or their coordinates are decoded wrongly\n"
         "    remedy: remove them from transforms.json, or register the captures again (sl-process)"
+    )
+
+
+def departed_message(found: Sequence[DepartedFrame]) -> str:
+    """Which frames ended far from where they started, and what that may mean; "" if none did."""
+    if not found:
+        return ""
+    return (
+        f"Frames far from their starting poses: {describe_departed(found)}.\n"
+        "    cause:  a starting pose is wrong by far more than its stated uncertainty and was found again, or the\n"
+        "            frame slid along an object that looks the same from there (of revolution, a rod)\n"
+        "    remedy: look at these frames in the viewer; if a starting pose is right, leave its frame out"
     )
 
 

@@ -23,7 +23,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.model.decoding_noise import measure_decoding
 from sl_nerfstudio.model.history import History
 from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
-from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
+from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
 from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, picture_outputs, ray_outputs
 from sl_nerfstudio.model.pose_parameters import FrameTransforms, make_pose_parameters
 from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
@@ -41,6 +41,7 @@ from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at, surface
 from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.threads import one_torch_thread
+from sl_nerfstudio.verdict.departed_frames import departed_frames
 
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
 
@@ -199,6 +200,7 @@ class SLModel(Model):
         if c.renders_poses:
             rig = constrained(c.refine_poses, rig)
         self.device_poses.rebase(rig.T_world_camera, rig.T_world_projector)
+        said.append(departed_message(departed_frames(self.scan, self.poses())))
         return "\n".join(filter(None, said))
 
     def measure_noise(self, samples: Any) -> None:

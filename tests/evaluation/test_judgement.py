@@ -6,6 +6,7 @@ import pytest
 from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.judgement import judge
+from sl_nerfstudio.verdict.departed_frames import DepartedFrame
 from tests.verdict.cases import ring
 
 FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)
@@ -32,6 +33,13 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
 def test_a_frame_that_training_could_not_place_makes_the_scan_poor() -> None:
     verdict = judge(GOOD, unplaced=["frame_00001"]).verdict
     assert verdict.band == "poor" and verdict.reasons[0].startswith("frame_00001: could not be placed")
+
+
+def test_a_frame_far_from_its_start_is_not_good_and_one_that_was_not_placed_is_named_once() -> None:
+    departed = [DepartedFrame("frame_00001", 19.86, 1.0)]
+    verdict = judge(GOOD, departed=departed).verdict
+    assert verdict.band == "acceptable" and verdict.reasons[0].startswith("frame_00001 (19.9 deg, stated 1): far from")
+    assert len(judge(GOOD, unplaced=["frame_00001"], departed=departed).verdict.reasons) == 1
 
 
 @pytest.mark.parametrize(("sigma", "band"), [(0.002, "good"), (0.008, "acceptable"), (0.05, "poor")])

@@ -5,8 +5,9 @@ import torch
 from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
 from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
-from sl_nerfstudio.model.messages import contradiction_message, poses_message, unplaced_message
+from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment
+from sl_nerfstudio.verdict.departed_frames import DepartedFrame
 
 from ..bundle_adjustment.analytic import rig_of
 
@@ -48,3 +49,11 @@ def test_frames_that_cannot_be_placed_are_named():
     assert unplaced_message([]) == ""
     text = unplaced_message(["frame_3", "frame_5"])
     assert text.startswith("Frames that cannot be placed: frame_3, frame_5.") and "remedy:" in text
+
+
+def test_frames_far_from_their_starts_are_named_with_both_causes():
+    assert departed_message([]) == ""
+    text = departed_message([DepartedFrame("frame_3", 60.02, 1.0)])
+    assert text.startswith("Frames far from their starting poses: frame_3 (60.0 deg, stated 1).")
+    assert "was found again" in text and "slid along" in text and "remedy:" in text
+    assert max(map(len, text.splitlines())) < 120

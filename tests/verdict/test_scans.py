@@ -1,12 +1,17 @@
 """Verdicts on scans from sl-synth: right ones are good, whatever their unit; every planted fault is named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import PoseSigma, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
+from sl_nerfstudio.verdict.departed_frames import departed_frames, departed_reasons, describe_departed
 from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
 from sl_nerfstudio.verdict.judge import judge_scan
 from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
@@ -101,3 +106,22 @@ def test_a_frame_that_nobody_else_saw_is_unconfirmed(scan):
     verdict = verdict_on(scan, poses)
     assert verdict.band != "good"
     assert any("frame_00005: no other frame shows enough of the same surface" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sigmas", [4.0, 9.0])
+def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axis, sigmas):
+    """Positions do not count, nor do frames whose uncertainty was not stated."""
+    stated, angle = 0.5, sigmas * np.sqrt(3) * 0.5
+    frames = tuple(replace(f, pose_sigma=PoseSigma(0.001, stated, 0.001, stated)) for f in scan.frames[:-1])
+    frames += (replace(scan.frames[-1], pose_sigma=None),)
+    T = scan.poses.T_world_camera.copy()
+    turn = Rotation.from_rotvec(np.radians(angle) * np.eye(3)[axis]).as_matrix()
+    T[[3, -1], :3, :3] = T[[3, -1], :3, :3] @ turn
+    T[:, :3, 3] += 40.0
+    found = departed_frames(replace(scan, frames=frames), DevicePoses(T, scan.poses.T_world_projector))
+    assert [one.name for one in found] == ([scan.frames[3].name] if sigmas > 6 else [])
+    for one in found:
+        assert one.turned_deg == pytest.approx(angle, rel=1e-6) and one.stated_deg == stated
+        assert [r.band for r in departed_reasons(found)] == ["acceptable"]
+        assert f"{one.name} ({angle:.1f} deg, stated 0.5)" in describe_departed(found)
