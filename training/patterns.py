@@ -46,6 +46,13 @@ def random_grid(rng: np.random.Generator) -> GridPattern:
     )
 
 
+def seeded_grid(rng: np.random.Generator) -> GridPattern:
+    """The same with the symbols of a seed, as a pattern.json can hold them, and with more or fewer nodes."""
+    side = int(rng.integers(28, 50)) * _PERIOD
+    one = random_grid(rng)
+    return GridPattern(side, side, one.period, one.line_width, one.gap, one.dark, int(rng.integers(1 << 20)))
+
+
 def draw_pattern(grid: GridPattern) -> DrawnPattern:
     """The pictures of a random grid."""
     assert grid.codes is not None

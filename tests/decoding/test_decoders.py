@@ -90,8 +90,8 @@ def test_the_key_changes_with_everything_that_changes_results(monkeypatch, tmp_p
 
 def test_the_network_decoder_depends_on_all_that_was_trained():
     assert [path.name for path in DECODERS["network"](GRID).weights()] == [
+        "edges.safetensors",
         "gcn.safetensors",
-        "reliability.safetensors",
         "unet.safetensors",
     ]
 

@@ -1,7 +1,7 @@
 """An image of the coded grid, decoded without calibration or other frames.
 
 The grid is found and its phases are read, its nodes are recognised, coordinates spread from the nodes over all pixels,
-and a dense fit to the image refines them.
+a dense fit to the image refines them, and beside edges they are continued from where their surface is seen better.
 """
 
 from functools import cached_property
@@ -13,12 +13,14 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
 from sl_nerfstudio.decoding.grid.detection import LEAST_NODES, DetectedGrid, GridDetector
-from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
+from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
+from sl_nerfstudio.decoding.grid.edges.chooser import Chosen, EdgeChooser
+from sl_nerfstudio.decoding.grid.edges.evidence import Evidence
 from sl_nerfstudio.decoding.grid.likelihood import symbol_log_ratio
 from sl_nerfstudio.decoding.grid.phase_reader import LEAST_MASK, map_from_pixels, sample_pixels, to_pixel_coordinates
 from sl_nerfstudio.decoding.grid.refusal.causes import refusal
-from sl_nerfstudio.decoding.grid.reliability import Evidence
-from sl_nerfstudio.decoding.grid.trained import load_reliability
+from sl_nerfstudio.decoding.grid.trained import load_edge_network
+from sl_nerfstudio.decoding.grid.turned import to_pattern
 from sl_nerfstudio.decoding.grid.unwrap import spread
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.pattern.codes import rotate_codes
@@ -29,8 +31,7 @@ from sl_nerfstudio.scan.images import as_grey
 # Which pixels are kept.
 _LEAST_TRUST = 0.02  # weight in the fit of a pixel that hardly shows the pattern
 _LEAST_LOG_RATIO = 0.0  # log-likelihood ratio of the symbols around a pixel: they must not contradict it
-_LEAST_AGREEMENT = 0.35  # correlation of the image with the drawn pattern
-_MOST_WRONG = 0.2  # probability that the pixel is wrong
+_MOST_WRONG = 0.3  # probability that the pixel is wrong
 _SMALLEST_REGION = 2.0  # periods squared
 _TEAR = 0.5  # periods between neighbouring pixels
 _NORMALISING = 0.8  # window of the local intensity normalisation, periods
@@ -42,7 +43,7 @@ class GridImageDecoder:
     def __init__(self, pattern: GridPattern) -> None:
         self.pattern = pattern
         self._detector = GridDetector(pattern)
-        self._reliability = load_reliability()
+        self._drawn = draw_sharpnesses(pattern.render(), pattern.period)
 
     def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """Projector coordinates of every pixel that shows the pattern.
@@ -53,9 +54,10 @@ class GridImageDecoder:
         grey = as_grey(image)
         found = self.detect(grey)
         evidence = self.examine(grey, found)
-        fitted = self._select(evidence, found.appearance.period)
-        mask = (evidence.probability > LEAST_MASK) | np.isfinite(fitted[..., 0])
-        return Decoded(fitted, mask, self._normalise(grey, mask, found.appearance.period))
+        chosen = self.edges.choose(evidence, found.rectified, found.assignment.turn)
+        coords = self._select(chosen, found.appearance.period)
+        mask = (evidence.probability > LEAST_MASK) | np.isfinite(coords[..., 0])
+        return Decoded(coords, mask, self._normalise(grey, mask, found.appearance.period))
 
     def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
         """The grid in an image. Raises DecodingError if too little of it fits the pattern."""
@@ -74,35 +76,28 @@ class GridImageDecoder:
         to_map = map_from_pixels(found.rectified)
         log_ratio = symbol_log_ratio(turned, codes, found.maps.symbol, to_map, found.appearance.period)
         turned = np.where((log_ratio > _LEAST_LOG_RATIO)[..., None], turned, np.float32(np.nan))
-        read = self._turn_back(turned, assignment.turn)
+        read = to_pattern(turned, self.pattern, assignment.turn)
+        read[~self._inside(read)] = np.nan
         trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
         fitted, agreement = fit_densely(grey, read, trust, self._drawn, found.appearance.period)
         return Evidence(read, fitted, agreement, log_ratio, phases.probability)
 
-    def _turn_back(self, turned: Float32[ndarray, "h w 2"], turn: int) -> Float32[ndarray, "h w 2"]:
-        """From periods (x, y) in the turned array to pattern pixels; NaN outside the pattern."""
-        grid = self.pattern
-        x, y = turned[..., 0], turned[..., 1]
-        i, j = (
-            (y, x),
-            (grid.rows - 1 - x, y),
-            (grid.rows - 1 - y, grid.columns - 1 - x),
-            (x, grid.columns - 1 - y),
-        )[turn]
-        coords = np.stack([grid.x0 + j * grid.period, grid.y0 + i * grid.period], -1).astype(np.float32)
-        return np.where(_inside(coords, grid)[..., None], coords, np.float32(np.nan))
-
-    def _select(self, evidence: Evidence, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
-        """The fitted coordinates without pixels that are probably wrong and without small regions."""
-        wrong = self._reliability.wrong(evidence.features(self.pattern.period, pixels_a_period))
-        kept = (wrong < _MOST_WRONG) & (evidence.agreement > _LEAST_AGREEMENT) & _inside(evidence.fitted, self.pattern)
-        coords = np.where(kept[..., None], evidence.fitted, np.float32(np.nan))
+    def _select(self, chosen: Chosen, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
+        """The coordinates without pixels that are probably wrong and without small regions."""
+        kept = (chosen.wrong < _MOST_WRONG) & self._inside(chosen.coords)
+        coords = np.where(kept[..., None], chosen.coords, np.float32(np.nan))
         least = round(_SMALLEST_REGION * pixels_a_period**2)
         return drop_small_regions(coords, _TEAR * self.pattern.period, least)
 
+    def _inside(self, coords: Float32[ndarray, "h w 2"]) -> Bool[ndarray, "h w"]:
+        """Pixels whose coordinates lie in the pattern; False for NaN."""
+        x, y = coords[..., 0], coords[..., 1]
+        return (x >= 0) & (x <= self.pattern.w) & (y >= 0) & (y <= self.pattern.h)
+
     @cached_property
-    def _drawn(self) -> tuple[DrawnGrid, ...]:
-        return draw_sharpnesses(self.pattern.render(), self.pattern.period)
+    def edges(self) -> EdgeChooser:
+        """Continues coordinates beside edges."""
+        return EdgeChooser(load_edge_network(), self.pattern, self._drawn)
 
     def _normalise(
         self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
@@ -111,9 +106,3 @@ class GridImageDecoder:
         return normalise_locally(
             grey, mask, _NORMALISING * pixels_a_period, float(picture.mean()), float(picture.std())
         )
-
-
-def _inside(coords: Float32[ndarray, "h w 2"], grid: GridPattern) -> Bool[ndarray, "h w"]:
-    """Pixels whose coordinates lie in the pattern; False for NaN."""
-    x, y = coords[..., 0], coords[..., 1]
-    return (x >= 0) & (x <= grid.w) & (y >= 0) & (y <= grid.h)

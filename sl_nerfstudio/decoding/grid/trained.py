@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
+from sl_nerfstudio.decoding.grid.edges.network import EdgeNetwork
 from sl_nerfstudio.decoding.grid.gcn import GraphNetwork
-from sl_nerfstudio.decoding.grid.reliability import Reliability
 from sl_nerfstudio.decoding.grid.unet import UNet
 
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -26,10 +26,11 @@ def load_graph_network() -> GraphNetwork:
     return network.eval()
 
 
-def load_reliability() -> Reliability:
-    """The trained model of wrong pixels."""
-    values = _weights("reliability")
-    return Reliability(values["weight"].numpy(), float(values["bias"]))
+def load_edge_network() -> EdgeNetwork:
+    """The trained edge network, in evaluation mode."""
+    network = EdgeNetwork()
+    network.load_state_dict(_weights("edges"))
+    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def weight_files() -> list[Path]:

@@ -32,8 +32,10 @@ class UNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = _WIDTHS
-        self.down = nn.ModuleList(_Pair(n_in, n_out) for n_in, n_out in pairwise((CHANNELS * STRIDE**2, *widths)))
-        self.up = nn.ModuleList(_Pair(deep + own, own) for own, deep in pairwise(widths))
+        self.down = nn.ModuleList(
+            ConvolutionPair(n_in, n_out) for n_in, n_out in pairwise((CHANNELS * STRIDE**2, *widths))
+        )
+        self.up = nn.ModuleList(ConvolutionPair(deep + own, own) for own, deep in pairwise(widths))
         self.head = nn.Conv2d(widths[0], 1 + 4 + SYMBOLS, 1)
 
     def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> NetworkOutput:
@@ -50,7 +52,7 @@ class UNet(nn.Module):
         return NetworkOutput(out[:, 0], out[:, 1:5], out[:, 5:])
 
 
-class _Pair(nn.Sequential):
+class ConvolutionPair(nn.Sequential):
     """Two convolutions, each followed by batch normalisation and a rectifier."""
 
     def __init__(self, n_in: int, n_out: int) -> None:
