@@ -36,7 +36,10 @@ def search(problem: Problem, refine: RefinePoses) -> tuple[Progress, float] | No
 
 
 def _away_from_borders(problem: Problem, found: Progress) -> Progress:
-    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual."""
+    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual.
+
+    Their windows average over pixels that are `half_window` nearer to the border than they are themselves.
+    """
     state, maps, s = found.state, problem.maps, problem.settings.kernel
     anchors, rows = state.anchors, found.rows
     r = residuals_of(state.rig, anchors, rows, maps)
@@ -47,6 +50,7 @@ def _away_from_borders(problem: Problem, found: Progress) -> Progress:
     least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
     if least <= 0:
         return found
+    least += maps.settings.half_window
     anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
 
