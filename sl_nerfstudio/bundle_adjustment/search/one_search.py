@@ -38,7 +38,7 @@ def search(problem: Problem, refine: RefinePoses) -> tuple[Progress, float] | No
 def _away_from_borders(problem: Problem, found: Progress) -> Progress:
     """Without look-ups so near to the border of what was decoded that their residuals are larger than usual.
 
-    Their windows average over pixels that are `half_window` nearer to the border than they are themselves.
+    As wide a strip beside those falls away, too, if windows reach that far: their look-ups average over both.
     """
     state, maps, s = found.state, problem.maps, problem.settings.kernel
     anchors, rows = state.anchors, found.rows
@@ -50,7 +50,7 @@ def _away_from_borders(problem: Problem, found: Progress) -> Progress:
     least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
     if least <= 0:
         return found
-    least += maps.settings.half_window
+    least += min(least, maps.settings.half_window)
     anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
 
