@@ -147,7 +147,9 @@ def test_training_saves_and_prints_the_next_commands(
     assert f"  ns-viewer --load-config '{short}' --viewer.websocket-host 127.0.0.1" in lines
     assert f"  sl-export --load-config '{short}' --output mesh.ply --poses refined" in lines
     assert f"  sl-eval --mesh mesh.ply --data {root} --poses refined/transforms.json --report report.html" in lines
-    assert len(said.splitlines()) <= 30 and err == ""
+    assert len(said.splitlines()) <= 30
+    # on a machine that is busy with other work, phases take so long that they report progress
+    assert all(line[:12].strip() in ("adjust", "train") and line.endswith(" left") for line in err.splitlines())
 
 
 def test_everything_is_printed_on_request(
