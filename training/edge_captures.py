@@ -8,7 +8,6 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
 from sl_nerfstudio.decoding.grid.edges.channels import EdgeView, edge_view, moved_coords
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
 from sl_nerfstudio.decoding.grid.turned import from_pattern
@@ -56,7 +55,7 @@ def edge_capture(
     if not known.any() or right[known].mean() < 1 - _ONLY_WRONG:
         return None
     turn, rectified = found.assignment.turn, found.rectified
-    view = edge_view(evidence, rectified, turn, grid, draw_sharpnesses(grid.render(), grid.period))
+    view = edge_view(evidence, rectified, turn, grid, decoder.drawn)
     return EdgeCapture(view, moved_coords(from_pattern(true, grid, turn), rectified, WRONG))
 
 

@@ -7,7 +7,6 @@ writes the captures, the weights as safetensors and a log; an interrupted run co
 
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from training.edge_errors import continuation_errors, held_out, losses
 from training.mirrored import Crop, mirrored
 from training.records import cosine_rate, log_row, save_weights
 from training.rendered_captures import rendered_captures
+from training.steps import descend, made_ahead, resume, save_checkpoint
 
 _RISK_WEIGHT = 5.0
 _HELD_OUT = 20  # every so many captures one is held out to measure with
@@ -78,13 +78,7 @@ def crops(config: Config, captures: Sequence[EdgeCapture], first: int) -> Iterat
             errors = continuation_errors(fitted, gradient, true)
         return channels.contiguous(memory_format=torch.channels_last), errors
 
-    with ThreadPoolExecutor(1) as maker:
-        coming = maker.submit(make, first)
-        for step in range(first, config.steps):
-            batch = coming.result()
-            if step + 1 < config.steps:
-                coming = maker.submit(make, step + 1)
-            yield batch
+    return made_ahead(make, first, config.steps)
 
 
 def _random_crop(rng: np.random.Generator, captures: Sequence[EdgeCapture], size: int) -> Crop:
@@ -131,9 +125,8 @@ def make_captures(config: Config) -> tuple[list[EdgeCapture], list[EdgeCapture]]
 
 def _middle(capture: EdgeCapture) -> EdgeCapture:
     """At most `_WINDOW` pixels a side of a capture."""
-    rows, columns = (
-        slice(max(0, n - _WINDOW) // 2, max(0, n - _WINDOW) // 2 + _WINDOW) for n in capture.true.shape[:2]
-    )
+    starts = [max(0, side - _WINDOW) // 2 for side in capture.true.shape[:2]]
+    rows, columns = (slice(start, start + _WINDOW) for start in starts)
     view = capture.view.part(rows, columns)
     parts = (np.ascontiguousarray(part) for part in (view.measured, view.fitted, view.read, view.continued))
     return EdgeCapture(EdgeView(*parts), capture.true[rows, columns].copy())
@@ -173,17 +166,13 @@ def train(config: Config) -> None:
     torch.manual_seed(config.seed)
     network = EdgeNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-3)
-    first = _resume(config, network, optimizer)
+    first = resume(config.output, network, optimizer)
     sums: dict[str, float] = {}
     start = time.monotonic()
     for step, (channels, errors) in zip(range(first, config.steps), crops(config, captures, first), strict=True):
-        for group in optimizer.param_groups:
-            group["lr"] = cosine_rate(config.rate, step, config.steps, 100)
         parts = losses(network(channels), errors)
-        optimizer.zero_grad(set_to_none=True)
-        (_RISK_WEIGHT * parts["risk"] + parts["wrong"]).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
-        optimizer.step()
+        rate = cosine_rate(config.rate, step, config.steps, 100)
+        descend(network, optimizer, rate, _RISK_WEIGHT * parts["risk"] + parts["wrong"])
         for key, value in parts.items():
             sums[key] = sums.get(key, 0.0) + float(value.detach())
         if (step + 1) % config.log_every == 0:
@@ -197,21 +186,8 @@ def train(config: Config) -> None:
 
 
 def _save(config: Config, step: int, network: EdgeNetwork, optimizer: torch.optim.Optimizer) -> None:
-    state = {"step": step, "network": network.state_dict(), "optimizer": optimizer.state_dict()}
-    torch.save(state, config.output / "checkpoint.new")
-    (config.output / "checkpoint.new").replace(config.output / "checkpoint.pt")
+    save_checkpoint(config.output, step, network, optimizer)
     save_weights(network, config.output / "edges.safetensors", config, step=str(step))
-
-
-def _resume(config: Config, network: EdgeNetwork, optimizer: torch.optim.Optimizer) -> int:
-    """The first step: 0, or that of the checkpoint in the output folder."""
-    path = config.output / "checkpoint.pt"
-    if not path.exists():
-        return 0
-    state = torch.load(path, weights_only=True)
-    network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
-    return int(state["step"])
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from sl_nerfstudio.decoding.grid.gcn import GraphNetwork, TurnedPattern, one_hot
 from sl_nerfstudio.decoding.grid.graph import neighbourhoods
 from training.graphs import DamagedGraph, damage_graph, random_codes, random_damage
 from training.records import cosine_rate, log_row, save_weights
+from training.steps import descend
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,8 @@ def train(config: Config) -> None:
         graph = damage_graph(rng, codes, random_damage(rng), int(rng.integers(4)), rng.uniform(0.1, 0.9))
         if len(graph.place) < 9:
             continue
-        for group in optimizer.param_groups:
-            group["lr"] = cosine_rate(config.rate, step, config.steps, 50)
         loss, right = step_loss(network, graph, turned_pattern(codes), config, rng)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
-        optimizer.step()
+        descend(network, optimizer, cosine_rate(config.rate, step, config.steps, 50), loss)
         total, recognised = total + float(loss.detach()), recognised + right
         if (step + 1) % config.log_every == 0:
             row = {

@@ -8,7 +8,6 @@ writes the weights as safetensors and a log; an interrupted run continues from i
 import math
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from sl_nerfstudio.decoding.grid.unet import NetworkOutput, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
 from training.records import cosine_rate, log_row, save_weights
+from training.steps import descend, made_ahead, resume, save_checkpoint
 
 _NODE_WEIGHT = 3.0  # symbols are read at nodes: errors count more there
 _RENEWAL = 20  # steps between two new patterns
@@ -125,13 +125,7 @@ def batches(config: Config, first: int) -> Iterator[Batch]:
             stock.renew()
         return stack([random_capture(rng, stock, config.size) for _ in range(config.batch)])
 
-    with ThreadPoolExecutor(1) as maker:
-        coming = maker.submit(make, first)
-        for step in range(first, config.steps):
-            batch = coming.result()
-            if step + 1 < config.steps:
-                coming = maker.submit(make, step + 1)
-            yield batch
+    return made_ahead(make, first, config.steps)
 
 
 def train(config: Config) -> None:
@@ -144,18 +138,14 @@ def train(config: Config) -> None:
     if config.start is not None:
         network.load_state_dict(load_file(config.start))
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-3)
-    first = _resume(config, network, optimizer)
+    first = resume(config.output, network, optimizer)
     sums: dict[str, float] = {}
     start = time.monotonic()
     for step, batch in zip(range(first, config.steps), batches(config, first), strict=True):
-        for group in optimizer.param_groups:
-            group["lr"] = cosine_rate(config.rate, step, config.steps, 100)
         output = network(batch.channels)
         parts = losses(output, batch)
-        optimizer.zero_grad(set_to_none=True)
-        sum(parts.values(), torch.zeros(())).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
-        optimizer.step()
+        rate = cosine_rate(config.rate, step, config.steps, 100)
+        descend(network, optimizer, rate, sum(parts.values(), torch.zeros(())))
         for key, value in {**{k: float(v.detach()) for k, v in parts.items()}, **figures(output, batch)}.items():
             sums[key] = sums.get(key, 0.0) + value
         if (step + 1) % config.log_every == 0:
@@ -167,21 +157,8 @@ def train(config: Config) -> None:
 
 
 def _save(config: Config, step: int, network: UNet, optimizer: torch.optim.Optimizer) -> None:
-    state = {"step": step, "network": network.state_dict(), "optimizer": optimizer.state_dict()}
-    torch.save(state, config.output / "checkpoint.new")
-    (config.output / "checkpoint.new").replace(config.output / "checkpoint.pt")
+    save_checkpoint(config.output, step, network, optimizer)
     save_weights(network, config.output / "unet.safetensors", config, step=str(step))
-
-
-def _resume(config: Config, network: UNet, optimizer: torch.optim.Optimizer) -> int:
-    """The first step: 0, or that of the checkpoint in the output folder."""
-    path = config.output / "checkpoint.pt"
-    if not path.exists():
-        return 0
-    state = torch.load(path, weights_only=True)
-    network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
-    return int(state["step"])
 
 
 if __name__ == "__main__":

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.similarity import angle_deg
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.verdict.verdict import Reason
 
@@ -29,13 +27,14 @@ def departed_frames(scan: Scan, poses: DevicePoses) -> list[DepartedFrame]:
 
     Positions are not compared: they depend on turns by as much as the camera is away from what it sees.
     """
-    turned = _turned_deg(scan.poses.T_world_camera, poses.T_world_camera)
-    stated = [None if f.pose_sigma is None else f.pose_sigma.camera_rotation_deg for f in scan.frames]
-    return [
-        DepartedFrame(frame.name, float(angle), sigma)
-        for frame, angle, sigma in zip(scan.frames, turned, stated, strict=True)
-        if sigma is not None and angle > _MOST_SIGMA * np.sqrt(3) * sigma
-    ]
+    found = []
+    for frame, T_start, T_end in zip(scan.frames, scan.poses.T_world_camera, poses.T_world_camera, strict=True):
+        if frame.pose_sigma is None:
+            continue
+        turned, stated = angle_deg(T_start[:3, :3].T @ T_end[:3, :3]), frame.pose_sigma.camera_rotation_deg
+        if turned > _MOST_SIGMA * np.sqrt(3) * stated:
+            found.append(DepartedFrame(frame.name, turned, stated))
+    return found
 
 
 def describe_departed(found: Sequence[DepartedFrame]) -> str:
@@ -48,7 +47,3 @@ def departed_reasons(found: Sequence[DepartedFrame]) -> list[Reason]:
     return [
         Reason("acceptable", f"{describe_departed([one])}: far from its starting pose; look at it") for one in found
     ]
-
-
-def _turned_deg(a: Float64[ndarray, "n 4 4"], b: Float64[ndarray, "n 4 4"]) -> Float64[ndarray, "n"]:
-    return np.degrees(Rotation.from_matrix(a[:, :3, :3].transpose(0, 2, 1) @ b[:, :3, :3]).magnitude())

@@ -13,7 +13,7 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
 from sl_nerfstudio.decoding.grid.detection import LEAST_NODES, DetectedGrid, GridDetector
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
+from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
 from sl_nerfstudio.decoding.grid.edges.chooser import Chosen, EdgeChooser
 from sl_nerfstudio.decoding.grid.edges.evidence import Evidence
 from sl_nerfstudio.decoding.grid.likelihood import symbol_log_ratio
@@ -43,7 +43,6 @@ class GridImageDecoder:
     def __init__(self, pattern: GridPattern) -> None:
         self.pattern = pattern
         self._detector = GridDetector(pattern)
-        self._drawn = draw_sharpnesses(pattern.render(), pattern.period)
 
     def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """Projector coordinates of every pixel that shows the pattern.
@@ -79,7 +78,7 @@ class GridImageDecoder:
         read = to_pattern(turned, self.pattern, assignment.turn)
         read[~self._inside(read)] = np.nan
         trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
-        fitted, agreement = fit_densely(grey, read, trust, self._drawn, found.appearance.period)
+        fitted, agreement = fit_densely(grey, read, trust, self.drawn, found.appearance.period)
         return Evidence(read, fitted, agreement, log_ratio, phases.probability)
 
     def _select(self, chosen: Chosen, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
@@ -95,14 +94,19 @@ class GridImageDecoder:
         return (x >= 0) & (x <= self.pattern.w) & (y >= 0) & (y <= self.pattern.h)
 
     @cached_property
+    def drawn(self) -> tuple[DrawnGrid, ...]:
+        """The pattern from sharp to soft."""
+        return draw_sharpnesses(self.pattern.render(), self.pattern.period)
+
+    @cached_property
     def edges(self) -> EdgeChooser:
         """Continues coordinates beside edges."""
-        return EdgeChooser(load_edge_network(), self.pattern, self._drawn)
+        return EdgeChooser(load_edge_network(), self.pattern, self.drawn)
 
     def _normalise(
         self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
     ) -> Float32[ndarray, "h w"]:
-        picture = self._drawn[0].layers[..., 0]
+        picture = self.drawn[0].layers[..., 0]
         return normalise_locally(
             grey, mask, _NORMALISING * pixels_a_period, float(picture.mean()), float(picture.std())
         )

@@ -26,20 +26,19 @@ class NetworkOutput(NamedTuple):
     symbol: Float[Tensor, "b 5 h w"]  # logits of the symbol of the nearest node
 
 
-class UNet(nn.Module):
-    """Four levels of two 3 x 3 convolutions; the image enters with 2 x 2 pixels folded into channels."""
+class LevelNetwork(nn.Module):
+    """Levels of two 3 x 3 convolutions, down and up again; the image enters with 2 x 2 pixels folded into channels."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int, widths: tuple[int, ...], outputs: int) -> None:
         super().__init__()
-        widths = _WIDTHS
         self.down = nn.ModuleList(
-            ConvolutionPair(n_in, n_out) for n_in, n_out in pairwise((CHANNELS * STRIDE**2, *widths))
+            ConvolutionPair(n_in, n_out) for n_in, n_out in pairwise((channels * STRIDE**2, *widths))
         )
         self.up = nn.ModuleList(ConvolutionPair(deep + own, own) for own, deep in pairwise(widths))
-        self.head = nn.Conv2d(widths[0], 1 + 4 + SYMBOLS, 1)
+        self.head = nn.Conv2d(widths[0], outputs, 1)
 
-    def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> NetworkOutput:
-        """Predict for images whose sides are multiples of `MULTIPLE`."""
+    def maps(self, channels: Float[Tensor, "b c h2 w2"]) -> Float[Tensor, "b outputs h w"]:
+        """The outputs at half the resolution of the image."""
         x = F.pixel_unshuffle(channels, STRIDE)
         kept: list[Tensor] = []
         for level, block in enumerate(self.down):
@@ -48,7 +47,18 @@ class UNet(nn.Module):
         for level in reversed(range(len(self.up))):
             larger = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = self.up[level](torch.cat([larger, kept[level]], 1))
-        out = self.head(x)
+        return self.head(x)
+
+
+class UNet(LevelNetwork):
+    """Four levels, for images whose sides are multiples of `MULTIPLE`."""
+
+    def __init__(self) -> None:
+        super().__init__(CHANNELS, _WIDTHS, 1 + 4 + SYMBOLS)
+
+    def forward(self, channels: Float[Tensor, "b 2 h2 w2"]) -> NetworkOutput:
+        """Predict for images whose sides are multiples of `MULTIPLE`."""
+        out = self.maps(channels)
         return NetworkOutput(out[:, 0], out[:, 1:5], out[:, 5:])
 
 
