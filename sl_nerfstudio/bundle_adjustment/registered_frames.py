@@ -40,6 +40,8 @@ class RegisteredFramesSettings:
 
     frame_rotation_deg: float = 1.0
     """Error of each frame's rotation after registration, 1 sigma per axis, in degrees."""
+    toned_rotation_deg: float = 0.5
+    """The same for a frame that tones hold where its surface would let it slip: the adjustment lets it slip, too."""
     frame_translation: float = 0.03
     """The same for its position, as a share of the object's radius."""
     baseline_length: float = 0.02
@@ -243,6 +245,7 @@ def _prior(
     whole, that puts the camera off.
     """
     rows = []
+    toned = {name for edge in registration.edges if edge.used and edge.by_tone for name in edge.frames}
     for k in index:
         pose, length = clouds[k].pose, registration.baseline[k] * scale
         direction = np.sqrt(np.trace(pose.covariance[3:, 3:]) / 2)
@@ -250,10 +253,11 @@ def _prior(
         motion = motion_by_pose_errors(clouds[k])
         camera_shift = motion[:3] - np.outer(clouds[k].centroid, motion[6])
         growth = float(np.linalg.norm(motion[6]))
+        turn_deg = settings.toned_rotation_deg if registration.names[k] in toned else settings.frame_rotation_deg
         rows.append(
             (
                 float(np.hypot(settings.frame_translation, length * np.linalg.norm(camera_shift) / 3**0.5)),
-                float(np.hypot(np.radians(settings.frame_rotation_deg), np.linalg.norm(motion[3:6]) / 3**0.5)),
+                float(np.hypot(np.radians(turn_deg), np.linalg.norm(motion[3:6]) / 3**0.5)),
                 length * float(np.linalg.norm([settings.baseline_length, growth, direction])),
                 max(turn, np.radians(settings.least_relative_rotation_deg)),
             )

@@ -16,6 +16,7 @@ class Decoded:
     coords: Float32[ndarray, "h w 2"]  # (x_p, y_p), NaN where not decoded
     mask: Bool[ndarray, "h w"]  # where the pattern lights the object; True at every decoded pixel
     pattern: Float32[ndarray, "h w"]  # in [0, 1]: captured intensity, locally normalised; 0 outside the mask
+    light: Float32[ndarray, "h w"] | None = None  # that a pattern value of 1 adds, of full scale; NaN where unknown
 
     @property
     def decoded(self) -> Bool[ndarray, "h w"]:

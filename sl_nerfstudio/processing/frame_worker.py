@@ -109,7 +109,7 @@ class FrameWorker:
                 (coords, camera, job.projector, job.seed),
                 lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
             )
-            cloud = frame_cloud(result.name, coords, camera, job.projector, pose)
+            cloud = frame_cloud(result.name, coords, camera, job.projector, pose, light=decoded.light)
         except RelativePoseError as error:
             return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
         return replace(result, cloud=cloud)

@@ -59,7 +59,9 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         group = f"it and {listed(others, _LISTED)} form a group whose" if others else "its"
         remedy = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
         why = "may slip along the surface (of revolution, or a plane)" if exclusion.slips else "is not certain"
-        more = ", with something beside the object in view that does not look the same from all sides"
+        more = (
+            ", with marks on the object (chalk, tape) or something beside it that does not look the same from all sides"
+        )
         return f"{group} connection to the other frames {why}; capture views {remedy}{more if exclusion.slips else ''}"
     return (
         f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "

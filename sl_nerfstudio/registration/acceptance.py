@@ -33,8 +33,8 @@ from sl_nerfstudio.threads import results
 
 def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
     """Poses and baselines of the largest component; every other frame with its reason."""
-    edges, settings = graph.edges, graph.settings
-    components = graph.assemble()
+    components, settings = graph.assemble(), graph.settings
+    edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
     component = _numbers(components, len(names))
     solution = graph.solve(components[0])
@@ -56,7 +56,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         tuple(
             Edge(
                 (names[e.source], names[e.target]), e.overlap, e.fitness, bool(used), is_ambiguous(e, settings.edge),
-                e.rotation_sigma_deg,
+                e.rotation_sigma_deg, e.by_tone,
             )
             for e, used in zip(edges, solution.consistent, strict=True)
         ),

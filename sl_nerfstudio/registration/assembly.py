@@ -127,7 +127,9 @@ class Assembly:
             return None
         if others and others[0][0] > s.largest_rival * score:
             return None
-        if any(self._slips(best, e, first, second) for e in self._between(self._slipping, first, second)):
+        if not self._held_by_tone(best, first, second) and any(
+            self._slips(best, e, first, second) for e in self._between(self._slipping, first, second)
+        ):
             return None
         if best.links < 2 and not self._certain_alone(first, second):
             return None
@@ -233,6 +235,14 @@ class Assembly:
             agreeing += float(sums.agreeing[0])
             contradicting += float(sums.in_front[0] + behind * sums.behind[0])
         return agreeing, contradicting
+
+    def _held_by_tone(self, joint: Joint, first: Component, second: Component) -> bool:
+        """Whether tones tell what surfaces do not notice: a pair across that they hold says the same."""
+        return any(
+            self._same(self._links(e, first, second)[0], joint.S_first_second, first, second)
+            for e in self._crossing(first, second)
+            if e.by_tone
+        )
 
     def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
         """Whether all frames across together do not notice the motion along which one pair of them slips."""

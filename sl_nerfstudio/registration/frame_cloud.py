@@ -28,6 +28,7 @@ class FrameCloud:
     points: Float64[ndarray, "n 3"]
     sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
     pose_errors: Float64[ndarray, "n 5"]  # along the camera ray, by one sigma of each principal error of the pose
+    light: Float32[ndarray, "h w"] | None = None  # of the projector that each pixel returns; None: not measured
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     @property
@@ -58,8 +59,11 @@ def frame_cloud(
     projector: Device,
     pose: RelativePose,
     settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
+    light: Float32[ndarray, "h w"] | None = None,
 ) -> FrameCloud:
     """Triangulate one frame, with each pose that explains it. `coords` are those from which `pose` was found.
+
+    `light` is how much of the projector's light each pixel returns, NaN where that is unknown.
 
     Raises RelativePoseError where hardly any point agrees with the pose.
     """
@@ -95,8 +99,9 @@ def frame_cloud(
         points,
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
         pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+        light=light,
         alternatives=tuple(
-            frame_cloud(name, coords, camera, projector, other, settings)
+            frame_cloud(name, coords, camera, projector, other, settings, light)
             for other in pose.alternatives
             if other.inliers.sum() >= settings.fewest_points
         ),

@@ -40,7 +40,7 @@ def with_relative_pose(
         noise_px=old.noise_px[old.inliers],
         alternatives=(),
     )
-    return frame_cloud(cloud.name, cloud.coords, cloud.camera, cloud.projector, pose)
+    return frame_cloud(cloud.name, cloud.coords, cloud.camera, cloud.projector, pose, light=cloud.light)
 
 
 @one_library_thread()

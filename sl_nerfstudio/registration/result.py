@@ -17,6 +17,7 @@ class Edge:
     used: bool  # False: inconsistent with the other pairs
     undecided: bool  # a clearly different similarity fits nearly as well
     rotation_sigma_deg: float  # standard deviation of the rotation that this pair determines least
+    by_tone: bool = False  # surfaces alone would let the frames slip: their tones hold them
 
 
 @dataclass(frozen=True)

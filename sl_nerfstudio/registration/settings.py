@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from sl_nerfstudio.registration.tone.settings import ToneMatchSettings, ToneSettings
+
 
 @dataclass(frozen=True)
 class FrameCloudSettings:
@@ -41,6 +43,8 @@ class SurfaceMapSettings:
     """quantile of the depths in the middle at which the object is expected: a table may be behind it"""
     nearness: float = 0.1
     """share of that depth by which the object's centre lies behind its surface at most"""
+    tone: ToneSettings = field(default_factory=ToneSettings)
+    """what of the brightness belongs to the surface"""
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,8 @@ class PairSettings:
     """rotation between two results, in degrees, below which they are one"""
     same_shift: float = 0.12
     """shift between two results, in radii, below which they are one"""
+    tone: ToneMatchSettings = field(default_factory=ToneMatchSettings)
+    """how the tone of a surface holds frames that would slip"""
     agreement: AgreementSettings = field(default_factory=AgreementSettings)
     """when points agree with a surface"""
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled_range
@@ -12,6 +12,7 @@ from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.plane_fit import solve_plane
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, reliable_points
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, SurfaceMapSettings
+from sl_nerfstudio.registration.tone.surface_tone import surface_tone
 from sl_nerfstudio.relative_pose.ray_pairs import directions
 
 
@@ -32,6 +33,7 @@ class SurfaceMap:
     normal: Float64[ndarray, "h w 3"]  # towards the camera
     sigma: Float64[ndarray, "h w"]  # one standard deviation of the surface along its normal
     valid: Bool[ndarray, "h w"]
+    tone: Float32[ndarray, "h w"]  # see surface_tone; NaN where unknown
     weight: Float64[ndarray, "m"]  # of each valid place when places are drawn: large where few look its way
     centroid: Float64[ndarray, "3"]
     radius: float  # RMS distance of the points from the centroid
@@ -116,11 +118,33 @@ def build_surface_map(
         np.ascontiguousarray(np.nan_to_num(normal)),
         np.ascontiguousarray(sigma),
         valid,
+        _tone(cloud, keep, index, point, normal, valid, settings),
         _orientation_weights(normal[valid], settings.orientations),
         centroid,
         radius,
         _views(points, place, camera, settings),
     )
+
+
+def _tone(
+    cloud: FrameCloud,
+    keep: Bool[ndarray, "n"],
+    index: Int64[ndarray, "m"],
+    point: Float64[ndarray, "h w 3"],
+    normal: Float64[ndarray, "h w 3"],
+    valid: Bool[ndarray, "h w"],
+    settings: SurfaceMapSettings,
+) -> Float32[ndarray, "h w"]:
+    """The surface's tone on the lattice; `index` is the place in the lattice of each point that is kept."""
+    if cloud.light is None:
+        return np.full(valid.shape, np.nan, dtype=np.float32)
+    column, row = np.floor(cloud.uv_camera[keep]).astype(np.int64).T
+    light = cloud.light[row, column]
+    known = np.isfinite(light)
+    count = np.bincount(index[known], minlength=valid.size)
+    mean = np.bincount(index[known], light[known], valid.size) / np.maximum(count, 1)
+    light = np.where(valid & (count.reshape(valid.shape) > 0), mean.reshape(valid.shape), np.nan)
+    return surface_tone(light, point, normal, cloud.pose.T_camera_projector[:3, 3], settings.tone)
 
 
 def _beyond_similarity(

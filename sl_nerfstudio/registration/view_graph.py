@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.assembly import Assembly, Component
@@ -17,6 +19,7 @@ from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, 
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
 from sl_nerfstudio.registration.settings import RegistrationSettings, Search
 from sl_nerfstudio.registration.surface_map import SurfaceMap
+from sl_nerfstudio.registration.tone.cycles import with_confirmed_tones
 from sl_nerfstudio.side_by_side import tracked
 
 Pair = tuple[int, int]
@@ -44,8 +47,9 @@ class ViewGraph:
 
     @property
     def edges(self) -> list[PairMatch]:
-        """Pairs that agree well enough."""
-        return [match for match in self.matches if is_accepted(match, self.settings.edge)]
+        """Pairs that agree well enough; what only the tones of two frames say counts if a third frame confirms it."""
+        accepted = [match for match in self.matches if is_accepted(match, self.settings.edge)]
+        return with_confirmed_tones(accepted, self.pivots, self.settings.pair)
 
     def try_pairs(self, pairs: Sequence[Pair], search: Search) -> None:
         """Register pairs without a guess, or from the rough poses of both where there are any."""
@@ -110,9 +114,14 @@ class ViewGraph:
         return Assembly(self.sides, self.pivots, self.edges, self.settings).grow()
 
     def solve(self, component: Component) -> PoseGraphSolution:
-        """A component with all edges inside it optimised together."""
-        weight = edge_weights(self.edges, self.settings.edge)
-        return optimise_pose_graph(self.edges, self.pivots, component, weight, self.settings.pose_graph)
+        """A component with the pairs that hold it optimised together."""
+        edges = self.holding(component)
+        weight = edge_weights(edges, self.settings.edge)
+        return optimise_pose_graph(edges, self.pivots, component, weight, self.settings.pose_graph)
+
+    def holding(self, component: Component) -> list[PairMatch]:
+        """The pairs, without those inside a component that may slip, if the others hold it together."""
+        return without_slipping(self.edges, component, self.settings.pair.bounded_slip_deg)
 
     def see_same_side(self, a: Similarity, b: Similarity) -> bool:
         """Whether the lines of sight of two cameras differ little enough to see a common surface."""
@@ -182,6 +191,27 @@ def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
 def split_by_slip(edges: Sequence[PairMatch], bounded_deg: float) -> tuple[list[PairMatch], list[PairMatch]]:
     """Pairs that hold their frames in place to within an angle, and pairs that may slip by more."""
     return [e for e in edges if e.slip_deg <= bounded_deg], [e for e in edges if e.slip_deg > bounded_deg]
+
+
+def without_slipping(edges: Sequence[PairMatch], component: Component, bounded_deg: float) -> list[PairMatch]:
+    """The pairs without those inside a component that may slip by more than an angle, if it is connected without."""
+    firm, slipping = split_by_slip(edges, bounded_deg)
+    if not _connected(component, firm):
+        return list(edges)
+    dropped = {id(e) for e in slipping if e.source in component and e.target in component}
+    return [e for e in edges if id(e) not in dropped]
+
+
+def _connected(component: Component, edges: Sequence[PairMatch]) -> bool:
+    """Whether pairs inside a component lead from each of its frames to every other."""
+    inside = [(e.source, e.target) for e in edges if e.source in component and e.target in component]
+    if not inside:
+        return len(component) < 2
+    place = {frame: k for k, frame in enumerate(component)}
+    rows, columns = np.array([(place[i], place[j]) for i, j in inside]).T
+    size = len(component)
+    links = coo_array((np.ones(len(inside)), (rows, columns)), shape=(size, size))
+    return bool(connected_components(links, directed=False)[0] == 1)
 
 
 def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:

@@ -94,7 +94,8 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
     (
         SeparateComponent("a", ("a",), True, "b"),
         "its connection to the other frames may slip along the surface (of revolution, or a plane); capture views "
-        "between it and b, with something beside the object in view that does not look the same from all sides",
+        "between it and b, with marks on the object (chalk, tape) or something beside it that does not look the same "
+        "from all sides",
     ),
     (
         CoordinatesDisagree("a", ("a",)),

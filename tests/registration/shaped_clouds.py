@@ -9,9 +9,11 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.pattern.light import projected_light
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
 from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.render import RenderedCapture
 from sl_nerfstudio.synthesis.setup import Setup, make_setup
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
@@ -90,17 +92,34 @@ def _setup(scene: str, resolution: int, frames: int, seed: int) -> Setup:
     return make_setup(SynthConfig(scene=scene, frames=frames, resolution=resolution, seed=seed))
 
 
+def _light(setup: Setup, view: RenderedCapture) -> ndarray:
+    """As the decoder measures it: in a window of half a period."""
+    step = np.abs(np.diff(view.coords, axis=1))[:-1] + np.abs(np.diff(view.coords, axis=0))[:, :-1]
+    pixels = setup.layout.lattice.period / float(np.nanmedian(np.linalg.norm(step, axis=-1))) * 2**0.5
+    return projected_light(view.radiance, view.coords, [setup.pattern], 0.5 * pixels)
+
+
 @cache
 def rendered(
-    scene: str, frames: Sequence[int], of: int = 24, resolution: int = 150, noise: float = 0.15, seed: int = 3
+    scene: str,
+    frames: Sequence[int],
+    of: int = 24,
+    resolution: int = 150,
+    noise: float = 0.15,
+    seed: int = 3,
+    lit: bool = False,
 ) -> RenderedClouds:
-    """Some frames of a walk of `of` frames around a scene, with noise in pattern pixels."""
+    """Some frames of a walk of `of` frames around a scene, with noise in pattern pixels.
+
+    `lit`: the light that the surface returns is measured in the images; sl-synth's surfaces have faint blotches.
+    """
     setup, rng, out = _setup(scene, resolution, of, seed), np.random.default_rng(seed), []
     camera, projector = setup.devices.camera, setup.devices.projector
     for k in frames:
-        coords = setup.render(k, 1).coords
-        coords = coords + noise * rng.standard_normal(coords.shape).astype(np.float32)
+        view = setup.render(k, 1)
+        light = _light(setup, view) if lit else None
+        coords = view.coords + noise * rng.standard_normal(view.coords.shape).astype(np.float32)
         T = np.linalg.inv(setup.truth.T_world_camera[k]) @ setup.truth.T_world_projector[k]
         pose = known_pose(T, *correspondences_of(coords), camera, projector)
-        out.append(frame_cloud(f"{scene} {k}", coords, camera, projector, pose))
+        out.append(frame_cloud(f"{scene} {k}", coords, camera, projector, pose, light=light))
     return RenderedClouds(tuple(out), setup, tuple(frames))

@@ -192,3 +192,14 @@ def test_a_single_registered_frame_is_an_error_that_names_the_others(clouds, who
     alone = replace(whole, registered=np.arange(FRAMES) == 0, exclusions=lost)
     with pytest.raises(UserError, match=r"1 of 18 frames could be registered(.|\n)*: frame_00009, frame_00010"):
         adjust_registered(clouds, alone)
+
+
+def test_a_vase_is_put_together_by_its_blotches():
+    """Its shape tells nothing of the turn about its axis; the faint blotches that sl-synth paints on it do."""
+    some = rendered("vase", tuple(range(4, 12)), resolution=240, lit=True)
+    bare = register([replace(c, light=None) for c in some.clouds], sequence=True)
+    found = register(some.clouds, sequence=True)
+    assert bare.registered.sum() < len(some.frames)
+    assert found.registered.all() and not found.uncertainties
+    rotation = pose_errors(some.T_world_camera, some.baseline, found.T_world_camera, found.baseline)[0]
+    assert rotation.max() < 2

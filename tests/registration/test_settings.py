@@ -14,25 +14,31 @@ from sl_nerfstudio import registration, relative_pose
 from sl_nerfstudio.registration import settings as registration_settings
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
 from sl_nerfstudio.registration.settings import FrameCloudSettings
+from sl_nerfstudio.registration.tone import settings as tone_settings
 from sl_nerfstudio.relative_pose import settings as relative_pose_settings
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
 from tests.relative_pose.known_pose import known_pose
 from tests.relative_pose.two_views import view
 
-MODULES = {relative_pose_settings: relative_pose, registration_settings: registration}
+MODULES = {
+    relative_pose_settings: relative_pose,
+    registration_settings: registration,
+    tone_settings: registration,
+}
 CLASSES = [
     (module, cls)
     for module in MODULES
     for cls in vars(module).values()
-    if dataclasses.is_dataclass(cls) and isinstance(cls, type)
+    if dataclasses.is_dataclass(cls) and isinstance(cls, type) and cls.__module__ == module.__name__
 ]
 
 
 @pytest.mark.parametrize(("module", "cls"), CLASSES, ids=lambda x: getattr(x, "__name__", ""))
 def test_every_setting_is_frozen_documented_and_used(module, cls):
     source = Path(module.__file__)
-    code = "\n".join(p.read_text() for p in source.parent.rglob("*.py") if p != source)
+    package = Path(MODULES[module].__file__).parent
+    code = "\n".join(p.read_text() for p in package.rglob("*.py") if p != source)
     tree = ast.parse(source.read_text())
     body = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == cls.__name__).body
     texts = {

@@ -69,7 +69,8 @@ def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
     known = np.isfinite(coords).all(-1) & light.lit
     coords[~known] = np.nan
     coords = drop_small_regions(coords, _LARGEST_STEP * max(layout.cell, _usual_step(coords)), _LEAST_REGION)
-    decoded = Decoded(coords, light.lit, np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32))
+    stripe = np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32)
+    decoded = Decoded(coords, light.lit, stripe, np.where(light.lit, light.direct, np.float32(np.nan)))
     if decoded.rate < _LEAST_DECODED:
         raise DecodingError(
             f"only {decoded.rate:.1%} of the lit pixels could be decoded",

@@ -19,7 +19,7 @@ class GrayCodeDecoder(Decoder[GrayCode]):
     """Decodes a folder of images: one photograph of every pattern of the sequence."""
 
     name: ClassVar[str] = "graycode"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     reads: ClassVar[str] = GrayCode.kind
     sequence: ClassVar[bool] = True
 

@@ -6,6 +6,7 @@ a dense fit to the image refines them, and beside edges they are continued from 
 
 from functools import cached_property
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
@@ -25,6 +26,7 @@ from sl_nerfstudio.decoding.grid.unwrap import spread
 from sl_nerfstudio.decoding.regions import drop_small_regions
 from sl_nerfstudio.pattern.codes import rotate_codes
 from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.light import projected_light
 from sl_nerfstudio.pattern.normalise import normalise_locally
 from sl_nerfstudio.scan.images import as_grey
 
@@ -35,6 +37,8 @@ _MOST_WRONG = 0.3  # probability that the pixel is wrong
 _SMALLEST_REGION = 2.0  # periods squared
 _TEAR = 0.5  # periods between neighbouring pixels
 _NORMALISING = 0.8  # window of the local intensity normalisation, periods
+_LIGHT_WINDOW = 0.5  # window in which the light is measured, periods
+_LIGHT_BLURS = (0.05, 0.09, 0.14, 0.2)  # of the pattern with which it is measured, periods
 
 
 class GridImageDecoder:
@@ -56,7 +60,9 @@ class GridImageDecoder:
         chosen = self.edges.choose(evidence, found.rectified, found.assignment.turn)
         coords = self._select(chosen, found.appearance.period)
         mask = (evidence.probability > LEAST_MASK) | np.isfinite(coords[..., 0])
-        return Decoded(coords, mask, self._normalise(grey, mask, found.appearance.period))
+        period = found.appearance.period
+        light = projected_light(grey, coords, self._soft, _LIGHT_WINDOW * period)
+        return Decoded(coords, mask, self._normalise(grey, mask, period), light)
 
     def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
         """The grid in an image. Raises DecodingError if too little of it fits the pattern."""
@@ -106,7 +112,15 @@ class GridImageDecoder:
     def _normalise(
         self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
     ) -> Float32[ndarray, "h w"]:
-        picture = self.drawn[0].layers[..., 0]
-        return normalise_locally(
-            grey, mask, _NORMALISING * pixels_a_period, float(picture.mean()), float(picture.std())
-        )
+        mean, spread = float(self._picture.mean()), float(self._picture.std())
+        return normalise_locally(grey, mask, _NORMALISING * pixels_a_period, mean, spread)
+
+    @cached_property
+    def _soft(self) -> list[Float32[ndarray, "ph pw"]]:
+        """The pattern through lenses of different sharpness."""
+        picture, period = self.pattern.render(), self.pattern.period
+        return [cv2.GaussianBlur(picture, (0, 0), blur * period) for blur in _LIGHT_BLURS]
+
+    @property
+    def _picture(self) -> Float32[ndarray, "ph pw"]:
+        return self.drawn[0].layers[..., 0]

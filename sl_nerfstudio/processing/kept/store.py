@@ -8,6 +8,8 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from jaxtyping import Bool, Float16, Float32, UInt16
+from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.files.atomic import write_atomic
@@ -43,22 +45,38 @@ class DecodedStore:
         try:
             with np.load(BytesIO(content), allow_pickle=False) as stored:
                 coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
+                light = stored.get("light")
         except (ValueError, KeyError, EOFError, BadZipFile):
             return None
         if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
             return None
-        return Decoded(coords, mask, pattern.astype(np.float32) / np.float32(65535))
+        if light is not None and light.shape != mask.shape:
+            return None
+        return _restored(coords, mask, pattern, light)
 
     def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
         """Store a frame, and return it as `load` will, so that a resumed run gives the same result."""
         buffer = BytesIO()
         pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
-        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern)
+        light = None if decoded.light is None else decoded.light.astype(np.float16)
+        more = {} if light is None else {"light": light}
+        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern, **more)
         write_checked(self._path(frame, key), buffer.getvalue())
-        return Decoded(decoded.coords, decoded.mask, pattern.astype(np.float32) / np.float32(65535))
+        return _restored(decoded.coords, decoded.mask, pattern, light)
 
     def _path(self, frame: CapturedFrame, key: str) -> Path:
         return self.root / DECODED / f"{frame.name}-{key}.npz"
+
+
+def _restored(
+    coords: Float32[ndarray, "h w 2"],
+    mask: Bool[ndarray, "h w"],
+    pattern: UInt16[ndarray, "h w"],
+    light: Float16[ndarray, "h w"] | None,
+) -> Decoded:
+    """What was decoded, with intensities as exact as they are stored."""
+    values = pattern.astype(np.float32) / np.float32(65535)
+    return Decoded(coords, mask, values, None if light is None else light.astype(np.float32))
 
 
 class Manifest:

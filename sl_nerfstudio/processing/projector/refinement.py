@@ -122,7 +122,8 @@ def with_projector(clouds: Sequence[FrameCloud], consistent: ConsistentFrames, p
     for k, cloud in enumerate(clouds):
         T = poses.T_camera_projector[k] if consistent.registration.registered[k] else cloud.pose.T_camera_projector
         pose = relative_pose_near(T, *correspondences_of(cloud.coords), cloud.camera, projector)
-        out.append(kept.kept(frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose)))
+        moved = frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose, light=cloud.light)
+        out.append(kept.kept(moved))
     return out
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, with_kept_cloud
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.progress import track
@@ -27,11 +28,11 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
     Frames that have none alone, because they show a plane, say, get it as well. Raises UserError if no pose fits.
     """
     worker = FrameWorker(job)
-    decoded = {result.name: worker.load(result).coords for result in results if result.key}
+    decoded = {result.name: worker.load(result) for result in results if result.key}
     rng = np.random.default_rng(job.seed)
     parts = []
-    for coords in decoded.values():
-        uv_camera, uv_projector = correspondences_of(coords)
+    for one in decoded.values():
+        uv_camera, uv_projector = correspondences_of(one.coords)
         keep = subsample(np.arange(len(uv_camera)), _MOST_PER_FRAME, rng)
         parts.append((uv_camera[keep], uv_projector[keep]))
     if not parts:
@@ -47,12 +48,14 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
     ]
 
 
-def _with_pose(job: FrameJob, result: FrameStageResult, coords: np.ndarray, common: RelativePose) -> FrameStageResult:
-    T = common.T_camera_projector
+def _with_pose(job: FrameJob, result: FrameStageResult, decoded: Decoded, common: RelativePose) -> FrameStageResult:
+    T, coords = common.T_camera_projector, decoded.coords
     own = relative_pose_near(T, *correspondences_of(coords), job.camera, job.projector, job.seed)
     pose = replace(own, T_camera_projector=T, covariance=common.covariance, degeneracies=common.degeneracies)
     try:
-        cloud: FrameCloud | None = frame_cloud(result.name, coords, job.camera, job.projector, pose)
+        cloud: FrameCloud | None = frame_cloud(
+            result.name, coords, job.camera, job.projector, pose, light=decoded.light
+        )
     except RelativePoseError as error:
         return replace(result, cloud=None, stage="calibrating", reason=f"{result.frame.images[0]}: {error}")
     return replace(result, cloud=cloud, stage="", reason="")

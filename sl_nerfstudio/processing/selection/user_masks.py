@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,8 @@ class UserMasks:
                 "compare mask and capture",
             )  # fmt: skip
         coords = np.where(mask[..., None], decoded.coords, np.float32(np.nan))
-        return Decoded(coords, decoded.mask & mask, np.where(mask, decoded.pattern, np.float32(0)))
+        pattern = np.where(mask, decoded.pattern, np.float32(0))
+        return replace(decoded, coords=coords, mask=decoded.mask & mask, pattern=pattern)
 
     @property
     def digest(self) -> str:

@@ -11,6 +11,7 @@ from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival, match_from
 from sl_nerfstudio.registration.pairs.rotation_search import around_guess, without_guess
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement
+from sl_nerfstudio.registration.pairs.tone_match import turn_by_tone
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, PairSettings, Search
 from sl_nerfstudio.registration.surface_map import SurfaceMap
 
@@ -152,4 +153,23 @@ def _best_match(
         if score[k] > 0 and all(_differ(found, k, j, target, settings) for j in [best, *different]):
             different.append(k)
     rivals = tuple(Rival(found.similarity(k), float(score[k] / max(score[best], 1e-9))) for k in different)
-    return match_from(pair, found.similarity(best), sums, best, rivals, sides, common, settings)
+    match = match_from(pair, found.similarity(best), sums, best, rivals, sides, common, settings)
+    return _held_by_tone(match, sides, common, settings) or match
+
+
+def _held_by_tone(match: PairMatch, sides: Sides, common: Tolerance, settings: PairSettings) -> PairMatch | None:
+    """A pair that slips, turned to where its tones agree; None if it does not slip, or where that is not certain.
+
+    Other results for the pair are passed over: tones were compared all the way around.
+    """
+    if match.slip_deg == 0:
+        return None
+    turn = turn_by_tone(sides, match.S_target_source, (match.slip_direction, match.slip_deg), common, settings)
+    if turn is None:
+        return None
+    tolerance = Tolerance(0.0, settings.tolerance_sigmas)
+    S = turn.S_target_source
+    sums = agreement(*sides, Hypotheses.of(S), tolerance, tolerance, settings.agreement)
+    if sums.fitness[0] < match.fitness - settings.tone.largest_loss:
+        return None
+    return match_from((match.source, match.target), S, sums, 0, (), sides, common, settings, turn)

@@ -128,7 +128,7 @@ def slip_deg(
             ]
         )
         for _ in range(settings.slip_steps):
-            moved = _followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas), settings)
+            moved = followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas), settings)
         still, *others = (moved.similarity(k) for k in range(len(angles)))
         rises = [motion_cost(sides, still, other, unit, settings).rise for other in others]
         rise = np.minimum(rise, rises)
@@ -136,7 +136,7 @@ def slip_deg(
     return float(angles[noticed[0]] if len(noticed) else angles[-1])
 
 
-def _followed(
+def followed(
     sides: tuple[Side, Side],
     moved: Hypotheses,
     held: Float64[ndarray, "3"],

@@ -40,6 +40,11 @@ class Side:
         """With about `count` points spread evenly over the image."""
         return Side(surface, *surface.sample(count, rng))
 
+    def thinned(self, most: int) -> "Side":
+        """With every n-th of its points, at most about `most`."""
+        some = slice(None, None, max(1, len(self.points) // most))
+        return Side(self.map, *(np.ascontiguousarray(part[some]) for part in (self.points, self.normals, self.sigma)))
+
 
 @dataclass(frozen=True)
 class Tolerance:

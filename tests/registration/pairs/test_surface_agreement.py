@@ -60,7 +60,8 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     radius = float(np.sqrt(((point[valid] - centroid) ** 2).sum(-1).mean()))
     sigma = rng.uniform(0.005, 0.03, valid.shape)
     even = np.ones(int(valid.sum()))
-    return SurfaceMap(camera, point, normal, sigma, valid, even, centroid, radius, (View(centroid, radius),))
+    tone = np.full(valid.shape, np.nan, dtype=np.float32)
+    return SurfaceMap(camera, point, normal, sigma, valid, tone, even, centroid, radius, (View(centroid, radius),))
 
 
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
