@@ -46,6 +46,18 @@ def test_mask_and_pattern_image(decoded):
     assert np.corrcoef(expected, decoded.pattern[inside])[0, 1] > 0.9
 
 
+def test_light_is_the_projectors_alone():
+    """Twice the light is twice as much; the room's does not count."""
+    one, twice, in_room = (
+        decode_gray_code(photographs(COORDS, gain=gain, room=room), LAYOUT).light
+        for gain, room in ((0.3, 0.0), (0.6, 0.0), (0.3, 0.2))
+    )
+    some = np.isfinite(one) & np.isfinite(twice) & np.isfinite(in_room) & LIT
+    assert some.sum() > 0.9 * LIT.sum()
+    np.testing.assert_allclose(np.median(twice[some] / one[some]), 2, atol=0.1)
+    np.testing.assert_allclose(np.median(in_room[some] / one[some]), 1, atol=0.05)
+
+
 def test_colour_and_16_bit_give_the_same(images, decoded):
     colour = [np.repeat(image[..., None], 3, -1) for image in images]
     deep = [image.astype(np.uint16) * np.uint16(257) for image in images]

@@ -10,9 +10,12 @@ import sl_nerfstudio.decoding
 from sl_nerfstudio.decoding.decoded import DecodingError
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
 from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.light import projected_light
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.noise import disturb_image
 from sl_nerfstudio.synthesis.setup import make_setup
+
+PIXELS_A_PERIOD = 7.0
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,17 @@ def test_mask_and_pattern_are_what_they_say(decoded, truth):
     assert (decoded.mask & ~truth.mask).sum() < 0.08 * truth.mask.sum()
     assert decoded.pattern.min() >= 0 and decoded.pattern.max() <= 1 and not decoded.pattern[~decoded.mask].any()
     assert decoded.pattern[decoded.mask].std() > 0.1
+
+
+def test_light_is_what_the_surface_returns_of_the_projectors(decoder, decoded, truth, image):
+    """As measured without noise and with the true coordinates; more room light does not change it."""
+    expected = projected_light(truth.radiance, truth.coords, [decoder.pattern.render()], 0.5 * PIXELS_A_PERIOD)
+    brighter = decoder.decode(np.clip(image.astype(np.int16) + 30, 0, 255).astype(np.uint8))
+    both = np.isfinite(expected) & np.isfinite(decoded.light) & np.isfinite(brighter.light)
+    assert both.sum() > 0.95 * decoded.decoded.sum() and not np.isfinite(decoded.light[~decoded.decoded]).any()
+    assert np.corrcoef(decoded.light[both], expected[both])[0, 1] > 0.9
+    dark = both & (image < 220)
+    np.testing.assert_allclose(np.median(brighter.light[dark] / decoded.light[dark]), 1, atol=0.03)
 
 
 def test_the_shipped_weights_are_small():

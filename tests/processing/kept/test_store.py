@@ -1,6 +1,7 @@
 """Decoded frames are loaded again, but only for the same images and the same decoder."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,7 +26,8 @@ def decoded():
     rng = np.random.default_rng(0)
     coords = rng.random((5, 7, 2)).astype(np.float32)
     coords[2] = np.nan
-    return Decoded(coords, rng.random((5, 7)) > 0.3, rng.random((5, 7)).astype(np.float32))
+    light = np.where(np.isnan(coords[..., 0]), np.nan, rng.random((5, 7))).astype(np.float32)
+    return Decoded(coords, rng.random((5, 7)) > 0.3, rng.random((5, 7)).astype(np.float32), light)
 
 
 def test_a_frame_is_loaded_as_it_was_saved(tmp_path, frame, decoded):
@@ -38,7 +40,16 @@ def test_a_frame_is_loaded_as_it_was_saved(tmp_path, frame, decoded):
         np.testing.assert_array_equal(one.coords, decoded.coords)
         np.testing.assert_array_equal(one.mask, decoded.mask)
         np.testing.assert_array_equal(one.pattern, saved.pattern)
+        np.testing.assert_array_equal(one.light, saved.light)
     np.testing.assert_allclose(saved.pattern, decoded.pattern, atol=1e-5)
+    np.testing.assert_allclose(saved.light, decoded.light, rtol=1e-3)
+
+
+def test_light_that_was_not_measured_stays_unknown(tmp_path, frame, decoded):
+    store = DecodedStore(tmp_path, "a decoder")
+    key = store.key(frame)
+    assert store.save(frame, key, replace(decoded, light=None)).light is None
+    assert store.load(frame, key).light is None
 
 
 def test_other_images_or_another_decoder_make_another_key(tmp_path, frame):
