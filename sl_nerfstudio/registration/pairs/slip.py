@@ -152,7 +152,8 @@ def followed(
     damping = settings.damping * np.trace(H, axis1=1, axis2=2).clip(1e-12)
     H = free @ H @ free + damping[:, None, None] * np.eye(7)
     step = -np.linalg.solve(H, (g @ free)[..., None])[..., 0] / D
-    return moved.incremented(step[:, :3], step[:, 3:6], np.exp(step[:, 6]), target.centroid)
+    growth = np.clip(step[:, 6], -settings.largest_log_scale, settings.largest_log_scale)
+    return moved.incremented(step[:, :3], step[:, 3:6], np.exp(growth), target.centroid)
 
 
 def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:

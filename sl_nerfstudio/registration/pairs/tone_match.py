@@ -95,17 +95,18 @@ def _around(
     """Similarities along the motion, a step apart, once around; all but the rotation follows the surfaces."""
     s, target = settings.tone, sides[1].map
     few = sides[0].thinned(s.followed_points), sides[1].thinned(s.followed_points)
-    steps = round(180 / s.step_deg)
-    at = Hypotheses.joined([Hypotheses.of(S), Hypotheses.of(S)])
-    senses = [screw_motion(sense * np.radians(s.step_deg) * direction, target) for sense in (1.0, -1.0)]
-    ways: list[list[Hypotheses]] = [[], []]
-    for _ in range(steps):
-        at = Hypotheses.joined([Hypotheses.of(M @ at.similarity(k)) for k, M in enumerate(senses)])
-        for _ in range(s.follow_steps):
-            at = followed(few, at, direction[3:6], common, settings)
-        for k in range(2):
-            ways[k].append(at[[k]])
-    return Hypotheses.joined([*reversed(ways[1]), Hypotheses.of(S), *ways[0]])
+    ways: list[list[Hypotheses]] = []
+    for sense in (-1.0, 1.0):
+        step, way = screw_motion(sense * np.radians(s.step_deg) * direction, target), [Hypotheses.of(S)]
+        for _ in range(round(180 / s.step_deg)):
+            at = Hypotheses.of(step @ way[-1].similarity(0))
+            for _ in range(s.follow_steps):
+                at = followed(few, at, direction[3:6], common, settings)
+            if not abs(np.log(at.scale[0] / S.scale)) < settings.largest_log_scale:
+                break  # nothing is left that it could follow
+            way.append(at)
+        ways.append(way)
+    return Hypotheses.joined([*reversed(ways[0][1:]), *ways[1]])
 
 
 @dataclass(frozen=True)
