@@ -13,7 +13,7 @@ from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.pairs.pair_registration import register_pair
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance
-from sl_nerfstudio.registration.pairs.tone_match import likeness
+from sl_nerfstudio.registration.pairs.tone_match import likeness, turn_by_tone
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
 from tests.registration.shaped_clouds import rendered
@@ -73,6 +73,16 @@ def test_what_light_and_view_make_holds_nothing():
     for seed in range(5):
         made = blotches(maps[0], seed)
         assert not registered((with_tone(maps[0], made), with_tone(maps[1], made))).by_tone
+
+
+def test_a_motion_that_leaves_both_surfaces_ends_without_a_word():
+    """What shrinks or grows threefold within a radian has nothing to follow after some steps."""
+    maps, true = vase(4, 6)
+    rng = np.random.default_rng(0)
+    sides = Side.sampled(maps[0], 400, rng), Side.sampled(maps[1], 400, rng)
+    away = np.array([5.0, -3.0, 4.0, 0.6, 0.0, 0.8, 1.1])
+    with np.errstate(all="raise", under="ignore"):
+        assert turn_by_tone(sides, true, (away, 12.0), Tolerance(0.0, 2.0), PAIR) is None
 
 
 def test_likeness_is_the_correlation_of_the_tones_that_meet():
