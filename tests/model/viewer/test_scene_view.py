@@ -5,6 +5,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 import viser
@@ -12,9 +13,10 @@ import viser.transforms as vtf
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.meshing.vertex_quality import VertexQuality
 from sl_nerfstudio.model.viewer.device_nodes import DeviceNodes, vertical_fov
 from sl_nerfstudio.model.viewer.scene_view import SceneView, first_view
-from sl_nerfstudio.model.viewer.surface import MODES
+from sl_nerfstudio.model.viewer.surface import MODES, UNKNOWN, Surface
 from tests.dataparser.tiny_scan import RADIUS
 from tests.model.viewer.conftest import SCALE
 
@@ -176,6 +178,47 @@ def test_the_surface_in_all_colours(view: SceneView) -> None:
     assert view._surface is not found and "Step 8" in view.panel._legend.content
     choose(view, surface=MODES[0])
     assert "/surface" not in view._nodes and not view.panel.update.visible
+
+
+def test_normals_depth_and_coordinates_have_the_colours_of_their_place(view: SceneView) -> None:
+    surface, scan = Surface(model_of(view), 32), model_of(view).scan
+    p = surface.mesh.vertices / SCALE  # mm, in the scan's axes
+    np.testing.assert_allclose(surface.coloured("normals", 0).rgb, 127.5 * (p / RADIUS + 1), atol=8)
+    distance = np.linalg.norm(p - scan.poses.T_world_camera[1, :3, 3], axis=1)
+    depth = surface.coloured("depth", 1)
+    assert depth.scale == ("turbo", pytest.approx(distance.min()), pytest.approx(distance.max()), "mm")
+    share = (distance - distance.min()) / np.ptp(distance)
+    np.testing.assert_allclose(depth.rgb, 255 * matplotlib.colormaps["turbo"](share)[:, :3], atol=1)
+    rgb = surface.coloured("coordinates", 1).rgb
+    T_projector_world = np.linalg.inv(scan.poses.T_world_projector[1])
+    x, y, z = (p @ T_projector_world[:3, :3].T + T_projector_world[:3, 3]).T
+    projector = scan.projector
+    u, v = projector.cx - projector.fl_x * x / z, projector.cy + projector.fl_y * y / z
+    # facing the projector, by more than the mesh's normals err, and away from the edges of its picture
+    towards = scan.poses.T_world_projector[1, :3, 3] - p
+    facing = (towards * p).sum(1) / (np.linalg.norm(towards, axis=1) * RADIUS)
+    lit = (facing > 0.1) & (np.minimum(u, v) > 1) & (u < projector.w - 1) & (v < projector.h - 1)
+    expected = 255 * np.stack([u[lit] % 128 / 128, v[lit] % 128 / 128, np.full(lit.sum(), 0.2)], 1)
+    assert lit.sum() > 100
+    np.testing.assert_allclose(rgb[lit], expected, atol=1)
+    assert (rgb[facing < -0.1] == UNKNOWN).all()
+
+
+def test_residual_sigma_and_views_are_those_of_the_vertices_and_grey_where_no_frame_confirms(view: SceneView) -> None:
+    surface = Surface(model_of(view), 32)
+    n = len(surface.mesh.vertices)
+    sigma, residual, views = np.linspace(0, 0.2, n), np.linspace(3, 0, n), np.arange(n) % 4
+    sigma[views == 0] = residual[views == 0] = np.nan
+    surface.__dict__["quality"] = VertexQuality(sigma, sigma, views, residual, np.full(n, 20.0))
+    for mode, values, units, share in (("sigma", sigma, "mm", 95), ("residual", residual, "pattern px", 95),
+                                       ("views", views, "frames", 100)):  # fmt: skip
+        coloured = surface.coloured(mode, 0)
+        assert coloured.scale is not None
+        colours, lower, upper, said = coloured.scale
+        assert (lower, said) == (0, units) and upper == pytest.approx(np.nanpercentile(values, share))
+        expected = 255 * matplotlib.colormaps[colours](np.clip(values / upper, 0, 1))[:, :3]
+        np.testing.assert_allclose(coloured.rgb[views > 0], expected[views > 0], atol=1)
+        assert (coloured.rgb[views == 0] == UNKNOWN).all() and "Grey: no frame confirms" in coloured.meaning
 
 
 def test_a_field_without_a_surface_is_said_not_raised(view: SceneView) -> None:
