@@ -22,6 +22,7 @@ _EXTRAS = {
     "show": "patterns on a display (sl-pattern --show, sl-capture)",
     "phone": "photographs of phones (.heic)",
     "video": "captures from a video",
+    "las": "point clouds for surveying programs (sl-export --points cloud.las)",
     "cuda": "the field's own kernels on NVIDIA GPUs",
 }
 _GROUPS = {"nerfstudio.method_configs": "methods", "nerfstudio.dataparser_configs": "dataparsers"}
