@@ -24,6 +24,19 @@ def _wrapped(line: str) -> list[str]:
     )  # fmt: skip
 
 
+def fitted(text: str) -> str:
+    """`text` in lines of at most 80 columns; what does not fit continues four columns further to the right."""
+    return "\n".join(line if len(line) <= WIDTH else _continued(line) for line in text.splitlines())
+
+
+def _continued(line: str) -> str:
+    inset = " " * (len(line) - len(line.lstrip()))
+    return textwrap.fill(
+        line.strip(), WIDTH, initial_indent=inset, subsequent_indent=f"{inset}    ",
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
+
+
 def duration(seconds: float) -> str:
     """A duration as a person says it: `8 s`, `2 min 5 s`, `1 h 20 min`."""
     whole = max(round(seconds), 0)

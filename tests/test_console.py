@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.console import WIDTH, command, duration, next_steps, paragraph, short_path
+from sl_nerfstudio.console import WIDTH, command, duration, fitted, next_steps, paragraph, short_path
 
 PLAIN = st.text(st.characters(exclude_characters="\n\\", exclude_categories=["Cs"]), max_size=30)
 WORDS = st.lists(st.one_of(st.sampled_from(["--data", "--poses", "-v"]), PLAIN), max_size=12)
@@ -39,6 +39,18 @@ def test_lines_and_insets_of_a_text_stay():
     text = paragraph("adjust", "Poses adjusted.\n    cause:  " + "word " * 20)
     assert text.splitlines()[0] == "adjust      Poses adjusted."
     assert all(line.startswith(" " * 16) for line in text.splitlines()[1:])
+
+
+@given(st.lists(st.tuples(st.sampled_from([0, 2, 4]), st.text(alphabet="ab ", max_size=200)), max_size=5))
+def test_long_lines_continue_further_to_the_right_and_keep_every_word(lines):
+    text = "\n".join(" " * inset + f"x{words}".rstrip() for inset, words in lines)
+    out = fitted(text).splitlines()
+    assert " ".join(out).split() == text.split()
+    assert all(len(line) <= WIDTH or len(line.split()) == 1 for line in out)
+    starts = [line for line in out if line.strip().startswith("x")]
+    assert [len(line) - len(line.lstrip()) for line in starts] == [inset for inset, _ in lines]
+    assert all(line.startswith("    ") for line in out if line not in starts)
+    assert all(line in out for line in text.splitlines() if len(line) <= WIDTH)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, fitted, next_steps
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 
@@ -41,15 +41,21 @@ def _synthesise() -> None:
         return
     synthesise(arguments.config, arguments.output)
     print(f"wrote {arguments.config.frames} frames to {arguments.output}")
-    print(next_steps([_next(arguments.output, arguments.config)]))
+    print(_next(arguments.output, arguments.config))
 
 
 def _next(output: Path, config: SynthConfig) -> str:
-    """The command that goes on with what was made."""
+    """How to go on with what was made."""
     if not config.images_only:
-        return command("ns-train", "sl-neus", "--data", output)
-    files = ("--images", output / "images", "--pattern", output / "pattern.json")
-    return command("sl-process", *files, "--intrinsics", output / "intrinsics.json", "--output", "scan")
+        return next_steps([command("ns-train", "sl-neus", "--data", output)])
+    pattern = output / "pattern.json"
+    if not pattern.exists():
+        return fitted(
+            "sl-process cannot decode these captures: their pattern is a picture without the codes that pattern.json "
+            "holds. They can be the pictures without the pattern of another scan (sl_color_path)"
+        )
+    files = ("--images", output / "images", "--pattern", pattern)
+    return next_steps([command("sl-process", *files, "--intrinsics", output / "intrinsics.json", "--output", "scan")])
 
 
 if __name__ == "__main__":

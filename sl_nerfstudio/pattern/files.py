@@ -13,6 +13,7 @@ from sl_nerfstudio.pattern.layout import FORMAT, PatternLayout
 from sl_nerfstudio.scan.document import document_faults, read_document
 from sl_nerfstudio.scan.file_error import FileError
 from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.photographs import ENDINGS
 from sl_nerfstudio.scan.problem import Faults
 
 LAYOUTS: dict[str, type[PatternLayout]] = {
@@ -48,6 +49,13 @@ def read_pattern(path: Path) -> tuple[Float32[ndarray, "h w"], PatternLayout | N
 
 
 def _read_document(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() in ENDINGS:
+        raise FileError(
+            path,
+            "is a picture; the codes of a pattern are in its pattern.json",
+            "the picture of the pattern was given instead of its description",
+            "give the pattern.json that sl-pattern or sl-synth wrote beside it",
+        )
     document = read_document(path)
     faults = Faults()
     document_faults(document, path.name, faults)

@@ -1,12 +1,16 @@
 """sl-synth: flags, messages, exit status."""
 
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sl_nerfstudio.cli.synth import main
 from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan.images import encode_png
 
 _HELP = """
 import sys
@@ -36,6 +40,18 @@ def test_a_small_scan(monkeypatch, tmp_path, capsys):
     scan = read_scan(out)
     assert len(scan.frames) == 2 and scan.units == "cm" and scan.projector.model == "DOE"
     assert scan.frames[0].camera.w == 32
+
+
+def test_captures_under_a_picture_are_not_sent_to_a_decoder_that_needs_codes(monkeypatch, tmp_path, capsys):
+    (tmp_path / "white.png").write_bytes(encode_png(np.full((64, 64), 255, np.uint8)))
+    flags = ("--frames", 2, "--resolution", 32, "--images-only", "--pattern")
+    _run(monkeypatch, "--output", tmp_path / "plain", *flags, tmp_path / "white.png")
+    said = " ".join(capsys.readouterr().out.split())
+    assert "sl-process cannot decode these captures" in said and "next:" not in said
+    assert not (tmp_path / "plain/pattern.json").exists()
+    _run(monkeypatch, "--output", tmp_path / "coded", *flags[:-1])
+    said = shlex.split(capsys.readouterr().out.partition("next:")[2].replace("\\\n", ""))
+    assert said[0] == "sl-process" and all(Path(word).exists() for word in said[2:8:2]), said
 
 
 def test_help_is_there_without_slow_imports():

@@ -107,6 +107,13 @@ def test_no_description_at_all(path, text):
         read_pattern(path)
 
 
+@pytest.mark.parametrize("name", ["pattern.png", "PATTERN.JPG"])
+def test_a_picture_is_no_description(grid, tmp_path, name):
+    (tmp_path / name).write_bytes(encode_png((255 * grid.render()).astype(np.uint8)))
+    with pytest.raises(UserError, match=r"is a picture(.|\n)*give the pattern\.json"):
+        read_layout(tmp_path / name)
+
+
 def test_files_that_are_no_pictures(tmp_path):
     path = tmp_path / "pattern.png"
     path.write_bytes(b"no image")
