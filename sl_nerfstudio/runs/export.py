@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -30,6 +31,8 @@ from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.writing import encode_json, sigma_fields
 from sl_nerfstudio.threads import one_library_thread
 
+_ROUNDING = 1e-6  # of single precision, relative to the largest number
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -43,6 +46,7 @@ class Exported:
     textured: Textured | None  # None: no texture was asked for
     points: int  # in the point cloud
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
+    poses_refined: bool  # whether the run's poses are others than the scan's
     writing_seconds: float  # everything but the extraction
 
     @property
@@ -86,7 +90,16 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
         write_covariance(settings.pose_folder, scan, joint)
         write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
     seconds = time.perf_counter() - start - surface.extraction_seconds
-    return Exported(mesh, properties, surface, decimated, colours, textured, points, model.pose_sigma(), seconds)
+    refined = poses_refined(model)
+    return Exported(
+        mesh, properties, surface, decimated, colours, textured, points, model.pose_sigma(), refined, seconds
+    )
+
+
+def poses_refined(model: TrainedModel) -> bool:
+    """Whether the model's poses differ from those of its scan by more than rounding."""
+    given, now = model.scan.poses.stacked(), model.poses().stacked()
+    return not np.allclose(now, given, rtol=0.0, atol=_ROUNDING * float(np.abs(given).max()))
 
 
 def _require_pictures(settings: ExportSettings, scan: Scan) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,13 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 
 from sl_nerfstudio.cli.export import export_trained
 from sl_nerfstudio.cli.exporting.checks import check_outputs
 from sl_nerfstudio.cli.exporting.config import ExportConfig
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.meshing.mesh_io import read_mesh
 from sl_nerfstudio.model.training.fingerprints import plain
+from sl_nerfstudio.runs.trained_run import TrainedRun
 from sl_nerfstudio.scan import Scan, read_poses
 from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of
 
@@ -33,8 +37,64 @@ def test_the_mesh_is_in_world_units_and_axes_and_cut(scan, tmp_path, suffix):
     mesh = read_mesh(config.output, "mm")
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTRE, axis=1), RADIUS, atol=5e-3)
     assert mesh.vertices[:, 2].min() > CENTRE[2] - 36  # the lower side is seen by nobody
+    (evaluation,) = next_commands(text)
+    assert evaluation == f"sl-eval --mesh {config.output} --data {scan.root} --report report.html".split()
+    text = " ".join(text.split())  # long lines are broken where they need be
     assert f"{len(mesh.vertices):,} vertices" in text and " mm" in text and "vertices that no frame saw" in text
-    assert f"sl-eval --mesh {config.output} --data {scan.root} --report report.html" in text.replace(" \\\n     ", "")
+
+
+def moved(scan: Scan) -> TrainedRun:
+    """A run that refined the poses: a camera stands 0.1 mm elsewhere."""
+    T_world_camera = scan.poses.T_world_camera.copy()
+    T_world_camera[2, 0, 3] += 0.1
+    run = run_of(scan)
+    run.model.poses = lambda: DevicePoses(T_world_camera, scan.poses.T_world_projector)  # type: ignore[method-assign]
+    return run
+
+
+def next_commands(text: str) -> list[list[str]]:
+    """The commands under `next:`, each as its words."""
+    lines = text.partition("next:\n")[2].replace(" \\\n     ", "").splitlines()
+    return [shlex.split(line) for line in lines]
+
+
+def test_the_next_commands_judge_refined_poses_even_if_they_were_not_asked_for(scan, tmp_path):
+    config = ExportConfig(
+        Path("run 1/config.yml"), tmp_path / "mesh.ply", resolution=48, fill_holes=2.5, trajectory=("tum", "kitti")
+    )
+    export, evaluation = next_commands(export_trained(moved(scan), config))
+    again = tyro.cli(ExportConfig, args=export[1:], config=(tyro.conf.FlagCreatePairsOff,))
+    assert export[0] == "sl-export" and again == replace(config, poses=tmp_path / "refined", overwrite=True)
+    expected = f"sl-eval --mesh {config.output} --data {scan.root} --poses {tmp_path}/refined/transforms.json"
+    assert evaluation == [*expected.split(), "--report", "report.html"]
+    (tmp_path / "refined").mkdir()  # of somebody else
+    export, evaluation = next_commands(export_trained(moved(scan), config))
+    assert export[export.index("--poses") + 1] == str(tmp_path / "mesh-refined")
+    assert evaluation[evaluation.index("--poses") + 1] == str(tmp_path / "mesh-refined/transforms.json")
+
+
+def test_poses_that_were_written_or_not_refined_need_one_command(scan, tmp_path):
+    config = ExportConfig(Path("c"), tmp_path / "mesh.ply", resolution=48)
+    assert [words[0] for words in next_commands(export_trained(run_of(scan), config))] == ["sl-eval"]
+    (words,) = next_commands(export_trained(moved(scan), replace(config, poses=tmp_path / "p")))
+    assert words[0] == "sl-eval" and words[5:7] == ["--poses", str(tmp_path / "p/transforms.json")]
+
+
+@pytest.mark.parametrize("flag", ["watertight", "keep_unobserved"])
+def test_a_mesh_with_invented_surface_is_not_sent_to_sl_eval(scan, tmp_path, flag):
+    config = ExportConfig(Path("c"), tmp_path / "mesh.ply", resolution=48, **{flag: True})
+    text = export_trained(moved(scan), config)
+    assert not next_commands(text) and f"export it without --{flag.replace('_', '-')}" in " ".join(text.split())
+
+
+def test_every_line_fits_a_terminal_unless_it_is_one_word(scan, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = ExportConfig(
+        Path("c"), Path("mesh.glb"), resolution=48, target_faces=500, fill_holes=90.0, points=Path("p.las"),
+        poses=Path("refined"), cameras=("colmap", "blender"), trajectory=("tum", "kitti"),
+    )  # fmt: skip
+    lines = export_trained(run_of(replace(scan, units="arbitrary")), config).splitlines()
+    assert max(map(len, lines[: lines.index("next:")])) <= 80
 
 
 def test_keep_unobserved_keeps_the_whole_ball(scan, tmp_path):

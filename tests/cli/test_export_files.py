@@ -28,7 +28,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 def export(scan: Scan, output: Path, **flags) -> str:
     config = ExportConfig(Path("c"), output, resolution=48, **flags)
     check_outputs(config)
-    return export_trained(run_of(scan), config)
+    return " ".join(export_trained(run_of(scan), config).split())  # long lines are broken where they need be
 
 
 def vertex_data(path: Path) -> np.ndarray:

@@ -38,7 +38,7 @@ def coloured(scan) -> Scan:
 def test_a_texture_is_written_with_the_decimated_mesh_and_described(coloured, tmp_path, suffix):
     output = tmp_path / f"mesh{suffix}"
     config = ExportConfig(Path("c"), output, resolution=64, texture=256, target_faces=2000, points=tmp_path / "p.ply")
-    text = export_trained(run_of(coloured), config)
+    text = " ".join(export_trained(run_of(coloured), config).split())  # long lines are broken where they need be
     found = trimesh.load_mesh(output, process=False)
     material = found.visual.material
     image = np.asarray((material.baseColorTexture if suffix == ".glb" else material.image).convert("RGB")).reshape(

@@ -113,8 +113,10 @@ def test_the_summary_says_what_was_removed_and_why(scan, found):
     cut = cut_object(mesh, found)
     marked = MarkedMesh(mesh, np.zeros(len(mesh.vertices), dtype=bool)).with_faces(cut.kept)
     surface = Surface(marked, None, None, cut, 0, 1.0)
-    exported = Exported(marked.mesh, VertexProperties(NO_QUALITY, marked.invented), surface, *3 * [None], 0, None, 1.0)
-    text = summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported)
+    exported = Exported(
+        marked.mesh, VertexProperties(NO_QUALITY, marked.invented), surface, *3 * [None], 0, None, False, 1.0
+    )
+    text = " ".join(summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported).split())
     assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
     assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
 

@@ -1,6 +1,6 @@
 """The flags of sl-export."""
 
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -57,6 +57,18 @@ class ExportConfig:
         """The files with the refined poses and with the training, if they are to be written."""
         folder = self.pose_folder
         return () if folder is None else (folder / "transforms.json", folder / "training.json")
+
+    def words(self) -> list[str]:
+        """The flags that give this configuration, for a command to copy."""
+        words: list[str] = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.default is not MISSING and value == field.default:
+                continue
+            words.append(f"--{field.name.replace('_', '-')}")
+            if not isinstance(value, bool):
+                words += map(str, value if isinstance(value, tuple) else (value,))
+        return words
 
     def settings(self, units: str) -> "ExportSettings":
         """The export that is asked for, of a scan whose lengths are in `units`."""

@@ -1,10 +1,11 @@
 """What sl-export prints: what was written, what was removed or invented, and what to do next."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sl_nerfstudio.cli.exporting.config import ExportConfig
-from sl_nerfstudio.console import command, next_steps, short_path, unit_word
+from sl_nerfstudio.console import command, fitted, next_steps, short_path, unit_word
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -38,10 +39,27 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         *_other_files(config, scan, exported, unit),
     ]
     lines.append(f"time: surface {surface.extraction_seconds:.1f} s, everything else {exported.writing_seconds:.1f} s")
-    known = () if config.poses is None else ("--poses", config.pose_files[0])
-    given = ("--mesh", config.output, "--data", short_path(scan.root), *known)
-    evaluation = command("sl-eval", *given, "--report", "report.html")
-    return "\n".join([*lines, next_steps([evaluation])])
+    return "\n".join([fitted("\n".join(lines)), *_next(config, scan, exported)])
+
+
+def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]:
+    """How to judge the mesh. It fits the captures only from the poses with which it was trained."""
+    if config.watertight or config.keep_unobserved:
+        flag = "--watertight" if config.watertight else "--keep-unobserved"
+        return [fitted(f"to judge the surface with sl-eval, export it without {flag}: it judges what is invented, too")]
+    steps, poses = [], config.pose_files[:1]
+    if exported.poses_refined and not poses:
+        again = replace(config, poses=_new_folder(config.output), overwrite=True)
+        steps.append(command("sl-export", *again.words()))
+        poses = again.pose_files[:1]
+    given = ("--mesh", config.output, "--data", short_path(scan.root), *(("--poses", poses[0]) if poses else ()))
+    return [next_steps([*steps, command("sl-eval", *given, "--report", "report.html")])]
+
+
+def _new_folder(mesh: Path) -> Path:
+    """A folder for poses beside the mesh; --overwrite is for the mesh, not for poses that are already there."""
+    usual = mesh.parent / "refined"
+    return mesh.with_name(f"{mesh.stem}-refined") if usual.exists() else usual
 
 
 def _file_unit(path: Path, units: str) -> list[str]:
