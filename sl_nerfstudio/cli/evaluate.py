@@ -103,7 +103,7 @@ def _evaluate(config: EvalConfig) -> None:
     if config.verbose:
         print_tables(evaluation)
     print_lengths(lengths, inputs.scan.units)
-    print(summary(evaluation, judgement, inputs.pose_sigma))
+    print(summary(evaluation, judgement, inputs.pose_sigma, config.report))
     for path in results:
         print(f"written: {path}")
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -14,9 +15,14 @@ from sl_nerfstudio.scan import PoseSigma
 _MOST = 4  # reasons, and things to do, that are printed
 
 
-def summary(evaluation: Evaluation, judgement: Judgement, sigma: Sequence[PoseSigma | None]) -> str:
-    """The verdict, the three figures that matter, why it is not better, and what to do next."""
-    fit = evaluation.agreement
+def summary(
+    evaluation: Evaluation, judgement: Judgement, sigma: Sequence[PoseSigma | None], report: Path | None = None
+) -> str:
+    """The verdict, the three figures that matter, why it is not better, and what to do next.
+
+    `report` is the file with everything else, if one was asked for.
+    """
+    fit, rest = evaluation.agreement, "in the report: --report FILE.html" if report is None else f"in {report}"
     figures = [
         ("surface", _surface(evaluation, sigma)),
         ("captures", f"coordinates agree to {fit.coordinate_px_median:.2g} px (median), 95 % to "
@@ -27,17 +33,17 @@ def summary(evaluation: Evaluation, judgement: Judgement, sigma: Sequence[PoseSi
         [
             f"verdict: {judgement.verdict.band}",
             *(paragraph(name, text) for name, text in figures),
-            *_listed("reasons", judgement.verdict.reasons),
-            *_listed("next", judgement.next_steps),
+            *_listed("reasons", judgement.verdict.reasons, rest),
+            *_listed("next", judgement.next_steps, rest),
         ]
     )
 
 
-def _listed(name: str, lines: Sequence[str]) -> list[str]:
-    """The first few; all of them are in the report."""
+def _listed(name: str, lines: Sequence[str], rest: str) -> list[str]:
+    """The first few, and where the rest is."""
     shown = [paragraph(name if k == 0 else "", line) for k, line in enumerate(lines[:_MOST])]
     more = len(lines) - len(shown)
-    return shown + ([paragraph("", f"({more} more in the report: --report FILE.html)")] if more else [])
+    return shown + ([paragraph("", f"({more} more {rest})")] if more else [])
 
 
 def _surface(evaluation: Evaluation, sigma: Sequence[PoseSigma | None]) -> str:

@@ -1,6 +1,7 @@
 """sl-eval from its flags to its files."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -129,6 +130,21 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
     assert content["initial"]["camera"]["translation_rmse"] < 1e-6
     text = page.read_text()
     assert "refined/transforms.json" in text and "9.9" in text and "σ frame" in text
+
+
+def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    known = read_scan(scan)
+    wrong = DevicePoses(known.poses.T_world_camera.copy(), known.poses.T_world_projector)
+    wrong.T_world_camera[:, :3, 3] += [6.0, 0.0, 0.0]
+    write_transforms(tmp_path / "transforms.json", known, wrong)
+    page = tmp_path / "r.html"
+    for flags, place in (((), "in the report: --report FILE.html"), (("--report", page), f"in {page}")):
+        run("--mesh", mesh_of(scan), "--data", scan, "--poses", tmp_path, "--samples", "2000", *flags)
+        printed = " ".join(capsys.readouterr().out.split())
+        left = re.findall(r"\((\d+) more (.*?)\)", printed)
+        assert printed.startswith("verdict: poor") and left and {where for _, where in left} == {place}
 
 
 def test_without_truth_the_fit_is_there_and_nothing_else(scan: Path, untrue: Path, tmp_path: Path) -> None:
