@@ -1,10 +1,10 @@
 """What `sl-process` makes of captures by a renderer that shares no code with it.
 
-    python -m benchmarks.another_renderer [--sets mug box ...] [--unseen] [--keep FOLDER] [--output FILE]
+    python -m benchmarks.another_renderer [--sets mug box ...] [--which unseen] [--keep FOLDER] [--output FILE]
 
-Each set has 24 photographs of 600 x 600 pixels of an object alone, on a table or in a room. A frame of the scan is
-wrong if its camera or projector is turned by more than 3 degrees, or if it puts the object off by more than 6 % of its
-size.
+Each set has 24 photographs of 600 x 600 pixels (in the list `otherwise` some have others) of an object alone, on a
+table or in a room. A frame of the scan is wrong if its camera or projector is turned by more than 3 degrees, or if it
+puts the object off by more than 6 % of its size.
 Sets that are in the output file already are not run again.
 """
 
@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -31,8 +32,8 @@ class Config:
 
     sets: tuple[str, ...] = ()
     """parts of the names of sets; default: all of the list"""
-    unseen: bool = False
-    """the second list, at which nobody looks before a change is finished"""
+    which: Literal["known", "unseen", "otherwise"] = "known"
+    """which list: the first; the second, at which nobody looks before a change is finished; or other ways of walking"""
     keep: Path = Path("outputs/another_renderer")
     """folder of captures and scans"""
     output: Path | None = None
@@ -145,7 +146,7 @@ def main() -> None:
     output = config.output or config.keep / "results.json"
     rows = json.loads(output.read_text()) if output.exists() else []
     print(HEAD, flush=True)
-    for one in chosen_sets(config.sets, config.unseen):
+    for one in chosen_sets(config.sets, config.which):
         if any(row["name"] == one.name for row in rows):
             print(f"{one.name}: in {output} already", flush=True)
             continue

@@ -19,6 +19,18 @@ from benchmarks.another_renderer.sensor import jpeg
 
 
 @dataclass(frozen=True)
+class Walk:
+    """How the devices move, and how far they are."""
+
+    name: str = ""
+    turn_deg: float = 360.0  # of the camera about the object, first to last frame
+    elevation_deg: float = 32.0  # about which the camera goes up and down by 12
+    apart_deg: tuple[float, float] = 15.0, 27.0  # between camera and projector, seen from the object
+    roll: float = 0.15  # of the camera, radians at most
+    zoom: float = 1.0  # focal lengths and distances, relative to the usual ones
+
+
+@dataclass(frozen=True)
 class CaptureSet:
     """One set; `missed` are photographs in which the object is out of view."""
 
@@ -31,35 +43,38 @@ class CaptureSet:
     missed: tuple[int, ...] = ()
     shuffled: bool = False
     resolution: int = 600
+    walk: Walk = Walk()
 
     @property
     def name(self) -> str:
         """Unique."""
-        end = ("-shuffled" if self.shuffled else "") + ("" if self.resolution == 600 else f"-{self.resolution}")
-        return f"{self.thing}-{self.around}-{self.look_name}-{self.seed}{end}"
+        size = "" if self.resolution == 600 else str(self.resolution)
+        ends = (self.walk.name, "shuffled" if self.shuffled else "", size)
+        return "-".join([self.thing, self.around, self.look_name, str(self.seed), *filter(None, ends)])
 
 
-def lenses(resolution: int, pattern: ndarray, rng: np.random.Generator) -> tuple[Lens, Lens]:
+def lenses(resolution: int, pattern: ndarray, rng: np.random.Generator, zoom: float = 1.0) -> tuple[Lens, Lens]:
     """Camera and projector, both a little off centre, the camera's with distortion."""
-    f, (h, w) = 1.5 * resolution * rng.uniform(0.97, 1.05), pattern.shape
+    f, (h, w) = 1.5 * zoom * resolution * rng.uniform(0.97, 1.05), pattern.shape
     cx, cy = resolution * rng.uniform(0.49, 0.51, 2)
     camera = Lens(resolution, resolution, f, cx, cy, rng.uniform(-0.06, 0.02), rng.uniform(-0.02, 0.02))
     return camera, Lens(
-        w, h, 1.42 * w * rng.uniform(0.97, 1.03), w * rng.uniform(0.49, 0.51), h * rng.uniform(0.49, 0.53)
+        w, h, 1.42 * zoom * w * rng.uniform(0.97, 1.03), w * rng.uniform(0.49, 0.51), h * rng.uniform(0.49, 0.53)
     )
 
 
 def walk(one: CaptureSet, thing: trimesh.Trimesh, rng: np.random.Generator) -> list[View]:
-    """Once around; both devices move by themselves, and the projector is now on one side, now on another."""
+    """Around it; both devices move by themselves, and the projector is now on one side, now on another."""
+    how = one.walk
     low, high = thing.bounds
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     views, side, phase = [], rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
     for k in range(one.frames):
-        azimuth = 2 * np.pi * k / one.frames + rng.uniform(-0.06, 0.06)
-        elevation = np.radians(32 + 12 * np.sin(1.7 * azimuth + phase) + rng.uniform(-4, 4))
+        azimuth = np.radians(how.turn_deg) * k / one.frames + rng.uniform(-0.06, 0.06)
+        elevation = np.radians(how.elevation_deg + 12 * np.sin(1.7 * azimuth + phase) + rng.uniform(-4, 4))
         side += rng.uniform(-0.5, 0.5)
-        apart = np.radians(rng.uniform(15, 27))
-        far_camera, far_projector = size * 1.45 * rng.uniform(0.92, 1.15, 2)
+        apart = np.radians(rng.uniform(*how.apart_deg))
+        far_camera, far_projector = size * 1.45 * how.zoom * rng.uniform(0.92, 1.15, 2)
         eye = _direction(azimuth, elevation)
         across = _direction(azimuth + np.pi / 2, 0.0)
         way = np.cos(side) * across + 0.6 * np.sin(side) * np.cross(eye, across)
@@ -68,9 +83,9 @@ def walk(one: CaptureSet, thing: trimesh.Trimesh, rng: np.random.Generator) -> l
         if k in one.missed:
             aims[0] = middle + 1.2 * size * across
         views.append(View(
-            looking(middle + far_camera * eye, aims[0], rng.uniform(-0.15, 0.15)),
+            looking(middle + far_camera * eye, aims[0], rng.uniform(-how.roll, how.roll)),
             looking(middle + far_projector * from_projector, aims[1], rng.uniform(-0.3, 0.3)),
-            size * 1.45, size * 1.45,
+            size * 1.45 * how.zoom, size * 1.45 * how.zoom,
         ))  # fmt: skip
     return views
 
@@ -98,7 +113,7 @@ def _make(one: CaptureSet, pattern_folder: Path, root: Path) -> None:
         raise FileNotFoundError(f"{pattern_folder / 'pattern.png'}: no image; sl-pattern writes it")
     thing = OBJECTS[one.thing]()
     scene = Scene(thing, surroundings(one.around, thing, rng))
-    camera, projector = lenses(one.resolution, pattern, rng)
+    camera, projector = lenses(one.resolution, pattern, rng, one.walk.zoom)
     look = one.look
     paints = (Paint.random(look.texture, look.spots, look.colour, rng), Paint.random(0.5, True, look.colour, rng))
     projection = Projection(pattern / 255.0, projector, look)

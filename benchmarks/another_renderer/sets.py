@@ -1,6 +1,10 @@
-"""The sets. Those of the first list may be looked at while something is changed; the others are for the end."""
+"""The sets.
 
-from benchmarks.another_renderer.captures import CaptureSet
+Those of the first list may be looked at while something is changed; the second is for the end; in the third people
+walk otherwise.
+"""
+
+from benchmarks.another_renderer.captures import CaptureSet, Walk
 from benchmarks.another_renderer.photograph import Look
 from benchmarks.another_renderer.sensor import Sensor
 
@@ -20,9 +24,10 @@ LOOKS = {
 
 
 def _set(
-    thing: str, around: str, look: str, seed: int, missed: tuple[int, ...] = (), shuffled: bool = False
-) -> CaptureSet:
-    return CaptureSet(thing, around, look, seed, LOOKS[look], missed=missed, shuffled=shuffled)
+    thing: str, around: str, look: str, seed: int, missed: tuple[int, ...] = (), shuffled: bool = False,
+    frames: int = 24, resolution: int = 600, walk: Walk | None = None,
+) -> CaptureSet:  # fmt: skip
+    return CaptureSet(thing, around, look, seed, LOOKS[look], frames, missed, shuffled, resolution, walk or Walk())
 
 
 KNOWN = (
@@ -49,11 +54,24 @@ UNSEEN = (
     _set("cloth", "table", "clean", 39),
     _set("steps", "room", "clean", 40),
 )
+OTHERWISE = (
+    _set("housing", "none", "photo", 51, frames=16, walk=Walk("half-turn", turn_deg=180.0)),
+    _set("vertebra", "table", "photo", 52, frames=14, walk=Walk("few-frames")),
+    _set("jaw", "none", "photo", 53, walk=Walk("long-lens", zoom=2.5)),
+    _set("bust", "table", "photo", 54, walk=Walk("short-baseline", apart_deg=(5.0, 9.0))),
+    _set("knot", "table", "photo", 55, walk=Walk("long-baseline", apart_deg=(30.0, 42.0))),
+    _set("bracket", "none", "photo", 56, resolution=400),
+    _set("foot", "table", "rough", 57, resolution=1000),
+    _set("pair", "table", "photo", 58, walk=Walk("from-above", elevation_deg=62.0)),
+    _set("cloth", "none", "photo", 59, shuffled=True, walk=Walk("rolled", roll=3.14)),
+    _set("sticks", "none", "photo", 60, frames=40, walk=Walk("two-rounds", turn_deg=720.0)),
+)
+LISTS = {"known": KNOWN, "unseen": UNSEEN, "otherwise": OTHERWISE}
 
 
-def chosen_sets(parts: tuple[str, ...], unseen: bool) -> list[CaptureSet]:
+def chosen_sets(parts: tuple[str, ...], which: str) -> list[CaptureSet]:
     """Sets of one of the lists whose names contain one of the parts, or all. Raises ValueError for a part in none."""
-    sets = UNSEEN if unseen else KNOWN
+    sets = LISTS[which]
     for part in parts:
         if not any(part in one.name for one in sets):
             raise ValueError(f"--sets {part}: no set is named so; there are {', '.join(one.name for one in sets)}")

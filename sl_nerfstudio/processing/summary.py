@@ -87,6 +87,7 @@ def summarise(
                 cross,
                 bool(wrong),
                 () if registration is None else registration.turns_deg,
+                registration is not None and registration.by_order,
                 adjusted=not config.no_adjust,
             )
         ),

@@ -31,8 +31,13 @@ from sl_nerfstudio.registration.view_graph import ViewGraph
 from sl_nerfstudio.threads import results
 
 
-def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
-    """Poses and baselines of the largest component; every other frame with its reason."""
+def accept_frames(
+    names: tuple[str, ...], graph: ViewGraph, ordered: bool, others: Sequence[PairMatch] = ()
+) -> Registration:
+    """Poses and baselines of the largest component; every other frame with its reason.
+
+    `others`: pairs that are not in the graph, and may say that the surface looks the same after a turn.
+    """
     components, settings = graph.assemble(), graph.settings
     edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
@@ -68,7 +73,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(graph.sides, edges, solution, settings),
+        symmetric_turns_deg(graph.sides, edges, solution, settings, others),
         ordered,
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ the registered frames' baselines is 1 until `known_length` says how long one of 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.acceptance import accept_frames
 from sl_nerfstudio.registration.assembly import Component
+from sl_nerfstudio.registration.capture_order import chain_of_small_steps, sides_are_open, typical_step_deg
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
@@ -69,7 +71,34 @@ def register(
         for component in (c for c in components if len(c) > 1):
             graph.try_overlapping(graph.solve(component).S_world_camera)
         graph.bridge(components)
-    return accept_frames(tuple(c.name for c in clouds), graph, ordered)
+    names = tuple(c.name for c in clouds)
+    found = accept_frames(names, graph, ordered)
+    if start is None and sequence and (found.turns_deg or not found.registered.all()):
+        return _by_order(names, graph, found, settings) or found
+    return found
+
+
+def _by_order(
+    names: tuple[str, ...], graph: ViewGraph, found: Registration, settings: RegistrationSettings
+) -> Registration | None:
+    """Frames that fit at several sides of the object, placed by the order of capture; None where that is no gain.
+
+    `graph` and `found` are without it: frames are at other sides than they show, or most could not be placed.
+    """
+    step_deg = typical_step_deg(graph.matches, settings)
+    if step_deg is None or not sides_are_open(graph.matches, settings):
+        return None
+    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng, settings)
+    near = ViewGraph(graph.maps, [None] * len(names), graph.rng, settings)
+    within = settings.order.different_sides_deg
+    near.try_overlapping(chain, within)
+    for _ in range(settings.selection.rounds):
+        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, within)
+    placed = accept_frames(names, near, True, graph.matches)
+    most = len(names) / 2
+    if placed.registered.sum() <= most or (not found.turns_deg and found.registered.sum() > most):
+        return None
+    return replace(placed, by_order=True)
 
 
 def _in_order(components: Sequence[Component], n: int, least: float) -> bool:

@@ -332,6 +332,22 @@ class SymmetrySettings:
 
 
 @dataclass(frozen=True)
+class CaptureOrderSettings:
+    """How frames of a symmetric object are placed by the order of capture."""
+
+    least_steps: float = 0.5
+    """share of the successive frames that must agree for their usual step to be known"""
+    different_sides_deg: float = 20.0
+    """rotation between two results of a pair, in degrees, beyond which they show different sides of the object"""
+    largest_step: float = 2.0
+    """largest rotation between successive frames, in usual steps"""
+    spacing: float = 0.5
+    """angle between the rotations from which a step is searched for, in usual steps"""
+    least_ratio: float = 0.5
+    """score of a small step, relative to that of the best result of its pair, from which it may be right"""
+
+
+@dataclass(frozen=True)
 class RegistrationSettings:
     """All settings of registration."""
 
@@ -355,6 +371,8 @@ class RegistrationSettings:
     """which frames are registered"""
     symmetry: SymmetrySettings = field(default_factory=SymmetrySettings)
     """whether the surface looks the same after a turn"""
+    order: CaptureOrderSettings = field(default_factory=CaptureOrderSettings)
+    """what the order of capture decides then"""
 
 
 FRAME_CLOUD_DEFAULTS = FrameCloudSettings()

@@ -22,12 +22,20 @@ from sl_nerfstudio.registration.settings import EdgeSettings, RegistrationSettin
 
 
 def symmetric_turns_deg(
-    sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+    sides: Sequence[Side],
+    edges: Sequence[PairMatch],
+    solution: PoseGraphSolution,
+    settings: RegistrationSettings,
+    others: Sequence[PairMatch] = (),
 ) -> tuple[float, ...]:
-    """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is."""
+    """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is.
+
+    `others`: pairs that are not edges of the solution, which may say turns as well.
+    """
     s, nodes = settings.symmetry, solution.S_world_camera
     fitness = [e.fitness for e, used in zip(edges, solution.consistent, strict=True) if used]
-    said = _distinct(edges, solution, settings)[: s.most_compared]
+    consistent = [*solution.consistent.tolist(), *([False] * len(others))]
+    said = _distinct([*edges, *others], consistent, nodes, settings)[: s.most_compared]
     if not fitness or not said:
         return ()
     usual = float(np.quantile(fitness, settings.edge.good_quantile))
@@ -53,11 +61,11 @@ def _half(turn: Similarity) -> Similarity:
 
 
 def _distinct(
-    edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+    edges: Sequence[PairMatch], consistent: Sequence[bool], nodes: Nodes, settings: RegistrationSettings
 ) -> list[Similarity]:
     """Clearly different turns of the world; those that the best pairs say come first."""
     s, found = settings.symmetry, list[Similarity]()
-    for turn in _said(edges, solution, settings.edge):
+    for turn in _said(edges, consistent, nodes, settings.edge):
         known = (Similarity.identity(), *found, *(T.inverse() for T in found))
         if abs(np.log(turn.scale)) < s.largest_log_scale and all(
             angle_deg((turn @ T.inverse()).R) > s.same_rotation_deg for T in known
@@ -66,12 +74,13 @@ def _distinct(
     return found
 
 
-def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: EdgeSettings) -> Iterator[Similarity]:
+def _said(
+    edges: Sequence[PairMatch], consistent: Sequence[bool], nodes: Nodes, settings: EdgeSettings
+) -> Iterator[Similarity]:
     """By which motions of the world pairs, or their rivals, differ from the solution."""
-    nodes = solution.S_world_camera
     placed = [
         (e, used)
-        for e, used in zip(edges, solution.consistent, strict=True)
+        for e, used in zip(edges, consistent, strict=True)
         if nodes[e.source] is not None and nodes[e.target] is not None
     ]
     for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0], settings))):

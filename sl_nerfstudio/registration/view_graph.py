@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.assembly import Assembly, Component
 from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
 from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, quality
@@ -59,12 +59,16 @@ class ViewGraph:
         trials = [(p, self.settings.pair.rough if g else search, g) for p, g in zip(new, guesses, strict=True)]
         self._register(trials, "registering pairs")
 
-    def try_overlapping(self, S_world_camera: Nodes) -> None:
-        """Register pairs that should overlap by the given poses, starting from there."""
+    def try_overlapping(self, S_world_camera: Nodes, within_deg: float = 180.0) -> None:
+        """Register pairs that should overlap by the given poses, starting from there.
+
+        What ends turned against its start by more than `within_deg` degrees counts for nothing.
+        """
         pairs = self._overlapping(S_world_camera)
         guesses = [_relative(S_world_camera, p) for p in pairs]
         nearby = self.settings.pair.nearby
-        self._register([(p, nearby, g) for p, g in zip(pairs, guesses, strict=True) if g], "closing loops")
+        trials = [(p, nearby, g) for p, g in zip(pairs, guesses, strict=True) if g]
+        self._register(trials, "closing loops", within_deg)
 
     def try_all(self) -> None:
         """Register every frame with those that look most like it, wherever they are in the order."""
@@ -128,14 +132,18 @@ class ViewGraph:
         largest = np.radians(self.settings.selection.largest_view_angle_deg)
         return bool(a.R[:, 2] @ b.R[:, 2] > np.cos(largest))
 
-    def _register(self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str) -> None:
+    def _register(
+        self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str, within_deg: float = 180.0
+    ) -> None:
         """Register pairs, and keep the better result of a pair that was tried before."""
         settings, rngs = self.settings, self.rng.spawn(len(trials))
         tasks = [
             partial(register_pair, self._maps(pair), pair, search, rng, guess, settings.pair)
             for (pair, search, guess), rng in zip(trials, rngs, strict=True)
         ]
-        for (pair, _, _), match in zip(trials, tracked(tasks, words), strict=True):
+        for (pair, _, guess), match in zip(trials, tracked(tasks, words), strict=True):
+            if match is not None and guess is not None and _turned_deg(match, guess) > within_deg:
+                continue
             known = self._tried.get(pair)
             if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
                 self._tried[pair] = match
@@ -212,6 +220,11 @@ def _connected(component: Component, edges: Sequence[PairMatch]) -> bool:
     size = len(component)
     links = coo_array((np.ones(len(inside)), (rows, columns)), shape=(size, size))
     return bool(connected_components(links, directed=False)[0] == 1)
+
+
+def _turned_deg(match: PairMatch, guess: Similarity) -> float:
+    """Angle between a result and what it started from, in degrees."""
+    return angle_deg(match.S_target_source.R @ guess.R.T)
 
 
 def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:

@@ -37,6 +37,7 @@ class ScanFacts:
     cross: CrossFrameAgreement | None = None  # of the frames in the scan, in their order
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
+    by_order: bool = False  # frames fit at several sides, and the order of capture decided
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
