@@ -66,14 +66,16 @@ def adjust_consistent(
 
     Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
     again as long as frames come in, because each shows more of the surface to the rest. Each frame is placed once: if
-    it contradicts the others there, too, it stays out. How far other minima are is asked of the last group only.
+    it contradicts the others there, too, it stays out. Where an object looks the same from several sides, none comes
+    in: it would fit at each of them. How far other minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
+    sides_alike = registration.by_order or bool(registration.turns_deg)
     placed_before: set[int] = set()
     for _ in range(_INCLUSIONS):
-        candidates = [k for k in found.missing() if k not in placed_before]
+        candidates = [k for k in found.missing() if k not in placed_before and not sides_alike]
         more = _placed(clouds, found, candidates)
         new = [k for k in candidates if more.registered[k]]
         if not new:

@@ -83,7 +83,9 @@ def summarise(
         verdict=judge_scan(
             ScanFacts(
                 tuple(map(_facts, frames)),
-                tuple(PairFacts(e.frames, e.used, e.overlap * e.fitness**2) for e in records),
+                tuple(
+                    PairFacts(e.frames, e.used, e.overlap * e.fitness**2) for e in records if e.used or not e.undecided
+                ),
                 cross,
                 bool(wrong),
                 () if registration is None else registration.turns_deg,

@@ -4,6 +4,7 @@ from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
     NoCommonSurface,
+    PairsContradict,
     SeparateComponent,
     SurfaceDisagrees,
     Uncertainty,
@@ -49,6 +50,11 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         )
     if isinstance(exclusion, NoCommonSurface):
         return "no other frame shows any of its surface; capture views in between"
+    if isinstance(exclusion, PairsContradict):
+        return (
+            f"{exclusion.contradicting} of its {exclusion.pairs} pairs with other frames contradict the pose that the "
+            "rest of them say; capture this view again, and views beside it"
+        )
     if isinstance(exclusion, CoordinatesDisagree):
         others = [name for name in exclusion.group if name != exclusion.frame]
         with_others = f" and those of {listed(others, _LISTED)} agree with each other but" if others else ""

@@ -1,5 +1,6 @@
 """Which frames are registered in the end, why the others are not, and what is uncertain."""
 
+import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -10,7 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.assembly import Component
 from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
-from sl_nerfstudio.registration.pairs.edge_weights import is_accepted, is_ambiguous, quality
+from sl_nerfstudio.registration.pairs.edge_weights import is_accepted, is_ambiguous, quality, support
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.pairs.surface_agreement import Tolerance, agreement_at
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
@@ -18,6 +19,7 @@ from sl_nerfstudio.registration.result import (
     Edge,
     Exclusion,
     NoCommonSurface,
+    PairsContradict,
     PoorPair,
     Registration,
     SeparateComponent,
@@ -26,6 +28,7 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     Uncertainty,
 )
+from sl_nerfstudio.registration.settings import EdgeSettings
 from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph
 from sl_nerfstudio.threads import results
@@ -48,7 +51,10 @@ def accept_frames(
     fitness = np.array(
         results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
     )
-    registered = connected & (fitness >= settings.acceptance.least_fitness)
+    agrees = connected & (fitness >= settings.acceptance.least_fitness)
+    doubts = _doubtful(names, agrees, edges, solution.consistent, settings.edge)
+    few = len(doubts) <= settings.acceptance.most_doubtful * agrees.sum()
+    registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
     return Registration(
@@ -66,7 +72,9 @@ def accept_frames(
             for e, used in zip(edges, solution.consistent, strict=True)
         ),
         tuple(
-            SurfaceDisagrees(names[k], float(fitness[k]))
+            doubts[k]
+            if agrees[k]
+            else SurfaceDisagrees(names[k], float(fitness[k]))
             if connected[k]
             else _exclusion(k, names, components, main, graph)
             for k in np.flatnonzero(~registered).tolist()
@@ -76,6 +84,25 @@ def accept_frames(
         symmetric_turns_deg(graph.sides, edges, solution, settings, others),
         ordered,
     )  # fmt: skip
+
+
+def _doubtful(
+    names: Sequence[str],
+    inside: Bool[ndarray, "n"],
+    edges: Sequence[PairMatch],
+    consistent: Bool[ndarray, "edges"],
+    settings: EdgeSettings,
+) -> dict[int, PairsContradict]:
+    """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
+    found = {}
+    frames: list[int] = np.flatnonzero(inside).tolist()
+    for k in frames:
+        mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
+        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e, settings)]
+        against = [e for e, used in mine if not used]
+        if math.fsum(map(support, against)) > math.fsum(support(e) for e, used in mine if used):
+            found[k] = PairsContradict(names[k], len(mine), len(against))
+    return found
 
 
 def _separate_poses(names: Sequence[str], component: Component, graph: ViewGraph) -> SeparatePoses:

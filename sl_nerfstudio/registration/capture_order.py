@@ -71,9 +71,12 @@ def _longest_run(steps: Sequence[Similarity | None]) -> Nodes:
 
 
 def _small(match: PairMatch | None, largest_deg: float, settings: RegistrationSettings) -> Similarity | None:
-    """The best of a pair's results that turn little; None if there is none that could be right."""
+    """The best of a pair's results, or one that clearly turns less; None if it is larger than a step can be."""
     if match is None or not is_accepted(match, settings.edge):
         return None
-    likely = [match.S_target_source]
-    likely += [r.S_target_source for r in match.rivals if r.ratio >= settings.order.least_ratio]
-    return next((S for S in likely if angle_deg(S.R) <= largest_deg), None)
+    S = match.S_target_source
+    for rival in match.rivals:
+        less = angle_deg(S.R) - angle_deg(rival.S_target_source.R)
+        if rival.ratio >= settings.order.least_ratio and less > settings.order.different_sides_deg:
+            S = rival.S_target_source
+    return S if angle_deg(S.R) <= largest_deg else None

@@ -58,6 +58,15 @@ class PoorPair:
 
 
 @dataclass(frozen=True)
+class PairsContradict:
+    """A frame was left out because most of its pairs, counted by how well they fit, place it elsewhere."""
+
+    frame: str
+    pairs: int  # with registered frames
+    contradicting: int
+
+
+@dataclass(frozen=True)
 class CoordinatesDisagree:
     """A frame was left out after the joint adjustment: its coordinates contradict those of the other frames."""
 
@@ -65,7 +74,7 @@ class CoordinatesDisagree:
     group: tuple[str, ...]  # frames that agree with each other but not with the rest
 
 
-Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair | CoordinatesDisagree
+Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair | PairsContradict | CoordinatesDisagree
 """Why a frame was not registered."""
 
 

@@ -297,6 +297,9 @@ class AcceptanceSettings:
 
     least_fitness: float = 0.55
     """share of a frame's points, of those that other frames can judge, which must agree"""
+    most_doubtful: float = 0.25
+    """share of the frames up to which those are left out most of whose pairs contradict the pose found: where there are
+    more, the pairs are to blame"""
     largest_sigma_rotation_deg: float = 3.0
     """standard deviation of the least known rotation, in degrees, beyond which it is uncertain"""
     unknown_sigma_rotation_deg: float = 104.0

@@ -41,7 +41,8 @@ def symmetric_turns_deg(
     usual = float(np.quantile(fitness, settings.edge.good_quantile))
     agreeing, as_it_is = _moved(sides, nodes, Similarity.identity(), settings)
     by_errors = as_it_is / (agreeing + as_it_is) if agreeing else 0.0
-    misfit = by_errors + max(settings.assembly.least_misfit, 1 - usual)  # of pairs, which are never exact
+    # as much as a good connection may have: what assembly would take for right is not told from what is
+    misfit = by_errors + settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
     turns = []
     for turn in said:
         same, contradicting = _moved(sides, nodes, turn, settings)

@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.acceptance import _doubtful
+from sl_nerfstudio.registration.pairs.pair_match import Rival
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import (
     NoCommonSurface,
+    PairsContradict,
     SeparateComponent,
     SurfaceDisagrees,
     UncertainRotation,
@@ -17,6 +21,7 @@ from sl_nerfstudio.registration.result import (
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AcceptanceSettings, EdgeSettings
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, part_of
+from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 
 SIZE = 70
@@ -81,6 +86,22 @@ def test_a_frame_whose_surface_disagrees_says_how_much_agrees(clouds):
     assert [e.frame for e in found.exclusions] == ["frame_00000", "frame_00001", "frame_00002"]
     assert all(0.9 < e.fitness <= 1 for e in found.exclusions)
     assert np.isnan(found.T_world_camera).all() and np.isnan(found.baseline).all()
+
+
+def test_a_frame_most_of_whose_pairs_say_another_pose_is_left_out():
+    """Two of its pairs are used, and two that fit a little better are not."""
+    nodes = [Similarity(1.0, T[:3, :3], T[:3, 3]) for T in RIG.T_world_camera[:5].numpy()]
+    ring = [edge(nodes, i, j) for i, j in ((0, 1), (1, 2), (0, 2), (0, 4), (1, 4), (2, 4))]
+    of_three = [edge(nodes, k, 3, fitness=f) for k, f in ((0, 0.9), (1, 0.9), (2, 0.95), (4, 0.95))]
+    names, inside = tuple("abcde"), np.ones(5, dtype=bool)
+    used = np.array([True] * 6 + [True, True, False, False])
+    assert _doubtful(names, inside, ring + of_three, used, EdgeSettings()) == {3: PairsContradict("d", 4, 2)}
+    used[-1] = True  # three of four agree
+    assert _doubtful(names, inside, ring + of_three, used, EdgeSettings()) == {}
+    used[-1], rival = False, (Rival(nodes[0], 0.95),)
+    undecided = [replace(e, rivals=rival) if not u else e for e, u in zip(ring + of_three, used, strict=True)]
+    assert _doubtful(names, inside, undecided, used, EdgeSettings()) == {}  # pairs that fit in two ways say nothing
+    assert _doubtful(names, inside & (np.arange(5) != 4), ring + of_three, used, EdgeSettings()) == {}
 
 
 def test_uncertainties_follow_their_limits(clouds):

@@ -56,6 +56,16 @@ def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
     verdict = judge_scan(scan(turns_deg=(60.0, 119.8)))
     assert verdict.band == "poor"
     assert verdict.reasons[0].startswith("the object looks the same after a turn by 60, 120 degrees, and pairs of")
+    ordered = judge_scan(scan(turns_deg=(60.0, 119.8), by_order=True))
+    assert ordered.band == "poor"
+    assert "placed by the order of capture" in ordered.reasons[0]
+    assert "in steps of less than 30 degrees" in ordered.reasons[0]
+
+
+def test_sides_that_the_order_of_capture_decided_are_not_certain():
+    verdict = judge_scan(scan(by_order=True))
+    assert verdict.band == "acceptable"
+    assert verdict.reasons[0].startswith("frames fit at several sides of the object; each was placed by the order of")
 
 
 def test_a_group_of_its_own_is_named():

@@ -30,8 +30,8 @@ T = TypeVar("T")
 
 KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
-    result.PoorPair, result.CoordinatesDisagree, result.UndecidedProjector, result.UncertainRotation,
-    result.SeparatePoses,
+    result.PoorPair, result.PairsContradict, result.CoordinatesDisagree, result.UndecidedProjector,
+    result.UncertainRotation, result.SeparatePoses,
     ConsistentFrames, AdjustedFrames, DevicePoses, PoseSigma, SelfCalibration,
     Device, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement, IntrinsicsEvidence,
     DeviceEvidence,
