@@ -73,17 +73,16 @@ def register(
         graph.bridge(components)
     names = tuple(c.name for c in clouds)
     found = accept_frames(names, graph, ordered)
-    if start is None and sequence and (found.turns_deg or not found.registered.all()):
-        return _by_order(names, graph, found, settings) or found
+    most_are_lost = found.registered.sum() <= n / 2
+    if start is None and sequence and (found.turns_deg or most_are_lost):
+        return _by_order(names, graph, settings) or found
     return found
 
 
-def _by_order(
-    names: tuple[str, ...], graph: ViewGraph, found: Registration, settings: RegistrationSettings
-) -> Registration | None:
-    """Frames that fit at several sides of the object, placed by the order of capture; None where that is no gain.
+def _by_order(names: tuple[str, ...], graph: ViewGraph, settings: RegistrationSettings) -> Registration | None:
+    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
 
-    `graph` and `found` are without it: frames are at other sides than they show, or most could not be placed.
+    `graph` is without it: frames are at other sides than they show, or most could not be placed.
     """
     step_deg = typical_step_deg(graph.matches, settings)
     if step_deg is None or not sides_are_open(graph.matches, settings):
@@ -95,10 +94,7 @@ def _by_order(
     for _ in range(settings.selection.rounds):
         near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, within)
     placed = accept_frames(names, near, True, graph.matches)
-    most = len(names) / 2
-    if placed.registered.sum() <= most or (not found.turns_deg and found.registered.sum() > most):
-        return None
-    return replace(placed, by_order=True)
+    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
 
 
 def _in_order(components: Sequence[Component], n: int, least: float) -> bool:
