@@ -9,6 +9,7 @@ from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
     NoCommonSurface,
+    PairsContradict,
     PoorPair,
     SeparateComponent,
     SurfaceDisagrees,
@@ -96,6 +97,11 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
         "its connection to the other frames may slip along the surface (of revolution, or a plane); capture views "
         "between it and b, with marks on the object (chalk, tape) or something beside it that does not look the same "
         "from all sides",
+    ),
+    (
+        PairsContradict("a", 9, 6),
+        "6 of its 9 pairs with other frames contradict the pose that the rest of them say; capture this view again, and "
+        "views beside it",
     ),
     (
         CoordinatesDisagree("a", ("a",)),
