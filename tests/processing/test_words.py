@@ -100,8 +100,8 @@ EXCLUSIONS: list[tuple[Exclusion, str]] = [
     ),
     (
         PairsContradict("a", 9, 6),
-        "6 of its 9 pairs with other frames contradict the pose that the rest of them say; capture this view again, and "
-        "views beside it",
+        "6 of its 9 pairs with other frames contradict the pose that the rest of them say; capture this view again, "
+        "and views beside it",
     ),
     (
         CoordinatesDisagree("a", ("a",)),
