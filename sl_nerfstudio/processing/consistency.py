@@ -21,7 +21,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
-from sl_nerfstudio.registration.result import CoordinatesDisagree, Registration, SeparatePoses
+from sl_nerfstudio.registration.result import CoordinatesDisagree, PairsContradict, Registration, SeparatePoses
 from sl_nerfstudio.threads import one_library_thread, results
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
@@ -66,16 +66,16 @@ def adjust_consistent(
 
     Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
     again as long as frames come in, because each shows more of the surface to the rest. Each frame is placed once: if
-    it contradicts the others there, too, it stays out. Where an object looks the same from several sides, none comes
-    in: it would fit at each of them. How far other minima are is asked of the last group only.
+    it contradicts the others there, too, it stays out. What surfaces do not tell before, they do not tell afterwards
+    either: frames that fit at several places stay out. How far other minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
-    sides_alike = registration.by_order or bool(registration.turns_deg)
+    undecidable = _undecidable(registration)
     placed_before: set[int] = set()
     for _ in range(_INCLUSIONS):
-        candidates = [k for k in found.missing() if k not in placed_before and not sides_alike]
+        candidates = [k for k in found.missing() if k not in placed_before | undecidable]
         more = _placed(clouds, found, candidates)
         new = [k for k in candidates if more.registered[k]]
         if not new:
@@ -90,6 +90,14 @@ def adjust_consistent(
         if not (found.registration.registered & ~known).any():
             break
     return ConsistentFrames(found.registration, found.minimum.with_other_minima(), found.cross)
+
+
+def _undecidable(registration: Registration) -> set[int]:
+    """Frames that fit at several places: all if the object looks the same from several sides."""
+    if registration.by_order or registration.turns_deg:
+        return set(range(len(registration.names)))
+    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict)}
+    return {k for k, name in enumerate(registration.names) if name in torn}
 
 
 def _with_agreeing(

@@ -19,7 +19,13 @@ from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
 from sl_nerfstudio.registration.reinclusion import include_left_out
-from sl_nerfstudio.registration.result import CoordinatesDisagree, NoCommonSurface, Registration, UncertainRotation
+from sl_nerfstudio.registration.result import (
+    CoordinatesDisagree,
+    NoCommonSurface,
+    PairsContradict,
+    Registration,
+    UncertainRotation,
+)
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from tests.bundle_adjustment import analytic
 from tests.bundle_adjustment.analytic import rig_of
@@ -113,6 +119,23 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
     assert calls == [[1, MOVED], [MOVED]] and found.registration.registered.all()
     assert found.registration.exclusions == () and np.isfinite(found.adjusted.poses.baseline).all()
     assert log == [f"placed against the adjusted frames: {NAMES[k]}; adjusting again with them" for k in (1, MOVED)]
+
+
+@pytest.mark.parametrize("doubt", [{"by_order": True}, {"turns_deg": (90.0,)}, {}])
+def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt):
+    """Every frame of a symmetric object does; of others, those whose pairs contradict each other."""
+    without = without_groups(registration_of(RIG.T_world_camera.numpy()), [[1], [MOVED]])
+    torn = replace(without, exclusions=(without.exclusions[0], PairsContradict(NAMES[MOVED], 9, 6)), **doubt)
+    asked = []
+
+    def none_placed(clouds, registration, poses, candidates):
+        asked.append(list(candidates))
+        return registration
+
+    monkeypatch.setattr(consistency, "include_left_out", none_placed)
+    found = adjust_consistent(clouds, torn, lambda _: None)
+    assert asked == ([] if doubt else [[1]])
+    assert registration_gaps(found.registration) == [1, MOVED] and found.registration.exclusions == torn.exclusions
 
 
 def test_a_frame_of_another_object_is_taken_out_by_name(clouds):
