@@ -68,6 +68,12 @@ def test_a_nut_looks_the_same_after_a_sixth_of_a_turn(nut: Scan) -> None:
     assert nut.turns(contradicting(nut, 60.0), contradicting(nut, 120.0)) == pytest.approx((60.0, 120.0), abs=0.1)
 
 
+def test_pairs_say_the_turn_only_as_exactly_as_pairs_are(nut: Scan) -> None:
+    """A turn that is off by a degree moves edges a little past each other."""
+    for degrees in (59.0, 61.0):
+        assert nut.turns(contradicting(nut, degrees)) == pytest.approx((degrees,), abs=0.1)
+
+
 def test_a_rival_says_it_as_well(nut: Scan) -> None:
     doubtful = nut.pair(0, 2, (Rival(nut.turned(0, 2, -60.0), 0.9),))
     assert nut.turns(doubtful, used=True) == pytest.approx((60.0,), abs=0.1)
