@@ -58,13 +58,12 @@ def chain_of_small_steps(
 
 def _longest_run(steps: Sequence[Similarity | None]) -> Nodes:
     """Frames one after the other from the first of them; `steps[k]` maps frame k to the next, None where unknown."""
-    nodes: Nodes = [Similarity.identity()]
+    nodes = [Similarity.identity()]
     runs = [[0]]
     for k, S_next_this in enumerate(steps, start=1):
         if S_next_this is None:
             runs.append([])
-        before = nodes[-1]
-        nodes.append(Similarity.identity() if S_next_this is None or before is None else before @ S_next_this.inverse())
+        nodes.append(Similarity.identity() if S_next_this is None else nodes[-1] @ S_next_this.inverse())
         runs[-1].append(k)
     longest = max(runs, key=len)
     return [S if k in longest and len(longest) > 1 else None for k, S in enumerate(nodes)]

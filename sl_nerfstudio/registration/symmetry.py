@@ -7,6 +7,7 @@ half of that way contradicts less still, so surfaces do tell. Half the turn of a
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,8 +35,9 @@ def symmetric_turns_deg(
     """
     s, nodes = settings.symmetry, solution.S_world_camera
     fitness = [e.fitness for e, used in zip(edges, solution.consistent, strict=True) if used]
-    consistent = [*solution.consistent.tolist(), *([False] * len(others))]
-    said = _distinct([*edges, *others], consistent, nodes, settings)[: s.most_compared]
+    unused = np.zeros(len(others), dtype=bool)
+    with_others = replace(solution, consistent=np.append(solution.consistent, unused))
+    said = _distinct([*edges, *others], with_others, settings)[: s.most_compared]
     if not fitness or not said:
         return ()
     usual = float(np.quantile(fitness, settings.edge.good_quantile))
@@ -62,11 +64,11 @@ def _half(turn: Similarity) -> Similarity:
 
 
 def _distinct(
-    edges: Sequence[PairMatch], consistent: Sequence[bool], nodes: Nodes, settings: RegistrationSettings
+    edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
 ) -> list[Similarity]:
     """Clearly different turns of the world; those that the best pairs say come first."""
     s, found = settings.symmetry, list[Similarity]()
-    for turn in _said(edges, consistent, nodes, settings.edge):
+    for turn in _said(edges, solution, settings.edge):
         known = (Similarity.identity(), *found, *(T.inverse() for T in found))
         if abs(np.log(turn.scale)) < s.largest_log_scale and all(
             angle_deg((turn @ T.inverse()).R) > s.same_rotation_deg for T in known
@@ -75,13 +77,12 @@ def _distinct(
     return found
 
 
-def _said(
-    edges: Sequence[PairMatch], consistent: Sequence[bool], nodes: Nodes, settings: EdgeSettings
-) -> Iterator[Similarity]:
+def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: EdgeSettings) -> Iterator[Similarity]:
     """By which motions of the world pairs, or their rivals, differ from the solution."""
+    nodes = solution.S_world_camera
     placed = [
         (e, used)
-        for e, used in zip(edges, consistent, strict=True)
+        for e, used in zip(edges, solution.consistent, strict=True)
         if nodes[e.source] is not None and nodes[e.target] is not None
     ]
     for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0], settings))):

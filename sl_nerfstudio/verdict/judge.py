@@ -22,14 +22,10 @@ def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         return
     yield from _left_out(facts, settings)
     yield from _undecided(facts, settings)
-    if facts.turns_deg:
-        yield Reason("poor", symmetry_sentence(facts.turns_deg, facts.by_order))
-    elif facts.by_order:
-        yield Reason(
-            "acceptable",
-            f"frames fit at several sides of the object; {_BY_ORDER}. Unless they were captured in this order, in "
-            "small steps, they are at other sides than they show",
-        )
+    if facts.by_order:
+        yield _placed_by_order(facts.turns_deg)
+    elif facts.turns_deg:
+        yield Reason("poor", symmetry_sentence(facts.turns_deg))
     if facts.pairs is not None:
         yield from _weak_connections(facts, settings)
     if facts.cross is not None:
@@ -80,24 +76,34 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         yield Reason(band, f"{listed(names)}: the pose is undecided; another one fits nearly as well")
 
 
-_BY_ORDER = "each was placed by the order of capture, turned as little as possible against the one before"
-
-
-def symmetry_sentence(turns_deg: Sequence[float], by_order: bool = False) -> str:
+def symmetry_sentence(turns_deg: Sequence[float]) -> str:
     """That the surface looks the same after turns, and what it means."""
-    angles = listed([f"{angle:.0f}" for angle in turns_deg])
-    same = f"the object looks the same after a turn by {angles} degrees"
-    if by_order:
-        return (
-            f"{same}, so nothing tells which side a frame shows; {_BY_ORDER}. That is right if the frames were "
-            f"captured in this order, in steps of less than {min(turns_deg) / 2:.0f} degrees; to be certain, put "
-            "something beside it that looks different from all sides"
-        )
     return (
-        f"{same}, and pairs of frames contradict each other by it: frames may be placed at another side than they "
-        "show. The surface is right if the object really is that symmetric; for the poses, capture in small steps "
-        "around it, or put something beside it that looks different from all sides"
+        f"{_same_after(turns_deg)}, and pairs of frames contradict each other by it: frames may be placed at another "
+        "side than they show. The surface is right if the object really is that symmetric; for the poses, capture in "
+        "small steps around it, or put something beside it that looks different from all sides"
     )
+
+
+def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
+    """What it means that the order of capture decided which side each frame shows."""
+    how = "each was placed by the order of capture, turned as little as possible against the one before"
+    if not turns_deg:
+        return Reason(
+            "acceptable",
+            f"frames fit at several sides of the object; {how}. Unless they were captured in this order, in small "
+            "steps, they are at other sides than they show",
+        )
+    return Reason(
+        "poor",
+        f"{_same_after(turns_deg)}, so nothing tells which side a frame shows; {how}. That is right if the frames were "
+        f"captured in this order, in steps of less than {min(turns_deg) / 2:.0f} degrees; to be certain, put something "
+        "beside it that looks different from all sides",
+    )
+
+
+def _same_after(turns_deg: Sequence[float]) -> str:
+    return f"the object looks the same after a turn by {listed([f'{angle:.0f}' for angle in turns_deg])} degrees"
 
 
 def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
