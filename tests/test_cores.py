@@ -49,5 +49,5 @@ def test_cores_are_whole_and_at_least_one(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     for text, expected in (("max 1000", 8), ("1500 1000", 2), ("100 1000", 1), ("99000 1000", 8)):
         write(tmp_path, {"cpu.max": text})
-        monkeypatch.setattr(module, "CGROUPS", tmp_path)
+        monkeypatch.setattr(module, "ROOT", tmp_path)
         assert cores() == expected

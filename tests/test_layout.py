@@ -13,10 +13,11 @@ PACKAGE = ROOT / "sl_nerfstudio"
 
 # Folders in the order in which data passes through them: each imports only from itself and from those before it.
 LAYERS = (
-    "errors", "console", "progress", "cores", "memory", "threads", "side_by_side", "compiled", "late_compiler",
-    "device_kernels", "files", "geometry", "scan", "pattern", "synthesis", "decoding", "capture", "calibration",
-    "relative_pose", "registration", "bundle_adjustment", "verdict", "object_separation", "processing", "field",
-    "rendering", "meshing", "dataparser", "model", "runs", "redecoding", "evaluation", "cli", "methods", "__main__",
+    "errors", "console", "progress", "control_groups", "cores", "memory", "threads", "side_by_side", "compiled",
+    "late_compiler", "device_kernels", "files", "geometry", "scan", "pattern", "synthesis", "decoding", "capture",
+    "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict", "object_separation", "processing",
+    "field", "rendering", "meshing", "dataparser", "model", "runs", "redecoding", "evaluation", "cli", "methods",
+    "__main__",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds
 MOST_LINES, MOST_FILES = 400, 20

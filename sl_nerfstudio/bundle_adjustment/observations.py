@@ -17,7 +17,7 @@ from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.se3 import rotate, transform
 from sl_nerfstudio.geometry.triangulation import closest_approach
 
-_ENTRIES_AT_ONCE = 2**23  # pairs of an anchor and a frame: bounds memory
+_ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
 _TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
 _LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
 

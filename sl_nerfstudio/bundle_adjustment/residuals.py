@@ -64,7 +64,7 @@ class Observations:
     @cached_property
     def memory(self) -> WindowMemory:
         """Of the look-ups of these rows: anchors move little from one step to the next."""
-        return WindowMemory.empty(len(self.anchor))
+        return WindowMemory.empty(array(self.frame))
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,27 @@ from typing import IO
 import numpy as np
 from numpy import ndarray
 
+from sl_nerfstudio.control_groups import OWN, ROOT, groups_around
 from sl_nerfstudio.errors import UserError
 
 _ALIGNMENT = 64  # bytes, of arrays in a file
 _SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+_LIMITS = ("memory.max", "memory.limit_in_bytes")  # of control groups, versions 2 and 1
 
 
 def largest_in_memory() -> int:
     """Bytes beyond which an array is kept in a file."""
-    return _memory(_CGROUP_LIMIT) // _SHARE
+    return usable_memory(ROOT, OWN) // _SHARE
+
+
+def usable_memory(root: Path, own: Path) -> int:
+    """Bytes of memory of the machine, or fewer if the control groups of this process allow fewer.
+
+    For the arguments see `control_groups.groups_around`.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    files = (folder / name for folder in groups_around("memory", root, own) for name in _LIMITS)
+    return min([machine, *(limit for file in files if (limit := _limit(file)) is not None)])
 
 
 class GrowingArray:
@@ -95,10 +106,8 @@ def _no_space(error: OSError, size: int) -> UserError:
     )
 
 
-def _memory(limit: Path) -> int:
-    """Bytes of memory of the machine, or fewer if the process's control group may use fewer."""
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def _limit(file: Path) -> int | None:
     try:
-        return min(machine, int(limit.read_text()))
-    except (OSError, ValueError):  # no control groups, or "max"
-        return machine
+        return int(file.read_text())
+    except (OSError, ValueError):  # no such group, or "max"
+        return None

@@ -112,11 +112,11 @@ class ExactMaps(CoordinateMaps):
     def around(rig: Rig, size: int) -> "ExactMaps":
         """Maps that know the true poses."""
         m = CoordinateMaps.of(images_of(rig, size))
-        return ExactMaps(m.values, m.offsets, m.widths, m.heights, m.settings, m.max_roughness, rig)
+        return ExactMaps(m.values, m.index, m.settings, m.max_roughness, rig)
 
     def look_up(self, frame: Tensor, uv_camera: Tensor, memory: object = None) -> MapSample:
         uv, part = seen(self.rig, frame, uv_camera)
-        valid = uv.isfinite().all(-1) & (uv_camera > 0).all(-1) & (uv_camera < int(self.widths[0])).all(-1)
+        valid = uv.isfinite().all(-1) & (uv_camera > 0).all(-1) & (uv_camera < int(self.index.widths[0])).all(-1)
         columns = []
         for step in torch.eye(2, dtype=torch.float64):
             h = 1e-4
@@ -155,7 +155,8 @@ def rough_prior(frames: int, degrees: float) -> PosePrior:
 def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:
     """The decoded coordinates of pixels inside the images."""
     pixel = uv.long()
-    return maps.values[maps.offsets[frame] + pixel[:, 1] * maps.widths[frame] + pixel[:, 0]].double()
+    images = torch.stack([maps.image(k) for k in range(maps.frames)])
+    return images[frame, pixel[:, 1], pixel[:, 0]].double()
 
 
 def without_prior(equations: NormalEquations) -> Tensor:

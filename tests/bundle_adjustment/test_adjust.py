@@ -133,7 +133,7 @@ def test_wrong_cells_do_not_spoil_it(true):
     cells = torch.rand(FRAMES, SIZE // 5, SIZE // 5, generator=torch.Generator().manual_seed(0)) < 0.03
     m = ExactMaps.around(true, SIZE)
     wrong = cells.repeat_interleave(5, 1).repeat_interleave(5, 2)
-    maps = SpoiltMaps(m.values, m.offsets, m.widths, m.heights, m.settings, m.max_roughness, true, wrong)
+    maps = SpoiltMaps(m.values, m.index, m.settings, m.max_roughness, true, wrong)
     turn, shift = errors(
         adjust(disturbed(true), maps, prior_of(FRAMES), "known-rig", replace(QUICK, max_iterations=30)).rig, true
     )

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, place_of, words_of
+from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.rays import pixel_centres
 
@@ -178,3 +182,34 @@ def test_positions_outside_an_image_are_at_its_border():
     maps = CoordinateMaps.of(plane_images())
     at = torch.tensor([[-0.1, 5.0], [30.0, 5.0], [5.0, 20.0], [NAN, 5.0], [29.9, 5.0], [15.0, 10.0]]).double()
     assert maps.border_distance(torch.zeros(6, dtype=torch.int64), at).tolist() == [0, 0, 0, 0, 1, 10]
+
+
+@given(st.lists(st.tuples(st.integers(1, 4), st.integers(1, 150)), min_size=1, max_size=4), st.integers(0, 2**32 - 1))
+def test_every_pixel_is_found_among_the_decoded_ones(sizes, seed):
+    """Sizes beside the borders of words; images with nothing, something and everything decoded."""
+    rng, images = np.random.default_rng(seed), []
+    for size in sizes:
+        images.append(rng.random((*size, 2)).astype(np.float32))
+        images[-1][rng.random(size) < rng.choice([0, 0.5, 1])] = NAN
+    maps = CoordinateMaps.of([torch.from_numpy(image) for image in images])
+    values, (words, first_words, _, _) = maps.arrays
+    for frame, image in enumerate(images):
+        assert np.array_equal(maps.image(frame).numpy(), image, equal_nan=True)
+        for row, column in np.ndindex(*image.shape[:2]):
+            row_word = first_words[frame] + row * words_of(image.shape[1])
+            place, known = place_of(words, row_word, column), np.isfinite(image[row, column, 0])
+            assert is_known(words, row_word, column) == (place >= 0) == known
+            assert place < 0 or (values[place] == image[row, column]).all()
+    assert len(values) == sum(np.isfinite(image[..., 0]).sum() for image in images)
+
+
+def test_images_are_visited_one_after_the_other():
+    """Else a look-up would read images that do not fit into memory again and again."""
+    frame, uv = positions()
+    memory = WindowMemory.empty(frame.numpy())
+    assert sorted(memory.order.tolist()) == list(range(len(frame)))
+    assert (np.diff(frame.numpy()[memory.order]) >= 0).all()
+    maps = CoordinateMaps.of(plane_images())
+    once, alone = maps.look_up(frame, uv), [maps.look_up(frame[k : k + 1], uv[k : k + 1]) for k in range(len(frame))]
+    assert torch.equal(once.uv_projector, torch.cat([a.uv_projector for a in alone]))
+    assert torch.equal(once.valid, torch.cat([a.valid for a in alone]))

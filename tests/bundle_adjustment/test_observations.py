@@ -1,5 +1,7 @@
 """Which pixels take part, and which other frames see them: against ray casting of an analytic scene."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -62,6 +64,16 @@ def test_frames_that_decoded_the_point_are_found_and_no_others(scene):
     met = cast(rig.T_world_camera[j, :3, 3], way / length[:, None])[0]
     seen = (met - length).abs() < 1e-5  # nothing is between camera and point
     assert seen.double().mean() > 0.97  # the rest is within the gate of an edge
+
+
+def test_without_a_gate_no_coordinate_is_read(scene):
+    """Coordinates of many frames are in a file, from which each choice of rows would read them all."""
+    rig, maps, anchors = scene
+    blank = replace(maps, values=torch.zeros_like(maps.values))
+    a, b = (observe(rig, anchors, m, 3, ALL, 0.1, torch.Generator().manual_seed(1)) for m in (maps, blank))
+    assert torch.equal(a.anchor, b.anchor) and torch.equal(a.frame, b.frame) and len(a.anchor) > 100
+    gated = observe(rig, anchors, blank, 3, 4.0, 0.1, torch.Generator().manual_seed(1))
+    assert len(gated.anchor) < len(a.anchor)  # a gate needs them
 
 
 def test_surfaces_seen_at_a_flat_angle_are_left_out(scene):

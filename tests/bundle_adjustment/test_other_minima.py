@@ -66,12 +66,13 @@ def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkey
     stranger, searches = 2, []
     maps = noisy_maps(1, 0.3)
     monkeypatch.setattr(analytic, "BALLS", analytic.BALLS[:1])
-    values, first, last = maps.values.clone(), int(maps.offsets[stranger]), int(maps.offsets[stranger + 1])
-    values[first:last] = noisy_maps(2, 0.3).values[first:last].roll(SIZE // 5, 0)
+    strange = noisy_maps(2, 0.3).image(stranger).reshape(-1, 2).roll(SIZE // 5, 0).reshape(SIZE, SIZE, 2)
+    images = [strange if frame == stranger else maps.image(frame) for frame in range(FRAMES)]
+    maps = CoordinateMaps.of(images)
     start = disturbed(rig_of(FRAMES, SIZE), 1)
     search = adjustment.search
     monkeypatch.setattr(adjustment, "search", lambda *a: searches.append(a) or search(*a))
-    one, several = (adjust(start, replace(maps, values=values), PRIOR, "free", s) for s in (ONE_SEARCH, SETTINGS))
+    one, several = (adjust(start, maps, PRIOR, "free", s) for s in (ONE_SEARCH, SETTINGS))
     assert one.unplaced == several.unplaced == (stranger,)
     assert len(searches) == 2 and torch.equal(one.factor, several.factor)
 

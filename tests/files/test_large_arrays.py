@@ -1,5 +1,6 @@
 """Arrays that grow: the same whole array from memory and from a file."""
 
+import os
 import tempfile
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.files import large_arrays
-from sl_nerfstudio.files.large_arrays import GrowingArray, in_file, largest_in_memory
+from sl_nerfstudio.files.large_arrays import GrowingArray, in_file, largest_in_memory, usable_memory
 
 
 @pytest.mark.parametrize("most", [0, 100, 10**6])
@@ -30,13 +31,27 @@ def test_no_place_for_the_file_is_a_fault_of_the_user(monkeypatch):
         GrowingArray(0).append(np.zeros(3))
 
 
-def test_the_limit_is_a_share_of_the_memory_that_may_be_used(tmp_path, monkeypatch):
-    limit = tmp_path / "memory.max"
-    limit.write_text("8000000\n")
-    monkeypatch.setattr(large_arrays, "_CGROUP_LIMIT", limit)
-    assert largest_in_memory() == 1000000
-    limit.write_text("max\n")
-    assert largest_in_memory() > 10**7
+@pytest.mark.parametrize(
+    ("own", "group", "text", "expected"),
+    [
+        ("0::/\n", "memory.max", "8000000\n", 8000000),  # a container
+        ("0::/a/b\n", "a/memory.max", "8000000\n", 8000000),  # the group around the process's own
+        ("4:memory:/a\n0::/\n", "memory/a/memory.limit_in_bytes", "8000000\n", 8000000),
+        ("0::/a\n", "b/memory.max", "8000000\n", None),  # another group
+        ("0::/\n", "memory.max", "max\n", None),
+        ("4:memory:/\n", "memory/memory.limit_in_bytes", "9223372036854771712\n", None),  # version 1 without a limit
+        ("", "nothing", "", None),
+    ],
+)
+def test_memory_is_as_much_as_control_groups_allow(own, group, text, expected, tmp_path, monkeypatch):
+    (tmp_path / group).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / group).write_text(text)
+    (tmp_path / "own").write_text(own)
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert usable_memory(tmp_path, tmp_path / "own") == (expected or machine)
+    monkeypatch.setattr(large_arrays, "ROOT", tmp_path)
+    monkeypatch.setattr(large_arrays, "OWN", tmp_path / "own")
+    assert largest_in_memory() == (expected or machine) // 8
 
 
 def test_arrays_in_a_file_are_the_same_arrays(tmp_path, monkeypatch):

@@ -2,23 +2,26 @@
 
 import numpy as np
 
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, words_of
 from sl_nerfstudio.bundle_adjustment.loops.random_bits import mixed
 from sl_nerfstudio.compiled import compiled, compiled_range
 
 
 @compiled_range
-def draw_pixels(first, last, frames, values, offsets, widths, heights, seed, pixels, counts):
+def draw_pixels(first, last, frames, index, seed, pixels, counts):
     """Up to `pixels.shape[1]` pixels of each frame, one of each occupied square of a lattice; `counts` says how many.
 
     Both the pixel of a square and the squares are chosen by random bits of the pixels' numbers.
     """
+    words, first_words, widths, heights = index
     most = pixels.shape[1]
     for k in range(first, last):
         f = frames[k]
-        start, w, h = offsets[f], widths[f], heights[f]
+        w, h, first_word = widths[f], heights[f], first_words[f]
         decoded = 0
-        for n in range(start, start + w * h):
-            decoded += np.isfinite(values[n, 0])
+        for row in range(h):
+            for column in range(w):
+                decoded += is_known(words, first_word + row * words_of(w), column)
         counts[k] = 0
         if decoded == 0 or most == 0:
             continue
@@ -26,12 +29,13 @@ def draw_pixels(first, last, frames, values, offsets, widths, heights, seed, pix
         across = w // step + 1
         chosen = np.full(across * (h // step + 1), -1)
         smallest = np.zeros(len(chosen), dtype=np.uint64)
-        for n in range(w * h):
-            if np.isfinite(values[start + n, 0]):
-                square = n // w // step * across + n % w // step
-                bits = mixed(mixed(seed, f), n)
-                if chosen[square] < 0 or bits < smallest[square]:
-                    chosen[square], smallest[square] = n, bits
+        for row in range(h):
+            for column in range(w):
+                if is_known(words, first_word + row * words_of(w), column):
+                    n, square = row * w + column, row // step * across + column // step
+                    bits = mixed(mixed(seed, f), n)
+                    if chosen[square] < 0 or bits < smallest[square]:
+                        chosen[square], smallest[square] = n, bits
         count = 0
         for square in range(len(chosen)):
             if chosen[square] >= 0:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import place_of, words_of
 from sl_nerfstudio.bundle_adjustment.loops.random_bits import mixed, uniform
 from sl_nerfstudio.compiled import compiled, compiled_range
 from sl_nerfstudio.geometry.devices.compiled_view import view_of
@@ -12,11 +13,12 @@ from sl_nerfstudio.geometry.rigid import moved
 def mark_visible(first, last, devices, images, frame, p_world, normal, centres, allowed, limits, visible):
     """visible[j, a]: whether frame j decoded something near anchor a, for frames first to last - 1.
 
-    `images` are values, offsets, widths and heights; `centres` those of cameras and projectors [2, frames, 3];
-    `allowed[i, j]` whether frame j may look up anchors of frame i; `limits` the gate in pixels and the least cosine.
+    `images` are values and their PixelIndex; `centres` those of cameras and projectors [2, frames, 3]; `allowed[i, j]`
+    whether frame j may look up anchors of frame i; `limits` the gate in pixels and the least cosine. Without a gate no
+    coordinate is read.
     """
     _, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
-    values, offsets, widths, heights = images
+    values, (words, first_words, widths, heights) = images
     gate, least_cosine = limits
     for j in range(first, last):
         T, T_projector, camera = T_camera_world[j], T_projector_camera[j], cameras[j]
@@ -33,11 +35,16 @@ def mark_visible(first, last, devices, images, frame, p_world, normal, centres, 
             u, v, in_front = view[0], view[1], view[2]
             if not (in_front and u >= 0 and v >= 0 and u < w and v < h):
                 continue
-            pixel = offsets[j] + int(v) * w + int(u)
+            place = place_of(words, first_words[j] + int(v) * words_of(w), int(u))
+            if place < 0:
+                continue
             x, y, z = moved(T_projector, x, y, z)
             expected = view_of(projector_code, x, y, z, projector)
-            miss = np.hypot(values[pixel, 0] - expected[0], values[pixel, 1] - expected[1])
-            visible[j, a] = expected[2] and miss < gate  # False where nothing is decoded
+            if gate < np.inf:
+                value = values[place]
+                visible[j, a] = expected[2] and np.hypot(value[0] - expected[0], value[1] - expected[1]) < gate
+            else:
+                visible[j, a] = expected[2]
 
 
 @compiled

@@ -1,7 +1,8 @@
 """Paraboloids fitted to small windows of a coordinate image, in compiled loops.
 
 A fit belongs to the pixel at the window's centre and serves every position within that pixel. Positions that stay in
-their pixel need no new fit: a `WindowMemory` keeps the last one of each position.
+their pixel need no new fit: a `WindowMemory` keeps the last one of each position. Windows are fitted frame by frame: if
+the images are in a file, each of them is read once.
 """
 
 from dataclasses import dataclass
@@ -10,6 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, next_place, words_of
 from sl_nerfstudio.compiled import compiled, compiled_range
 
 
@@ -17,40 +20,58 @@ from sl_nerfstudio.compiled import compiled, compiled_range
 class WindowMemory:
     """The last fit of each of some positions; a look-up changes it, and its result does not depend on it."""
 
-    pixel: Int64[ndarray, "n"]  # number of the pixel among those of all frames; -1 for none
+    order: Int64[ndarray, "n"]  # in which windows are fitted
+    pixel: Int64[ndarray, "n"]  # number of the pixel in its frame; -1 outside, -2 before the first fit
     fit: Float64[ndarray, "n 6 2"]  # c0 + cx dx + cy dy + cxx dx^2 + cxy dx dy + cyy dy^2 around the pixel's centre
     roughness: Float64[ndarray, "n"]  # RMS distance of the window from it; infinite without a fit
 
     @staticmethod
-    def empty(count: int) -> "WindowMemory":
-        """Without any fit."""
-        return WindowMemory(np.full(count, -1), np.zeros((count, 6, 2)), np.full(count, np.inf))
+    def empty(frame: Int64[ndarray, "n"]) -> "WindowMemory":
+        """Without any fit, for positions in these frames."""
+        count, frames = len(frame), int(frame.max(initial=-1)) + 1
+        order = Groups.of(frame, frames).entries
+        return WindowMemory(order, np.full(count, -2), np.zeros((count, 6, 2)), np.full(count, np.inf))
 
 
 @compiled_range
-def look_up_windows(first, last, values, offsets, widths, heights, frame, uv, limits, memory, found, roughness):
-    """Value and derivatives by x and y (`found`, 3 x 2) of the paraboloid at each position.
-
-    `limits` are half the window, its fewest pixels and the least pivot; `memory` the three arrays of a WindowMemory.
-    Where there is no fit, `roughness` is infinite.
-    """
-    pixels, fits, rough = memory
-    A, right = np.zeros((6, 8)), np.zeros((6, 2))
+def mark_moved(first, last, index, frame, uv, pixels, moved):
+    """Pixel in which each position is now, -1 outside the image; whether it is another one than before."""
+    _, _, widths, heights = index
     for k in range(first, last):
-        f, px, py = frame[k], uv[k, 0], uv[k, 1]
+        f, x, y = frame[k], uv[k, 0], uv[k, 1]
+        inside = x >= 0 and y >= 0 and x < widths[f] and y < heights[f]
+        pixel = int(y) * widths[f] + int(x) if inside else -1
+        moved[k] = pixel != pixels[k]
+        pixels[k] = pixel
+
+
+@compiled_range
+def fit_windows(first, last, chosen, values, index, frame, pixels, limits, fits, roughness):
+    """The paraboloids of some positions, in the order of their numbers in `chosen`.
+
+    `limits` are half the window, its fewest pixels and the least pivot. Where there is no fit, `roughness` is infinite.
+    """
+    words, first_words, widths, heights = index
+    A, right, places = np.zeros((6, 8)), np.zeros((6, 2)), np.zeros(2 * limits[0] + 1, dtype=np.int64)
+    for k in chosen[first:last]:
+        f, pixel = frame[k], pixels[k]
         roughness[k] = np.inf
-        if not (px >= 0 and py >= 0 and px < widths[f] and py < heights[f]):
-            continue
-        column, row = int(px), int(py)
-        pixel = offsets[f] + row * widths[f] + column
-        if pixels[k] != pixel:
-            rough[k] = _fit(values, offsets[f], widths[f], heights[f], column, row, limits, A, right)
-            pixels[k] = pixel
+        if pixel >= 0:
+            w = widths[f]
+            roughness[k] = _fit(
+                values, words, first_words[f], w, heights[f], pixel % w, pixel // w, limits, places, A, right
+            )
             for i in range(6):
                 fits[k, i, 0], fits[k, i, 1] = A[i, 6], A[i, 7]
-        roughness[k] = rough[k]
-        if rough[k] < np.inf:
-            dx, dy = px - column - 0.5, py - row - 0.5
+
+
+@compiled_range
+def evaluate_windows(first, last, widths, frame, uv, pixels, fits, roughness, found):
+    """Value and derivatives by x and y (`found`, 3 x 2) of the paraboloid at each position."""
+    for k in range(first, last):
+        if roughness[k] < np.inf:
+            w = widths[frame[k]]
+            dx, dy = uv[k, 0] - pixels[k] % w - 0.5, uv[k, 1] - pixels[k] // w - 0.5
             for c in range(2):
                 c0, cx, cy = fits[k, 0, c], fits[k, 1, c], fits[k, 2, c]
                 cxx, cxy, cyy = fits[k, 3, c], fits[k, 4, c], fits[k, 5, c]
@@ -60,21 +81,26 @@ def look_up_windows(first, last, values, offsets, widths, heights, frame, uv, li
 
 
 @compiled
-def _fit(values, offset, w, h, column, row, limits, A, right):
+def _fit(values, words, first_word, w, h, column, row, limits, places, A, right):
     """Least squares over one window: the coefficients in A[:, 6:], and the RMS distance (infinite without a fit).
 
     All products of the basis are monomials up to the fourth degree: their sums over a row come first.
     """
     half_window, least_pixels, least_pivot = limits
+    left, end = max(column - half_window, 0), min(column + half_window + 1, w)
+    top, bottom = max(row - half_window, 0), min(row + half_window + 1, h)
     A[:] = 0.0
     n = squares = origin_a = origin_b = 0.0
-    for y in range(max(row - half_window, 0), min(row + half_window + 1, h)):
+    for y in range(top, bottom):  # all rows first: each waits for memory, and together they wait once
+        places[y - top] = next_place(words, first_word + y * words_of(w), left)
+    for y in range(top, bottom):
         s0 = s1 = s2 = s3 = s4 = a0 = a1 = a2 = b0 = b1 = b2 = 0.0
-        for x in range(max(column - half_window, 0), min(column + half_window + 1, w)):
-            pixel = offset + y * w + x
-            a, b = float(values[pixel, 0]), float(values[pixel, 1])
-            if not (np.isfinite(a) and np.isfinite(b)):
+        row_word, place = first_word + y * words_of(w), places[y - top]
+        for x in range(left, end):
+            if not is_known(words, row_word, x):
                 continue
+            a, b = float(values[place, 0]), float(values[place, 1])
+            place += 1
             if n == 0.0:
                 origin_a, origin_b = a, b  # keeps the sums small
             n += 1.0
