@@ -106,12 +106,10 @@ def ratios(loaded: LoadedScan, found: Adjustment) -> tuple[float, float]:
 
 def first_frames(loaded: LoadedScan, count: int) -> LoadedScan:
     """A scan that ends after some frames."""
-    samples, end = loaded.samples, int(loaded.samples.first[count])
-    kept = {name: getattr(samples, name)[:end] for name in ("frame", "row", "column", "coords", "pattern", "held_out")}
     return replace(
         loaded,
         scan=replace(loaded.scan, frames=loaded.scan.frames[:count]),
-        samples=type(samples)(**kept, first=samples.first[: count + 1]),
+        samples=loaded.samples.first_frames(count),
     )
 
 

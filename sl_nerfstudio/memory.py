@@ -6,6 +6,7 @@ temporaries spend a third of their time there.
 """
 
 import ctypes
+import mmap
 import sys
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # numbers of malloc.h
@@ -23,3 +24,27 @@ def keep_freed_memory() -> bool:
         return False
     settings = ((_MMAP_THRESHOLD, 2**28), (_TRIM_THRESHOLD, 2**30), (_TOP_PAD, 2**26))
     return all([library.mallopt(number, value) == 1 for number, value in settings])
+
+
+def return_freed_memory() -> None:
+    """Give all freed memory back to the system after all, once (malloc_trim(3)); with glibc on Linux only."""
+    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
+        library.malloc_trim(0)
+
+
+def read_at_random(address: int, length: int) -> None:
+    """Tell Linux that mapped memory will be read here and there: then it reads no megabytes around each place."""
+    _advise(address, length, "MADV_RANDOM")
+
+
+def read_in_order(address: int, length: int) -> None:
+    """Tell Linux that mapped memory will be read from its beginning to its end: then it reads ahead."""
+    _advise(address, length, "MADV_NORMAL")
+
+
+def _advise(address: int, length: int, advice: str) -> None:
+    """madvise(2) for whole pages; it is only a hint, so failure does not matter."""
+    if sys.platform == "linux" and length > 0:
+        first = address - address % mmap.PAGESIZE
+        library = ctypes.CDLL(None)
+        library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(address + length - first), getattr(mmap, advice))

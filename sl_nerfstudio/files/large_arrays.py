@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.control_groups import OWN, ROOT, groups_around
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.memory import return_freed_memory
 
 _ALIGNMENT = 64  # bytes, of arrays in a file
 _SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
@@ -67,6 +68,7 @@ class GrowingArray:
 
     def _write(self) -> None:
         self._like = self._pieces[0][:0]
+        first = self._file is None
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115  # `whole` closes it
@@ -75,6 +77,8 @@ class GrowingArray:
         except OSError as error:
             raise _no_space(error, self._bytes) from error
         self._pieces = []
+        if first:  # many pieces; from now on there is one at a time
+            return_freed_memory()
 
 
 def in_file(arrays: Sequence[ndarray]) -> list[ndarray]:

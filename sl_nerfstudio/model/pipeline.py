@@ -172,7 +172,7 @@ class SLPipeline(VanillaPipeline):
 
     def _say_what_next(self, step: int, trainer: Any) -> None:
         if comms.is_main_process():
-            decoded = float(self.datamanager.samples.coords[:, 0].isfinite().float().mean())
+            decoded = self.datamanager.samples.decoded_share
             config = trainer.config.get_base_dir() / "config.yml"
             print(what_next(config, self.datamanager.get_datapath(), decoded), flush=True)
 

@@ -24,8 +24,9 @@ from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.held_out import BLOCK
-from sl_nerfstudio.dataparser.samples import PixelSamples
+from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
 from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.se3 import inverse, log_se3
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.geometry.spacing import evenly_spaced
@@ -241,17 +242,14 @@ def maps_and_held_out(
     held_out = HeldOutPixels(
         frame_of, torch.cat(uv_camera), torch.cat(uv_projector), frame_of * most + torch.cat(blocks)
     )
-    images = (_training_coords(scan, samples, number) for number in range(len(scan.frames)))
+    images = (_training_coords(frame.camera, own) for frame, own in zip(scan.frames, samples.in_order(), strict=True))
     return CoordinateMaps.of(images, settings.look_up), held_out
 
 
-def _training_coords(scan: Scan, samples: PixelSamples, number: int) -> Float[Tensor, "h w 2"]:
+def _training_coords(camera: Device, pixels: PixelBatch) -> Float[Tensor, "h w 2"]:
     """The coordinate image of a frame without its held-out pixels."""
-    camera = scan.frames[number].camera
-    rows = slice(int(samples.first[number]), int(samples.first[number + 1]))
-    image = torch.full((camera.h, camera.w, 2), float("nan"))
-    row, column, held = samples.row[rows].long(), samples.column[rows].long(), samples.held_out[rows]
-    image[row[~held], column[~held]] = samples.coords[rows][~held]
+    image, used = torch.full((camera.h, camera.w, 2), float("nan")), ~pixels.held_out
+    image[pixels.row[used], pixels.column[used]] = pixels.coords[used]
     return image
 
 

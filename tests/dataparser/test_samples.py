@@ -38,9 +38,24 @@ def test_every_masked_pixel_occurs_once_with_its_own_values(scan: Scan, samples:
         np.testing.assert_array_equal(pixels.decoded.numpy(), ~np.isnan(frame.read_coords()[row, column]).any(-1))
 
 
-def test_memory_is_19_bytes_a_pixel(samples: PixelSamples) -> None:
+def test_memory_is_20_bytes_a_pixel_that_lie_together(samples: PixelSamples) -> None:
+    assert samples.records.is_contiguous() and samples.records.nbytes == 20 * len(samples)
     columns = (samples.frame, samples.row, samples.column, samples.coords, samples.pattern, samples.held_out)
-    assert sum(c.element_size() * c.numel() for c in columns) == 19 * len(samples)
+    storage = samples.records.untyped_storage()
+    assert all(c.untyped_storage().data_ptr() == storage.data_ptr() for c in columns)  # none is a copy
+
+
+def test_the_decoded_share_is_that_of_all_pixels(samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sl_nerfstudio.dataparser.samples._AT_ONCE", 7)
+    assert 0 < samples.decoded_share < 1
+    assert samples.decoded_share == pytest.approx(float(samples.coords[:, 0].isfinite().double().mean()), rel=1e-12)
+
+
+def test_the_first_frames_alone_are_a_table(samples: PixelSamples) -> None:
+    some = samples.first_frames(2)
+    assert len(some) == int(samples.first[2]) and some.frame.unique().tolist() == [0, 1]
+    assert torch.equal(some.held_out_index, some.held_out.nonzero()[:, 0])
+    assert torch.equal(some.held_out_of(1), samples.held_out_of(1))
 
 
 def test_training_draws_never_touch_held_out_pixels_and_reach_all_others(samples: PixelSamples) -> None:
@@ -104,9 +119,38 @@ def test_empty_masks_are_rejected(tmp_path: Path) -> None:
 def test_a_table_in_a_file_is_the_same(scan: Scan, samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sl_nerfstudio.dataparser.samples.largest_in_memory", lambda: 0)
     mapped = build_samples(scan, show_progress=False)
-    for field in dataclasses.fields(PixelSamples):
-        a, b = getattr(mapped, field.name), getattr(samples, field.name)
-        assert torch.equal(a.nan_to_num(), b.nan_to_num()) if a.is_floating_point() else torch.equal(a, b)
+    assert mapped.in_file and not samples.in_file
+    for name in ("records", "first", "held_out_index"):
+        assert torch.equal(getattr(mapped, name), getattr(samples, name))
     index = samples.draw(50, torch.Generator().manual_seed(2))
     assert torch.equal(index, mapped.draw(50, torch.Generator().manual_seed(2)))
     assert torch.equal(mapped.at(index).pattern, samples.at(index).pattern)
+
+
+def test_a_table_in_a_file_says_how_it_is_read(
+    scan: Scan, samples: PixelSamples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a system that reads megabytes ahead does so for each of a thousand pixels a step."""
+    said: list[tuple[str, int, int]] = []
+    for name in ("read_at_random", "read_in_order"):
+        monkeypatch.setattr(f"sl_nerfstudio.dataparser.samples.{name}", lambda *at, name=name: said.append((name, *at)))
+    samples.draw(5)
+    list(samples.in_order())
+    assert said == []  # in memory
+    monkeypatch.setattr("sl_nerfstudio.dataparser.samples.largest_in_memory", lambda: 0)
+    mapped = build_samples(scan, show_progress=False)
+    where = mapped.records.data_ptr(), mapped.records.nbytes
+    mapped.draw(5)
+    assert said.pop() == ("read_at_random", *where)
+    for _ in mapped.in_order():
+        assert said == [("read_in_order", *where)]
+    assert 0 < mapped.decoded_share < 1 and said == 2 * [("read_in_order", *where)]
+
+
+def test_frames_in_order_are_all_pixels(samples: PixelSamples) -> None:
+    frames = list(samples.in_order())
+    assert [frame.frame.unique().tolist() for frame in frames] == [[0], [1], [2]]
+    whole = samples.at(torch.arange(len(samples)))
+    for field in dataclasses.fields(whole):
+        together = torch.cat([getattr(frame, field.name) for frame in frames])
+        assert torch.equal(together.nan_to_num(), getattr(whole, field.name).nan_to_num())

@@ -1,7 +1,9 @@
 """Arrays that grow: the same whole array from memory and from a file."""
 
 import os
+import sys
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,24 @@ def test_the_whole_is_what_was_added(most, tmp_path, monkeypatch):
     np.testing.assert_array_equal(whole, np.concatenate(pieces)[:, ::-1])
     whole[0] = 7  # as an array in memory
     assert not list(tmp_path.iterdir())  # the file has no name that could stay behind
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read from /proc")
+def test_pieces_that_went_to_a_file_take_no_memory(tmp_path, monkeypatch):
+    """Else freed memory would stay with the process, where the file's pages should be."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def own() -> int:
+        status = Path("/proc/self/status").read_text()
+        return int(status.split("RssAnon:")[1].split()[0]) // 1024
+
+    before, grown = own(), GrowingArray(200 << 20)
+    for k in range(200):
+        grown.append(np.full(1 << 17, float(k)))  # a megabyte each, as small as arrays that the C library keeps
+    assert own() > before + 150
+    grown.append(np.zeros(1 << 17))
+    assert own() < before + 50
+    assert grown.whole()[5 << 17] == 5
 
 
 def test_no_place_for_the_file_is_a_fault_of_the_user(monkeypatch):
