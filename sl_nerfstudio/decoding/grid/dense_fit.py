@@ -26,7 +26,8 @@ _FINEST = 12.0  # pixels per period: finer captures are averaged first
 _LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
 _ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
-_SMOOTHING = 0.35  # window in which coordinates are taken to be linear, periods
+_SMOOTHING = ((0.35, 0.05), (0.12, 0.1))  # windows in which coordinates are taken to be linear, and how far from them
+# the pixel's own may be for that; periods
 _LARGEST_SHIFT = 0.12  # periods, of all rounds together
 
 
@@ -139,7 +140,8 @@ def _refine(
     """
     if not inside.any():
         return np.full_like(coords, np.nan), np.zeros_like(image)
-    coords, period = local_planes(coords, inside, _SMOOTHING * pixels_a_period), grids[0].period
+    period = grids[0].period
+    coords = _smooth(coords, inside, pixels_a_period, period)
     start, even = coords, Light.even(image.shape)
     fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period) for grid in grids]
     best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
@@ -149,7 +151,23 @@ def _refine(
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)
         if index == 0:  # the network's remaining noise; smoothing in every round would flatten the surface
-            coords = local_planes(coords, inside, _SMOOTHING * pixels_a_period)
+            coords = _smooth(coords, inside, pixels_a_period, period)
         shift, _ = fit_shift(image, coords, trust, grids[best], light, pixels_a_period)
     # Judged in even light: what only the fitted light explains must not count as agreement.
     return coords, fit_shift(image, coords, trust, grids[best], even, pixels_a_period)[1]
+
+
+def _smooth(
+    coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], pixels_a_period: float, period: float
+) -> Float32[ndarray, "h w 2"]:
+    """Each pixel on the plane through the largest window that is near its own coordinates, or else as it is.
+
+    In narrow parts, and beside edges that were read without a tear, a window holds more than one surface: its plane is
+    of none of them. Outside `inside`, values continue the nearest planes.
+    """
+    out = np.where(inside[..., None], coords, np.float32(0))
+    for window, limit in reversed(_SMOOTHING):
+        plane = local_planes(coords, inside, window * pixels_a_period)
+        near = ~inside | (np.linalg.norm(plane - coords, axis=-1) < limit * period)
+        out = np.where(near[..., None], plane, out)
+    return out
