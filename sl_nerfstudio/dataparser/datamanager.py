@@ -24,7 +24,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.spacing import evenly_spaced
 
 Batch = dict[str, Tensor]
-_BYTES_PER_PIXEL = 23  # of the table, with the index of pixels that are not held out
+_BYTES_PER_PIXEL = 24  # of the table, with the index of pixels that are not held out
 
 
 @dataclass
@@ -39,7 +39,7 @@ class SLDataManagerConfig(VanillaDataManagerConfig):
     eval_num_rays_per_batch: int = 1024
     """Held-out pixels in an evaluation during training."""
     images_on_gpu: bool = True
-    """Keep the table of all pixels on the GPU (23 bytes per pixel) if half of its free memory is enough; otherwise, or
+    """Keep the table of all pixels on the GPU (24 bytes per pixel) if half of its free memory is enough; otherwise, or
     if off, each batch is copied there, for which every step waits."""
 
     # nerfstudio's own settings for choosing images and pixels, which have no meaning here.

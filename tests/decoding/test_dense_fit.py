@@ -107,3 +107,17 @@ def test_what_is_not_trusted_does_not_pull_at_the_pattern():
         for weight in (trust, np.ones_like(trust))
     ]
     assert errors[0] < 0.5 * errors[1]
+
+
+def test_a_narrow_bar_keeps_its_own_coordinates():
+    """As wide as a period, before a surface whose coordinates it runs into without a tear: windows hold both."""
+    truth = surface(14)
+    truth[:, 73:87] += (26, 17)
+    image = photograph(truth, 0.4, 0.005, np.random.default_rng(0))
+    start = cv2.blur(truth, (9, 1))  # 26 pattern pixels over 9 pixels are no tear
+    start[:, 77:83] = truth[:, 77:83]
+    rows, bar = slice(20, -20), slice(77, 83)
+    out, _ = fit_densely(image, start, np.ones(image.shape, np.float32), draw_sharpnesses(GRID.render(), 20.0), 14.0)
+    error = np.linalg.norm(out - truth, axis=-1)
+    assert np.quantile(error[rows, bar], 0.95) < 2.0  # a tenth of a period
+    assert np.median(error[rows, 20:60]) < 0.1  # a plane through the large window, where it holds one surface
