@@ -17,6 +17,7 @@ from sl_nerfstudio.processing.projector.found import FoundProjector
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
+from sl_nerfstudio.registration.pairs.edge_weights import support_of
 from sl_nerfstudio.registration.result import Registration, UncertainRotation
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
 from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
@@ -84,7 +85,9 @@ def summarise(
             ScanFacts(
                 tuple(map(_facts, frames)),
                 tuple(
-                    PairFacts(e.frames, e.used, e.overlap * e.fitness**2) for e in records if e.used or not e.undecided
+                    PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness))
+                    for e in records
+                    if e.used or not e.undecided
                 ),
                 cross,
                 bool(wrong),

@@ -17,7 +17,12 @@ def is_accepted(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS
 
 def support(match: PairMatch) -> float:
     """Between 0 and 1: how much two surfaces agree, and how little contradicts."""
-    return match.overlap * match.fitness**2
+    return support_of(match.overlap, match.fitness)
+
+
+def support_of(overlap: float, fitness: float) -> float:
+    """The same from the share of points that agree, and the share of those that could be judged."""
+    return overlap * fitness**2
 
 
 def quality(match: PairMatch, settings: EdgeSettings = REGISTRATION_DEFAULTS.edge) -> float:
