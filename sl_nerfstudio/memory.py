@@ -8,6 +8,7 @@ temporaries spend a third of their time there.
 import ctypes
 import mmap
 import sys
+from functools import cache
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # numbers of malloc.h
 
@@ -19,7 +20,7 @@ def keep_freed_memory() -> bool:
     """
     if sys.platform != "linux":
         return False
-    library = ctypes.CDLL(None)
+    library = _c_library()
     if not hasattr(library, "gnu_get_libc_version"):  # musl
         return False
     settings = ((_MMAP_THRESHOLD, 2**28), (_TRIM_THRESHOLD, 2**30), (_TOP_PAD, 2**26))
@@ -28,7 +29,7 @@ def keep_freed_memory() -> bool:
 
 def return_freed_memory() -> None:
     """Give all freed memory back to the system after all, once (malloc_trim(3)); with glibc on Linux only."""
-    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
+    if sys.platform == "linux" and hasattr(library := _c_library(), "malloc_trim"):
         library.malloc_trim(0)
 
 
@@ -46,5 +47,10 @@ def _advise(address: int, length: int, advice: str) -> None:
     """madvise(2) for whole pages; it is only a hint, so failure does not matter."""
     if sys.platform == "linux" and length > 0:
         first = address - address % mmap.PAGESIZE
-        library = ctypes.CDLL(None)
-        library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(address + length - first), getattr(mmap, advice))
+        length += address - first
+        _c_library().madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), getattr(mmap, advice))
+
+
+@cache
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None)

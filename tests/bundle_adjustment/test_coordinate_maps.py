@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, place_of, words_of
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, known_pixels, place_of, words_of
 from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.rays import pixel_centres
@@ -195,6 +195,8 @@ def test_every_pixel_is_found_among_the_decoded_ones(sizes, seed):
     values, (words, first_words, _, _) = maps.arrays
     for frame, image in enumerate(images):
         assert np.array_equal(maps.image(frame).numpy(), image, equal_nan=True)
+        count = known_pixels(words, first_words[frame], image.shape[1], image.shape[0])
+        assert count == np.isfinite(image[..., 0]).sum()
         for row, column in np.ndindex(*image.shape[:2]):
             row_word = first_words[frame] + row * words_of(image.shape[1])
             place, known = place_of(words, row_word, column), np.isfinite(image[row, column, 0])

@@ -29,9 +29,10 @@ def border_distances(first, last, index, starts, entries, pixel, found):
 def _steps(words, first_word, w, h, out):
     """Of one frame, by two passes over it (Rosenfeld and Pfaltz, Pattern Recognition, 1968)."""
     for y in range(h):
+        row_word = first_word + y * words_of(w)
         for x in range(w):
             pixel = y * w + x
-            if not is_known(words, first_word + y * words_of(w), x):
+            if not is_known(words, row_word, x):
                 continue
             least = 0
             if 0 < x < w - 1 and y > 0:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, words_of
+from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, known_pixels, words_of
 from sl_nerfstudio.bundle_adjustment.loops.random_bits import mixed
 from sl_nerfstudio.compiled import compiled, compiled_range
 
@@ -18,10 +18,7 @@ def draw_pixels(first, last, frames, index, seed, pixels, counts):
     for k in range(first, last):
         f = frames[k]
         w, h, first_word = widths[f], heights[f], first_words[f]
-        decoded = 0
-        for row in range(h):
-            for column in range(w):
-                decoded += is_known(words, first_word + row * words_of(w), column)
+        decoded = known_pixels(words, first_word, w, h)
         counts[k] = 0
         if decoded == 0 or most == 0:
             continue
@@ -30,8 +27,9 @@ def draw_pixels(first, last, frames, index, seed, pixels, counts):
         chosen = np.full(across * (h // step + 1), -1)
         smallest = np.zeros(len(chosen), dtype=np.uint64)
         for row in range(h):
+            row_word = first_word + row * words_of(w)
             for column in range(w):
-                if is_known(words, first_word + row * words_of(w), column):
+                if is_known(words, row_word, column):
                     n, square = row * w + column, row // step * across + column // step
                     bits = mixed(mixed(seed, f), n)
                     if chosen[square] < 0 or bits < smallest[square]:

@@ -49,9 +49,7 @@ class PixelIndex:
         """One frame, NaN where nothing is known."""
         w, h, first = self.widths[frame], self.heights[frame], self.first[frame]
         rows = self.words[first : first + h * words_of(w), 0].reshape(h, -1)
-        known = np.unpackbits(np.ascontiguousarray(rows, dtype="<u8").view(np.uint8), axis=1, bitorder="little")[
-            :, :w
-        ].astype(np.bool_)
+        known = np.unpackbits(rows.astype("<u8").view(np.uint8), axis=1, count=w, bitorder="little").view(np.bool_)
         out = np.full((h, w, 2), np.nan, dtype=np.float32)
         start = int(self.words[first, 1])
         out[known] = values[start : start + int(known.sum())]
@@ -92,6 +90,13 @@ def next_place(words, row_word, column):
     """Number of the first coordinate that is at a pixel or after it."""
     number, bit = row_word + column // WORD, np.uint64(column % WORD)
     return np.int64(words[number, 1]) + _bits_of(words[number, 0] & ((_ONE << bit) - _ONE))
+
+
+@compiled
+def known_pixels(words, first_word, width, height):
+    """How many pixels of a frame, from its first word on, have a coordinate."""
+    last_row, last = first_word + (height - 1) * words_of(width), width - 1
+    return next_place(words, last_row, last) + is_known(words, last_row, last) - np.int64(words[first_word, 1])
 
 
 @compiled

@@ -43,8 +43,10 @@ def _away_from_borders(problem: Problem, found: Progress) -> Progress:
     state, maps, s = found.state, problem.maps, problem.settings.kernel
     anchors, rows = state.anchors, found.rows
     r = residuals_of(state.rig, anchors, rows, maps)
-    own = maps.border_distance(anchors.frame, project(state.rig.camera[anchors.frame], anchors.d_camera)[0])
-    seen = maps.border_distance(rows.frame, pixels_of_rows(state.rig, anchors, rows)[0])
+    frame = torch.cat([anchors.frame, rows.frame])
+    uv_own = project(state.rig.camera[anchors.frame], anchors.d_camera)[0]
+    uv = torch.cat([uv_own, pixels_of_rows(state.rig, anchors, rows)[0]])
+    own, seen = maps.border_distance(frame, uv).tensor_split([len(uv_own)])
     size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows), s)
     nearer = torch.minimum(own[rows.anchor], seen)
     least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)

@@ -165,7 +165,7 @@ def _smooth(
     In narrow parts, and beside edges that were read without a tear, a window holds more than one surface: its plane is
     of none of them. Outside `inside`, values continue the nearest planes.
     """
-    out = np.where(inside[..., None], coords, np.float32(0))
+    out = coords
     for window, limit in reversed(_SMOOTHING):
         plane = local_planes(coords, inside, window * pixels_a_period)
         near = ~inside | (np.linalg.norm(plane - coords, axis=-1) < limit * period)
