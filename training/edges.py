@@ -17,6 +17,7 @@ import torch
 import tyro
 from jaxtyping import Float32
 from numpy import ndarray
+from safetensors.torch import load_file
 from torch import Tensor
 
 from sl_nerfstudio.decoding.grid.edges.channels import EdgeView
@@ -61,6 +62,8 @@ class Config:
     """highest learning rate, of AdamW"""
     seed: int = 0
     """determines captures, crops and initial weights"""
+    start: Path | None = None
+    """weights to start from, as safetensors, instead of random ones"""
     threads: int = 3
     """processor threads of torch, and processes that make captures; one more thread makes crops"""
     log_every: int = 50
@@ -164,7 +167,10 @@ def train(config: Config) -> None:
     torch.set_num_threads(config.threads)
     cv2.setNumThreads(1)
     torch.manual_seed(config.seed)
-    network = EdgeNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = EdgeNetwork()
+    if config.start is not None:
+        network.load_state_dict(load_file(config.start))
+    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=1e-3)
     first = resume(config.output, network, optimizer)
     sums: dict[str, float] = {}

@@ -6,7 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
 from sl_nerfstudio.decoding.grid.edges.channels import CHANNELS, EdgeView
+from sl_nerfstudio.decoding.grid.edges.chooser import EdgeChooser
 from sl_nerfstudio.decoding.grid.edges.continuation import continued, slopes, steps
 from sl_nerfstudio.decoding.grid.edges.network import MARGIN, EdgeNetwork
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
@@ -146,6 +148,29 @@ def test_strips_of_an_image_give_what_the_whole_gives():
         torch.testing.assert_close(getattr(above, name)[..., :first, :], a[..., :first, :], atol=1e-9, rtol=0)
         torch.testing.assert_close(getattr(below, name)[..., MARGIN:, :], a[..., first:, :], atol=1e-9, rtol=0)
     assert (near.step[..., MARGIN - 32 :, :] - whole.step[..., first:, :]).abs().max() > 1e-9  # less is not enough
+
+
+@pytest.mark.parametrize("rows", [64, 2 * MARGIN + 560])  # one strip, and two
+def test_the_step_that_is_chosen_is_the_best_of_the_possible_ones(rows):
+    torch.manual_seed(1)
+    rng = np.random.default_rng(2)
+    network = EdgeNetwork().eval().to(memory_format=torch.channels_last)
+    torch.nn.init.normal_(network.head.weight)
+    fitted = rng.random((rows, 48, 2)).astype(np.float32)
+    fitted[rng.random((rows, 48)) < 0.9] = np.nan
+    layers = [rng.normal(size=(count, rows, 48)).astype(np.float32) for count in (7, 8)]
+    view = EdgeView(layers[0], fitted, fitted, layers[1])
+    grid = GridPattern()
+    found, odds = EdgeChooser(network, grid, draw_sharpnesses(grid.render(), grid.period))._predict(view)
+    with torch.inference_mode():
+        output = network(torch.from_numpy(view.channels())[None].contiguous(memory_format=torch.channels_last))
+    known = np.pad(np.isfinite(fitted[..., 0]), 13)
+    can = np.stack([known[13 + y : 13 + y + rows, 13 + x : 13 + x + 48] for x, y in steps()])
+    scores = np.where(can, output.step[0].numpy(), -np.inf)
+    assert np.take_along_axis(scores, found[None].astype(int), 0)[0] == pytest.approx(scores.max(0), abs=1e-4)
+    expected = np.where(can.any(0), output.wrong[0].numpy(), np.inf)
+    np.testing.assert_allclose(np.where(can.any(0), odds, np.inf), expected, atol=1e-4)
+    assert (odds[~can.any(0)] > 10).all() and 0.5 < can.any(0).mean() < 1
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ class NetworkDecoder(Decoder[GridPattern]):
     """Decodes single images with the trained networks of this package."""
 
     name: ClassVar[str] = "network"
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
     reads: ClassVar[str] = GridPattern.kind
     sequence: ClassVar[bool] = False
 

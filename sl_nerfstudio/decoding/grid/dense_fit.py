@@ -168,6 +168,7 @@ def _smooth(
     out = coords
     for window, limit in reversed(_SMOOTHING):
         plane = local_planes(coords, inside, window * pixels_a_period)
-        near = ~inside | (np.linalg.norm(plane - coords, axis=-1) < limit * period)
+        apart = plane - coords
+        near = ~inside | (apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2)
         out = np.where(near[..., None], plane, out)
     return out

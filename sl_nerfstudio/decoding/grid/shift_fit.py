@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, Light
-from sl_nerfstudio.decoding.grid.smoothing import enlarge, gaussian_means, shrink
+from sl_nerfstudio.decoding.grid.smoothing import enlarge, gaussian_means
 
 # Windows.
 _SQUARES = 8  # per period, for which fits are made
 _SHIFT_WINDOW = 0.42  # of a shift, periods
 _LIGHT_WINDOW = 0.38  # in which the light is taken to be even, periods
 # Light.
-_LIGHT_MOMENTS = [0, 1, 4, 10, 11]  # those that contrast and brightness follow from
 _LEAST_CONTRAST, _WELL_LIT = 0.25, 0.9  # share of the contrast at this quantile of the image
 # Shift.
 _LARGEST_STEP = 0.2  # periods
@@ -35,8 +35,9 @@ def fit_shift(
     """Shift of the coordinates, in periods, that moves the drawn pattern onto the image, and their correlation."""
     step = _square_size(pixels_a_period)
     m = _moments(image, light.on(grid.at(coords)), trust, step)
-    shift, agreement = _solve(gaussian_means(m, _SHIFT_WINDOW * pixels_a_period / step))
-    fit = enlarge(np.dstack([shift, agreement]), image.shape, step)
+    found = np.empty((*m.shape[1:3], 3), dtype=np.float32)
+    _solve(gaussian_means(m, _SHIFT_WINDOW * pixels_a_period / step), found)
+    fit = enlarge(found, image.shape, step)
     return fit[..., :2], fit[..., 2]
 
 
@@ -50,7 +51,7 @@ def measure_light(
     """The light in the image, from coordinates that are nearly right."""
     step = _square_size(pixels_a_period)
     m = _moments(image, grid.at(coords), trust, step)
-    means = gaussian_means(m[..., _LIGHT_MOMENTS], _LIGHT_WINDOW * pixels_a_period / step)
+    means = gaussian_means(m[:2], _LIGHT_WINDOW * pixels_a_period / step)
     contrast, brightness = _contrast_and_brightness(means)
     light = enlarge(np.dstack([contrast, brightness]), image.shape, step)
     return Light(light[..., 0], light[..., 1])
@@ -63,48 +64,74 @@ def _square_size(pixels_a_period: float) -> int:
 
 def _moments(
     image: Float32[ndarray, "h w"], drawn: Float32[ndarray, "h w 3"], trust: Float32[ndarray, "h w"], step: int
-) -> Float32[ndarray, "a b 15"]:
-    """Products of the pattern, its derivatives and the image, averaged over squares of `step` pixels."""
+) -> Float32[ndarray, "4 a b 4"]:
+    """Products of the pattern p, its derivatives px and py and the image i, averaged over squares of `step` pixels.
+
+    In groups of four: (1, p, pp, i), (ip, ii, px, py), (p px, p py, px px, px py), (py py, i px, i py, 0).
+    """
     h, w = image.shape
-    one, p, px, py, i = np.ones_like(image), *np.moveaxis(drawn, -1, 0), image
-    products = np.stack(
-        [one, p, px, py, p * p, p * px, p * py, px * px, px * py, py * py, i, i * p, i * px, i * py, i * i], -1
-    )
-    products *= trust[..., None]
-    size = (-(-w // step), -(-h // step))
-    return np.concatenate([shrink(products[..., k : k + 4], size, step) for k in range(0, 15, 4)], -1)
+    out = np.zeros((4, -(-h // step), -(-w // step), 4), dtype=np.float32)
+    _add_products(image, drawn, trust, step, out)
+    return out
 
 
-def _contrast_and_brightness(m: Float32[ndarray, "h w 5"]) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
+@compiled
+def _add_products(image: ndarray, drawn: ndarray, trust: ndarray, step: int, out: ndarray) -> None:
+    h, w = image.shape
+    share = np.float32(1 / step**2)
+    for row in range(h):
+        for column in range(w):
+            weight, i = trust[row, column] * share, image[row, column]
+            p, px, py = drawn[row, column, 0], drawn[row, column, 1], drawn[row, column, 2]
+            r, c = row // step, column // step
+            products = (
+                (np.float32(1), p, p * p, i),
+                (i * p, i * i, px, py),
+                (p * px, p * py, px * px, px * py),
+                (py * py, i * px, i * py, np.float32(0)),
+            )
+            for group in range(4):
+                for k in range(4):
+                    out[group, r, c, k] += weight * products[group][k]
+
+
+def _contrast_and_brightness(
+    m: Float32[ndarray, "2 h w 4"],
+) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     """By least squares; the contrast is at least a quarter of that in the well lit parts of the image."""
-    n = np.maximum(m[..., 0], 1e-6)
-    mp, pp, mi, ip = (m[..., k] / n for k in range(1, 5))
+    n = np.maximum(m[0, ..., 0], 1e-6)
+    mp, pp, mi, ip = m[0, ..., 1] / n, m[0, ..., 2] / n, m[0, ..., 3] / n, m[1, ..., 0] / n
     variance = np.maximum(pp - mp * mp, 1e-6)
     contrast = (ip - mi * mp) / variance
-    seen = contrast[m[..., 0] > 0.5]
+    seen = contrast[m[0, ..., 0] > 0.5]
     floor = _LEAST_CONTRAST * float(np.quantile(seen, _WELL_LIT)) if len(seen) else 0.0
     contrast = np.maximum(contrast, max(floor, 1e-3))
     return contrast, mi - contrast * mp
 
 
-def _solve(m: Float32[ndarray, "h w 15"]) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
-    """Shift by least squares, with brightness and contrast eliminated, and the correlation of image and pattern."""
-    n = np.maximum(m[..., 0], 1e-6)
-    mp, mx, my, mi = (m[..., k] / n for k in (1, 2, 3, 10))
-    pp, xp, yp = m[..., 4] / n - mp * mp, m[..., 5] / n - mp * mx, m[..., 6] / n - mp * my
-    xx, xy, yy = m[..., 7] / n - mx * mx, m[..., 8] / n - mx * my, m[..., 9] / n - my * my
-    ip, ix, iy = m[..., 11] / n - mi * mp, m[..., 12] / n - mi * mx, m[..., 13] / n - mi * my
-    ii = m[..., 14] / n - mi * mi
-    pp = np.maximum(pp, 1e-6)
-    agreement = ip / np.sqrt(pp * np.maximum(ii, 1e-10))
-    # i = b + a p + a (sx px + sy py): eliminate p, then solve 2 x 2 equations for a sx and a sy.
-    xx, xy, yy = xx - xp * xp / pp, xy - xp * yp / pp, yy - yp * yp / pp
-    ix, iy = ix - xp * ip / pp, iy - yp * ip / pp
-    ridge = _PRIOR * (xx + yy) + 1e-6
-    xx, yy = xx + ridge, yy + ridge
-    determinant = np.maximum(xx * yy - xy * xy, 1e-9)
-    contrast = np.maximum(ip / pp, _LEAST_RELATIVE_CONTRAST * np.sqrt(np.maximum(ii, 0) / pp) + 1e-6)
-    shift = np.stack([yy * ix - xy * iy, xx * iy - xy * ix], -1) / (determinant * contrast)[..., None]
-    trusted = np.clip(agreement, 0, 1)[..., None]  # where the two disagree, their difference is meaningless
-    shift = np.clip(shift, -_LARGEST_STEP, _LARGEST_STEP) * trusted
-    return shift.astype(np.float32), agreement.astype(np.float32)
+@compiled
+def _solve(means: ndarray, out: ndarray) -> None:
+    """Shift (x, y) by least squares, brightness and contrast eliminated, and the correlation of image and pattern."""
+    h, w = out.shape[:2]
+    for row in range(h):
+        for column in range(w):
+            a, b, c, d = means[0, row, column], means[1, row, column], means[2, row, column], means[3, row, column]
+            n = max(a[0], np.float32(1e-6))
+            mp, mi, mx, my = a[1] / n, a[3] / n, b[2] / n, b[3] / n
+            pp, xp, yp = max(a[2] / n - mp * mp, np.float32(1e-6)), c[0] / n - mp * mx, c[1] / n - mp * my
+            xx, xy, yy = c[2] / n - mx * mx, c[3] / n - mx * my, d[0] / n - my * my
+            ip, ix, iy = b[0] / n - mi * mp, d[1] / n - mi * mx, d[2] / n - mi * my
+            ii = b[1] / n - mi * mi
+            agreement = ip / np.sqrt(pp * max(ii, 1e-10))
+            # i = b + a p + a (sx px + sy py): eliminate p, then solve 2 x 2 equations for a sx and a sy.
+            xx, xy, yy = xx - xp * xp / pp, xy - xp * yp / pp, yy - yp * yp / pp
+            ix, iy = ix - xp * ip / pp, iy - yp * ip / pp
+            ridge = _PRIOR * (xx + yy) + 1e-6
+            xx, yy = xx + ridge, yy + ridge
+            determinant = max(xx * yy - xy * xy, 1e-9)
+            contrast = max(ip / pp, _LEAST_RELATIVE_CONTRAST * np.sqrt(max(ii, 0) / pp) + 1e-6)
+            trusted = min(max(agreement, 0), 1)  # where the two disagree, their difference is meaningless
+            for axis in range(2):
+                shift = (yy * ix - xy * iy if axis == 0 else xx * iy - xy * ix) / (determinant * contrast)
+                out[row, column, axis] = min(max(shift, -_LARGEST_STEP), _LARGEST_STEP) * trusted
+            out[row, column, 2] = agreement

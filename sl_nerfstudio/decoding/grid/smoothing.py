@@ -5,46 +5,73 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
+
 _REACH = 2.5  # of a Gaussian window, standard deviations
 
 
-def gaussian_means(stack: Float32[ndarray, "h w k"], sigma: float) -> Float32[ndarray, "h w k"]:
-    """Gaussian means with zeros outside the image: quotients of two such means are means over the image alone."""
+def gaussian_means(layers: Float32[ndarray, "k h w 4"], sigma: float) -> Float32[ndarray, "k h w 4"]:
+    """Gaussian means with zeros outside the image: quotients of two such means are means over the image alone.
+
+    OpenCV is fastest with four channels at a time; there may be any number `k` of such groups.
+    """
     radius = int(np.ceil(_REACH * sigma))
     size = (2 * radius + 1, 2 * radius + 1)
-    parts = [stack[..., k : k + 4] for k in range(0, stack.shape[-1], 4)]
-    blurred = [
-        np.atleast_3d(cv2.GaussianBlur(np.ascontiguousarray(p), size, sigma, borderType=cv2.BORDER_CONSTANT))
-        for p in parts
-    ]
-    return np.concatenate(blurred, -1)
+    out = np.empty_like(layers)
+    for group, means in zip(layers, out, strict=True):
+        cv2.GaussianBlur(group, size, sigma, dst=means, borderType=cv2.BORDER_CONSTANT)
+    return out
 
 
 def local_planes(
     coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], sigma: float
 ) -> Float32[ndarray, "h w 2"]:
     """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best."""
-    h, w = inside.shape
-    y, x = np.mgrid[:h, :w].astype(np.float32)
-    x, y = (x - w / 2) / np.float32(sigma), (y - h / 2) / np.float32(sigma)
-    weight = inside.astype(np.float32)
     centre = np.nanmean(coords[inside], axis=0)
-    value = np.where(inside[..., None], coords - centre, 0).astype(np.float32)
-    products = [weight, weight * x, weight * y, weight * x * x, weight * x * y, weight * y * y]
-    products += [value[..., 0] * f for f in (1, x, y)] + [value[..., 1] * f for f in (1, x, y)]
-    m = gaussian_means(np.stack(products, -1), sigma)
-    # Moments about the pixel itself, where the plane is evaluated.
-    n = np.maximum(m[..., 0], 1e-6)
-    mx, my = m[..., 1] / n, m[..., 2] / n
-    sxx, sxy, syy = m[..., 3] / n - mx * mx + 1e-3, m[..., 4] / n - mx * my, m[..., 5] / n - my * my + 1e-3
-    determinant = sxx * syy - sxy * sxy
-    out = np.empty_like(value)
-    for axis in range(2):
-        mean, vx, vy = (m[..., 6 + 3 * axis + k] / n for k in range(3))
-        cx, cy = vx - mean * mx, vy - mean * my
-        slope_x, slope_y = (syy * cx - sxy * cy) / determinant, (sxx * cy - sxy * cx) / determinant
-        out[..., axis] = mean + slope_x * (x - mx) + slope_y * (y - my)
-    return (out + centre).astype(np.float32)
+    products = np.zeros((3, *inside.shape, 4), dtype=np.float32)
+    _multiply(coords, inside, centre, np.float32(sigma), products)
+    out = np.empty_like(coords)
+    _evaluate_planes(gaussian_means(products, sigma), centre, np.float32(sigma), out)
+    return out
+
+
+@compiled
+def _multiply(coords: ndarray, inside: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
+    """Products of one, place and coordinates at the pixels inside: (1, x, y, xx), (xy, yy, u, ux), (uy, v, vx, vy)."""
+    h, w = inside.shape
+    for row in range(h):
+        y = (row - h / 2) / sigma
+        for column in range(w):
+            if inside[row, column]:
+                x = (column - w / 2) / sigma
+                u, v = coords[row, column, 0] - centre[0], coords[row, column, 1] - centre[1]
+                a, b, c = out[0, row, column], out[1, row, column], out[2, row, column]
+                a[0], a[1], a[2], a[3] = 1, x, y, x * x
+                b[0], b[1], b[2], b[3] = x * y, y * y, u, u * x
+                c[0], c[1], c[2], c[3] = u * y, v, v * x, v * y
+
+
+@compiled
+def _evaluate_planes(means: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
+    """Planes from moments about the pixel itself, where they are evaluated."""
+    h, w = out.shape[:2]
+    for row in range(h):
+        y = (row - h / 2) / sigma
+        for column in range(w):
+            x = (column - w / 2) / sigma
+            a, b, c = means[0, row, column], means[1, row, column], means[2, row, column]
+            n = max(a[0], np.float32(1e-6))
+            mx, my = a[1] / n, a[2] / n
+            sxx, sxy, syy = a[3] / n - mx * mx + 1e-3, b[0] / n - mx * my, b[1] / n - my * my + 1e-3
+            determinant = sxx * syy - sxy * sxy
+            for axis in range(2):
+                if axis == 0:
+                    mean, vx, vy = b[2] / n, b[3] / n, c[0] / n
+                else:
+                    mean, vx, vy = c[1] / n, c[2] / n, c[3] / n
+                cx, cy = vx - mean * mx, vy - mean * my
+                slope_x, slope_y = (syy * cx - sxy * cy) / determinant, (sxx * cy - sxy * cx) / determinant
+                out[row, column, axis] = centre[axis] + mean + slope_x * (x - mx) + slope_y * (y - my)
 
 
 def shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) -> Float32[ndarray, "a b k"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.channels import network_channels
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid
 from sl_nerfstudio.decoding.grid.edges.continuation import continued, slopes, steps
@@ -84,12 +85,22 @@ def _drawn_if_continued(
 
 def _tears(coords: Float32[ndarray, "h w 2"]) -> Bool[ndarray, "h w"]:
     """Pixels on both sides of a tear."""
-    torn = np.zeros(coords.shape[:2], dtype=bool)
-    for axis in (0, 1):
-        apart = np.abs(np.diff(coords, axis=axis)).max(-1) > _TEAR  # False for NaN
-        for first in (0, 1):
-            torn[(slice(None),) * axis + (slice(first, first + apart.shape[axis]),)] |= apart
+    torn = np.zeros(coords.shape[:2], dtype=np.bool_)
+    _mark_tears(coords, np.float32(_TEAR), torn)
     return torn
+
+
+@compiled
+def _mark_tears(coords: ndarray, tear: float, torn: ndarray) -> None:
+    h, w = torn.shape
+    for row in range(h):
+        for column in range(w):
+            for r, c in ((row + 1, column), (row, column + 1)):
+                if r >= h or c >= w:
+                    continue
+                dx, dy = coords[r, c, 0] - coords[row, column, 0], coords[r, c, 1] - coords[row, column, 1]
+                if abs(dx) > tear or abs(dy) > tear:  # False for NaN
+                    torn[row, column] = torn[r, c] = True
 
 
 def _moved(layer: Float32[ndarray, "h w *k"], rectified: RectifiedImage, flags: int) -> Float32[ndarray, "a b *k"]:
@@ -108,6 +119,7 @@ def moved_coords(
     values, weight = np.where(known[..., None], coords, np.float32(0)), known.astype(np.float32)
     near = _moved(values, rectified, cv2.INTER_NEAREST)
     linear = _moved(values, rectified, cv2.INTER_LINEAR)
-    smooth = (_moved(weight, rectified, cv2.INTER_LINEAR) > 0.999) & (np.abs(linear - near).max(-1) < tear)
+    apart = np.abs(linear - near)
+    smooth = (_moved(weight, rectified, cv2.INTER_LINEAR) > 0.999) & (np.maximum(apart[..., 0], apart[..., 1]) < tear)
     out = np.where(smooth[..., None], linear, near)
     return np.where((_moved(weight, rectified, cv2.INTER_NEAREST) > 0.5)[..., None], out, np.float32(np.nan))

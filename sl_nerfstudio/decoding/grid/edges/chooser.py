@@ -5,15 +5,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int
+from jaxtyping import Float32, Float64, Int
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid
 from sl_nerfstudio.decoding.grid.edges.channels import EdgeView, edge_view
 from sl_nerfstudio.decoding.grid.edges.continuation import continued, slopes, steps
 from sl_nerfstudio.decoding.grid.edges.evidence import Evidence
 from sl_nerfstudio.decoding.grid.edges.network import MARGIN, EdgeNetwork
 from sl_nerfstudio.decoding.grid.rectify import RectifiedImage, integer_centres
+from sl_nerfstudio.decoding.grid.unet import STRIDE
 from sl_nerfstudio.pattern.grid import GridPattern
 
 _SURELY_WRONG = 20.0  # log odds where nothing can be continued
@@ -57,18 +59,16 @@ class EdgeChooser:
 
     def _predict(self, view: EdgeView) -> tuple[Int[ndarray, "h w"], Float32[ndarray, "h w"]]:
         """Index of the chosen step, and log odds of being wrong, for every pixel of the rectified image."""
-        possible = _possible(np.isfinite(view.fitted[..., 0]), self._steps)
-        channels, rows = view.channels(), view.fitted.shape[0]
-        step, wrong = np.empty(view.fitted.shape[:2], dtype=np.int16), np.empty(view.fitted.shape[:2], dtype=np.float32)
+        known = np.isfinite(view.fitted[..., 0])
+        channels, rows = view.channels(), len(known)
+        step, wrong = np.zeros(known.shape, dtype=np.int16), np.full(known.shape, _SURELY_WRONG, dtype=np.float32)
         for first in range(0, rows, _STRIP):
             begin, last = max(0, first - MARGIN), min(first + _STRIP, rows)
             strip = np.ascontiguousarray(channels[:, begin : min(last + MARGIN, rows)])
             with torch.inference_mode():
-                output = self._network(torch.from_numpy(strip)[None].contiguous(memory_format=torch.channels_last))
-            inner, here = slice(first - begin, last - begin), slice(first, last)
-            can = possible[:, here]
-            step[here] = np.where(can, output.step[0, :, inner].numpy(), np.float32(-np.inf)).argmax(0)
-            wrong[here] = np.where(can.any(0), output.wrong[0, inner].numpy(), np.float32(_SURELY_WRONG))
+                maps = self._network.maps(torch.from_numpy(strip)[None].contiguous(memory_format=torch.channels_last))
+            here = maps[0].permute(1, 2, 0).numpy()[(first - begin) // STRIDE :]
+            _choose(here, known, self._steps, first, last, step, wrong)
         return step, wrong
 
     def _own_steps(self, linear: Float64[ndarray, "2 2"]) -> Int[ndarray, "k 2"]:
@@ -76,9 +76,24 @@ class EdgeChooser:
         return np.rint(np.linalg.solve(linear, self._steps.T).T).astype(np.int64)
 
 
-def _possible(known: Bool[ndarray, "h w"], all_steps: Int[ndarray, "k 2"]) -> Bool[ndarray, "k h w"]:
-    """Whether something is known at each step from each pixel."""
+@compiled
+def _choose(
+    maps: ndarray, known: ndarray, steps: ndarray, first: int, last: int, step: ndarray, wrong: ndarray
+) -> None:
+    """Fill rows `first` to `last` - 1: among the steps to places where something is known, the one scored highest.
+
+    `maps` are those of `EdgeNetwork.maps`, (h, w, outputs), from row `first` on. Pixels without such a step are left.
+    """
     h, w = known.shape
-    reach = int(np.abs(all_steps).max())
-    padded = np.pad(known, reach)
-    return np.stack([padded[reach + dy : reach + dy + h, reach + dx : reach + dx + w] for dx, dy in all_steps])
+    count, parts = len(steps), STRIDE * STRIDE
+    for row in range(first, last):
+        for column in range(w):
+            at = maps[(row - first) // STRIDE, column // STRIDE]
+            part = (row - first) % STRIDE * STRIDE + column % STRIDE
+            best, highest = -1, -np.inf
+            for k in range(count):
+                r, c = row + steps[k, 1], column + steps[k, 0]
+                if 0 <= r < h and 0 <= c < w and known[r, c] and at[k * parts + part] > highest:
+                    best, highest = k, at[k * parts + part]
+            if best >= 0:
+                step[row, column], wrong[row, column] = best, at[count * parts + part]

@@ -15,6 +15,7 @@ from sl_nerfstudio.compiled import compiled
 _DISTANCES = (3, 6, 9, 13)  # pixels of the rectified image
 _DIRECTIONS = 8
 _TEAR = 0.3  # periods between neighbouring pixels: a larger difference is no slope
+_LEAST_SEEN = 1e-3  # share of the window in which there is a slope
 _SLOPE_WINDOW = 2.0  # sigma, pixels of the rectified image
 
 
@@ -31,19 +32,44 @@ def slopes(coords: Float32[ndarray, "h w 2"], period: float, scale: float = 1.0)
     `period` is in the unit of the coordinates; `scale` is the size of a pixel of the rectified image in pixels of this
     one.
     """
-    total = np.zeros((*coords.shape, 2), dtype=np.float32)
-    count = np.zeros(coords.shape, dtype=np.float32)
-    for axis, by in ((1, 0), (0, 1)):
-        step = np.diff(coords, axis=axis)
-        smooth = np.abs(step).max(-1) < _TEAR * period  # False for NaN
-        step = np.where(smooth[..., None], step, 0)
-        for first in (0, 1):
-            part = (slice(None),) * axis + (slice(first, first + step.shape[axis]),)
-            total[part][..., by] += step
-            count[part][..., by] += smooth
-    total = _blurred(total.reshape(*coords.shape[:2], 4), scale).reshape(total.shape)
-    count = _blurred(count, scale)[..., None, :]
-    return np.where(count > 1e-3, total / np.maximum(count, 1e-6), np.float32(np.nan)).astype(np.float32)
+    total = np.empty((*coords.shape, 2), dtype=np.float32)
+    count = np.empty(coords.shape, dtype=np.float32)
+    _sum_steps(coords, np.float32(_TEAR * period), total, count)
+    out = _blurred(total.reshape(*coords.shape[:2], 4), scale).reshape(total.shape)
+    _divide(out, _blurred(count, scale))
+    return out
+
+
+@compiled
+def _sum_steps(coords: ndarray, tear: float, total: ndarray, count: ndarray) -> None:
+    """Sums (axis, by x or y) of the steps to the neighbours on both sides that are not torn away, and their number."""
+    h, w = coords.shape[:2]
+    for row in range(h):
+        for column in range(w):
+            for by in range(2):
+                x = y = np.float32(0)
+                smooth = 0
+                for side in range(2):  # the step to the next pixel, then the one from the pixel before
+                    r, c = row - side * by, column - side * (1 - by)
+                    rr, cc = r + by, c + 1 - by
+                    if r < 0 or c < 0 or rr >= h or cc >= w:
+                        continue
+                    dx, dy = coords[rr, cc, 0] - coords[r, c, 0], coords[rr, cc, 1] - coords[r, c, 1]
+                    if abs(dx) < tear and abs(dy) < tear:  # False for NaN
+                        x, y, smooth = x + dx, y + dy, smooth + 1
+                total[row, column, 0, by], total[row, column, 1, by], count[row, column, by] = x, y, smooth
+
+
+@compiled
+def _divide(total: ndarray, count: ndarray) -> None:
+    """Means from sums, in place; NaN where hardly anything was added up."""
+    h, w = count.shape[:2]
+    for row in range(h):
+        for column in range(w):
+            for by in range(2):
+                n = count[row, column, by]
+                for axis in range(2):
+                    total[row, column, axis, by] = total[row, column, axis, by] / n if n > _LEAST_SEEN else np.nan
 
 
 def continued(

@@ -37,6 +37,10 @@ class EdgeNetwork(LevelNetwork):
         nn.init.zeros_(self.head.weight)
 
     def forward(self, channels: Float[Tensor, "b c h w"]) -> EdgeOutput:
-        """Predict for images whose sides are multiples of `unet.MULTIPLE`."""
+        """Predict for images whose sides are multiples of `unet.MULTIPLE`.
+
+        Map c s s + s i + j of `maps`, with s = `STRIDE`, holds what output c is at rows i, s + i, .. and columns
+        j, s + j, ..; the last output is `wrong`.
+        """
         out = F.pixel_shuffle(self.maps(channels), STRIDE)
         return EdgeOutput(out[:, :_STEPS], out[:, _STEPS])
