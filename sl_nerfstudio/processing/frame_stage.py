@@ -68,9 +68,9 @@ def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Gen
         return
     try:
         with worker_pool(min(jobs, len(frames)), _start_worker, job) as pool:
-            with no_interrupts():
-                futures = [pool.submit(_work, frame) for frame in frames]
-            for future in as_completed(futures):
+            with no_interrupts():  # a future keeps its result: of those that are done, none may be kept
+                ready = as_completed([pool.submit(_work, frame) for frame in frames])
+            for future in ready:
                 yield future.result()
     except BrokenProcessPool as error:
         raise UserError(

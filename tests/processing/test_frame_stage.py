@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+import weakref
 from contextlib import redirect_stdout
 
 import numpy as np
@@ -174,6 +175,16 @@ def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ram
     killed = type(job)(job.work, KilledDecoder(LAYOUT), job.camera, job.projector, job.seed)
     with pytest.raises(UserError, match=r"was killed\n.*cause:  2 processes need more memory.*\n.*--jobs"):
         list(run_frames(killed, captures.frames, 2))
+
+
+def test_results_of_other_processes_do_not_stay_in_memory(ramp_scan, tmp_path):
+    """The caller moves clouds to a file once they are many: then nobody else may hold them."""
+    gone = []
+    for result in run_frames(ramp_scan.job(tmp_path), _captures(ramp_scan).frames, 2):
+        assert all(earlier() is None for earlier in gone[:-1])  # the last one waits in its future for the next
+        gone.append(weakref.ref(result.cloud))
+        del result
+    assert len(gone) == len(NAMES) and all(cloud() is None for cloud in gone)
 
 
 def _bytes_of(folder):
