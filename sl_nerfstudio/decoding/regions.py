@@ -1,33 +1,57 @@
 """Connected regions of a coordinate image: small ones are decoding errors."""
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.connectivity import component_labels
+from sl_nerfstudio.compiled import compiled
 
 
 def drop_small_regions(
     coords: Float32[ndarray, "h w 2"], largest_step: float, least_pixels: int
 ) -> Float32[ndarray, "h w 2"]:
-    """Set connected regions of fewer than `least_pixels` pixels to NaN.
+    """Set connected regions of fewer than `least_pixels` pixels to NaN; `largest_step` as in `number_regions`."""
+    number = number_regions(coords, largest_step)
+    small = np.bincount(number.ravel(), minlength=1) < least_pixels
+    return np.where(small[number][..., None], np.float32(np.nan), coords)
+
+
+def number_regions(coords: Float32[ndarray, "h w 2"], largest_step: float) -> Int32[ndarray, "h w"]:
+    """Connected regions, numbered from 1 in the order of their first pixels; 0 where nothing is decoded.
 
     Neighbouring pixels (4 directions) are connected if both are decoded and neither coordinate differs by more than
-    `largest_step` projector pixels.
+    `largest_step`.
     """
-    h, w = coords.shape[:2]
-    known = np.isfinite(coords).all(-1)
-    index = np.full((h, w), -1, dtype=np.int32)
-    index[known] = np.arange(known.sum(), dtype=np.int32)
-    pairs = []
-    for here, there in (((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-                        ((slice(None, -1), slice(None)), (slice(1, None), slice(None)))):  # fmt: skip
-        near = np.abs(coords[here] - coords[there]).max(-1) <= largest_step  # False for NaN
-        pairs.append(np.stack([index[here][near], index[there][near]]))
-    a, b = np.concatenate(pairs, 1)
-    n = int(known.sum())
-    label = component_labels(a, b, n)
-    small = np.bincount(label, minlength=1)[label] < least_pixels
-    out = coords.copy()
-    out[known] = np.where(small[:, None], np.float32(np.nan), coords[known])
-    return out
+    number = np.zeros(coords.shape[:2], dtype=np.int32)
+    _fill(coords, largest_step, number)
+    return number
+
+
+@compiled
+def _fill(coords: ndarray, tear: float, number: ndarray) -> None:
+    """Fill `number`: 0 where coordinates are unknown, otherwise 1, 2, .. by region."""
+    h, w = number.shape
+    stack = np.empty((h * w, 2), dtype=np.int32)
+    regions = 0
+    for row in range(h):
+        for column in range(w):
+            if number[row, column] != 0 or np.isnan(coords[row, column, 0]):
+                continue
+            regions += 1
+            number[row, column] = regions
+            stack[0, 0], stack[0, 1] = row, column
+            top = 1
+            while top > 0:
+                top -= 1
+                r, c = stack[top, 0], stack[top, 1]
+                for d in range(4):
+                    rr = r + (d == 1) - (d == 3)
+                    cc = c + (d == 0) - (d == 2)
+                    if rr < 0 or cc < 0 or rr >= h or cc >= w or number[rr, cc] != 0:
+                        continue
+                    dx = abs(coords[rr, cc, 0] - coords[r, c, 0])
+                    dy = abs(coords[rr, cc, 1] - coords[r, c, 1])
+                    if dx <= tear and dy <= tear:  # false for NaN
+                        number[rr, cc] = regions
+                        stack[top, 0], stack[top, 1] = rr, cc
+                        top += 1

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from sl_nerfstudio.pattern.gaussian_window import gaussian_window
+
 _LEAST_KNOWN = 0.3  # of a window: fewer decoded pixels say too little
 _LEAST_VARIANCE = 1e-4  # of the pattern in a window
 
@@ -30,22 +32,29 @@ def projected_light(
     `pictures` the pattern at several degrees of sharpness, of which the one counts that explains most: with another,
     fine parts of the pattern would seem darker than coarse ones.
     """
-    return max((_fit(image, coords, picture, sigma) for picture in pictures), key=lambda fit: fit.explained).slope
+    known = np.isfinite(coords).all(-1)
+    weight = known.astype(np.float32)
+    grey = image.astype(np.float32) * weight
+    image_means = gaussian_window(np.dstack([weight, grey, grey * grey]), sigma)
+    place = np.nan_to_num(coords) - np.float32(0.5)
+    fits = (_fit(grey, weight, image_means, place, picture, sigma) for picture in pictures)
+    return max(fits, key=lambda fit: fit.explained).slope
 
 
 def _fit(
-    image: Float[ndarray, "h w"], coords: Float32[ndarray, "h w 2"], picture: Float32[ndarray, "ph pw"], sigma: float
+    grey: Float32[ndarray, "h w"],
+    weight: Float32[ndarray, "h w"],
+    image_means: Float32[ndarray, "h w 3"],
+    place: Float32[ndarray, "h w 2"],
+    picture: Float32[ndarray, "ph pw"],
+    sigma: float,
 ) -> _Fit:
-    known = np.isfinite(coords).all(-1)
-    place = np.nan_to_num(coords) - np.float32(0.5)
+    """With one picture; `image_means` are those of the weight, of the grey and of its square."""
     drawn = cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    weight = known.astype(np.float32)
-    grey, drawn = image.astype(np.float32) * weight, drawn * weight
-    n, p, i, pp, ip, ii = (
-        cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        for values in (weight, drawn, grey, drawn * drawn, grey * drawn, grey * grey)
-    )
-    some = known & (n > _LEAST_KNOWN)
+    drawn = drawn * weight
+    p, pp, ip = cv2.split(gaussian_window(np.dstack([drawn, drawn * drawn, grey * drawn]), sigma))
+    n, i, ii = cv2.split(image_means)
+    some = (weight > 0) & (n > _LEAST_KNOWN)
     n = np.maximum(n, np.float32(1e-6))
     p, i = p / n, i / n
     variance, common, contrast = pp / n - p * p, ip / n - i * p, ii / n - i * i

@@ -1,9 +1,11 @@
 """Local intensity normalisation: makes a captured image look like the pattern that was projected on the object."""
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter
+
+from sl_nerfstudio.pattern.gaussian_window import gaussian_window
 
 
 def normalise_locally(
@@ -20,10 +22,11 @@ def normalise_locally(
     """
     weight = mask.astype(np.float32)
     values = np.where(mask, image, 0).astype(np.float32)
-    known = np.maximum(gaussian_filter(weight, sigma, truncate=3.0), 1e-6)
-    local_mean = gaussian_filter(values, sigma, truncate=3.0) / known
-    spread = np.where(mask, values - local_mean, 0)
-    local_std = np.sqrt(gaussian_filter(spread * spread, sigma, truncate=3.0) / known)
+    known, mean_of_all = cv2.split(gaussian_window(np.dstack([weight, values]), sigma))
+    known = np.maximum(known, np.float32(1e-6))
+    local_mean = mean_of_all / known
+    spread = np.where(mask, values - local_mean, np.float32(0))
+    local_std = np.sqrt(gaussian_window(spread * spread, sigma) / known)
     floor = 1e-3 * max(float(values.max(initial=0)), 1e-12)  # flat regions stay flat
     normalised = mean + contrast * (values - local_mean) / np.maximum(local_std, floor)
     return np.where(mask, np.clip(normalised, 0, 1), 0).astype(np.float32)

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 from scipy.ndimage import find_objects
 
-from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, Light
 from sl_nerfstudio.decoding.grid.shift_fit import fit_shift, measure_light
 from sl_nerfstudio.decoding.grid.smoothing import local_planes, shrink
+from sl_nerfstudio.decoding.regions import number_regions
 
 # Regions.
 _TEAR = 0.35  # periods between neighbouring pixels
@@ -90,40 +90,9 @@ def _regions(
     coords: Float32[ndarray, "h w 2"], period: float
 ) -> Iterator[tuple[tuple[slice, slice], Bool[ndarray, "a b"]]]:
     """Connected regions without a tear: the bounding box of each, and its pixels within the box."""
-    number = np.zeros(coords.shape[:2], dtype=np.int32)
-    _number_regions(coords, _TEAR * period, number)
+    number = number_regions(coords, _TEAR * period)
     for index, box in enumerate(find_objects(number), 1):
         yield box, number[box] == index
-
-
-@compiled
-def _number_regions(coords: ndarray, tear: float, number: ndarray) -> None:
-    """Fill `number`: 0 where coordinates are unknown, otherwise 1, 2, .. by region."""
-    h, w = number.shape
-    stack = np.empty((h * w, 2), dtype=np.int32)
-    regions = 0
-    for row in range(h):
-        for column in range(w):
-            if number[row, column] != 0 or np.isnan(coords[row, column, 0]):
-                continue
-            regions += 1
-            number[row, column] = regions
-            stack[0, 0], stack[0, 1] = row, column
-            top = 1
-            while top > 0:
-                top -= 1
-                r, c = stack[top, 0], stack[top, 1]
-                for d in range(4):
-                    rr = r + (d == 1) - (d == 3)
-                    cc = c + (d == 0) - (d == 2)
-                    if rr < 0 or cc < 0 or rr >= h or cc >= w or number[rr, cc] != 0:
-                        continue
-                    dx = abs(coords[rr, cc, 0] - coords[r, c, 0])
-                    dy = abs(coords[rr, cc, 1] - coords[r, c, 1])
-                    if dx <= tear and dy <= tear:  # false for NaN
-                        number[rr, cc] = regions
-                        stack[top, 0], stack[top, 1] = rr, cc
-                        top += 1
 
 
 def _refine(

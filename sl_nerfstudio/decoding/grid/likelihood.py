@@ -5,11 +5,15 @@ show that the second one is elsewhere in the pattern. Even where the network is 
 all likelihoods allow for that.
 """
 
-import cv2
+import math
+
 import numpy as np
 from jaxtyping import Float32, Float64, Int8
 from numpy import ndarray
 from scipy.special import log_softmax
+
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.pattern.gaussian_window import gaussian_window
 
 _MISREAD = 0.15  # share of the symbols that may be wrong, however certain the network is
 _WINDOW = 0.7  # periods over which symbols are averaged
@@ -33,16 +37,27 @@ def symbol_log_ratio(
     `coords` are in periods within the array `codes`, `symbol` are the network's logits, and `to_map` maps pixels
     (x, y, first centre 0) to their places.
     """
-    row, column = np.nonzero(np.isfinite(coords[..., 0]))
-    place = coords[row, column]
-    cell = np.rint(place).astype(int)
-    j, i = np.clip(cell[:, 0], 0, codes.shape[1] - 1), np.clip(cell[:, 1], 0, codes.shape[0] - 1)
-    at = np.rint(np.stack([column, row], -1) @ to_map[:, :2].T + to_map[:, 2]).astype(int)
-    x, y = np.clip(at[:, 0], 0, symbol.shape[2] - 1), np.clip(at[:, 1], 0, symbol.shape[1] - 1)
-    probability = np.exp(log_softmax(symbol, axis=0))[codes[i, j], y, x]
+    probability = np.exp(log_softmax(symbol, axis=0))
     ratio = np.log((1 - _MISREAD) * symbol.shape[0] * probability + _MISREAD)
-    weight = np.exp(-(((place - cell) / _READABLE) ** 2).sum(-1))
     sums = np.zeros((*coords.shape[:2], 2), dtype=np.float32)
-    sums[row, column] = np.stack([weight, weight * ratio], -1)
-    sums = cv2.GaussianBlur(sums, (0, 0), _WINDOW * pixels_a_period, borderType=cv2.BORDER_CONSTANT)
+    _weigh(coords, codes, ratio, to_map, sums)
+    sums = gaussian_window(sums, _WINDOW * pixels_a_period)
     return (sums[..., 1] / np.maximum(sums[..., 0], 1e-6)).astype(np.float32)
+
+
+@compiled
+def _weigh(coords: ndarray, codes: ndarray, ratio: ndarray, to_map: ndarray, sums: ndarray) -> None:
+    """Weight of each pixel with coordinates, and its share of the sum: the ratio of the nearest node's symbol there."""
+    h, w = coords.shape[:2]
+    for row in range(h):
+        for column in range(w):
+            x, y = coords[row, column, 0], coords[row, column, 1]
+            if np.isnan(x):
+                continue
+            j, i = round(x), round(y)
+            weight = math.exp(-((x - j) ** 2 + (y - i) ** 2) / _READABLE**2)
+            j, i = min(max(j, 0), codes.shape[1] - 1), min(max(i, 0), codes.shape[0] - 1)
+            mx = round(to_map[0, 0] * column + to_map[0, 1] * row + to_map[0, 2])
+            my = round(to_map[1, 0] * column + to_map[1, 1] * row + to_map[1, 2])
+            mx, my = min(max(mx, 0), ratio.shape[2] - 1), min(max(my, 0), ratio.shape[1] - 1)
+            sums[row, column, 0], sums[row, column, 1] = weight, weight * ratio[codes[i, j], my, mx]

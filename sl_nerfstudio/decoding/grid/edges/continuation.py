@@ -5,12 +5,12 @@ The displacement of a pixel to a place on the same surface that is farther from 
 here the plane at that place is continued, not its value.
 """
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.pattern.gaussian_window import gaussian_window
 
 _DISTANCES = (3, 6, 9, 13)  # pixels of the rectified image
 _DIRECTIONS = 8
@@ -35,8 +35,8 @@ def slopes(coords: Float32[ndarray, "h w 2"], period: float, scale: float = 1.0)
     total = np.empty((*coords.shape, 2), dtype=np.float32)
     count = np.empty(coords.shape, dtype=np.float32)
     _sum_steps(coords, np.float32(_TEAR * period), total, count)
-    out = _blurred(total.reshape(*coords.shape[:2], 4), scale).reshape(total.shape)
-    _divide(out, _blurred(count, scale))
+    out = gaussian_window(total.reshape(*coords.shape[:2], 4), _SLOPE_WINDOW * scale).reshape(total.shape)
+    _divide(out, gaussian_window(count, _SLOPE_WINDOW * scale))
     return out
 
 
@@ -100,7 +100,3 @@ def _continue(coords: ndarray, slope: ndarray, step: ndarray, out: ndarray) -> N
                     out[row, column, axis] = coords[r, c, axis] - slope[r, c, axis, 0] * dx - slope[r, c, axis, 1] * dy
                 else:
                     out[row, column, axis] = np.nan
-
-
-def _blurred(values: Float32[ndarray, "h w k"], scale: float) -> Float32[ndarray, "h w k"]:
-    return cv2.GaussianBlur(values, (0, 0), _SLOPE_WINDOW * scale, borderType=cv2.BORDER_CONSTANT)
