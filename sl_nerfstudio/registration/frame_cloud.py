@@ -10,6 +10,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.registration.settings import FRAME_CLOUD_DEFAULTS, REGISTRATION_DEFAULTS, FrameCloudSettings
+from sl_nerfstudio.relative_pose.agreement import agreeing_coords
 from sl_nerfstudio.relative_pose.camera_depth import camera_depth_by_pose
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
@@ -24,7 +25,7 @@ class FrameCloud:
     projector: Device
     pose: RelativePose
     coords: Float32[ndarray, "h w 2"]  # decoded coordinates that agree with the pose; NaN elsewhere
-    uv_camera: Float64[ndarray, "n 2"]
+    uv_camera: Float64[ndarray, "n 2"]  # of the points: `correspondences_of(coords)`
     points: Float64[ndarray, "n 3"]
     sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
     pose_errors: Float64[ndarray, "n 5"]  # along the camera ray, by one sigma of each principal error of the pose
@@ -84,9 +85,6 @@ def frame_cloud(
         T,
         torch.from_numpy(uv_projector[keep]),
     )
-    agreeing = np.full_like(coords, np.nan)
-    row, column = np.floor(uv_camera[keep]).astype(np.int64).T[::-1]
-    agreeing[row, column] = coords[row, column]
     # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
     points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
     return FrameCloud(
@@ -94,7 +92,7 @@ def frame_cloud(
         camera,
         projector,
         pose,
-        agreeing,
+        agreeing_coords(coords, camera, projector, pose),
         uv_camera[keep],
         points,
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),

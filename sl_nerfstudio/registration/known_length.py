@@ -120,7 +120,12 @@ def _point_at(
     radius_px: float,
 ) -> Float64[ndarray, "3"]:
     """World point of a picked pixel, at the median depth of what was decoded around it."""
-    near = np.linalg.norm(cloud.uv_camera - pixel, axis=1) < radius_px
+    first = np.maximum(np.floor(np.array(pixel) - radius_px).astype(np.int64), 0)
+    last = np.maximum(np.ceil(np.array(pixel) + radius_px).astype(np.int64), 0)
+    around = cloud.coords[first[1] : last[1], first[0] : last[0]]
+    row, column = np.nonzero(np.isfinite(around[..., 0]))
+    uv_camera = first + np.stack([column, row], -1) + 0.5
+    near = np.linalg.norm(uv_camera - pixel, axis=1) < radius_px
     if not near.any():
         raise UserError(
             f"{cloud.name}: nothing was decoded within {radius_px:g} pixels of ({pixel[0]:g}, {pixel[1]:g})\n"
@@ -128,8 +133,7 @@ def _point_at(
         )
     # Not the cloud's points: bundle adjustment may have changed the relative pose, and depth depends on it.
     T = np.linalg.inv(T_world_camera) @ T_world_projector
-    row, column = np.floor(cloud.uv_camera[near]).astype(int).T[::-1]
-    d_projector = directions(cloud.projector, cloud.coords[row, column].astype(np.float64))
-    depth = camera_depth(T[:3, :3], T[:3, 3], directions(cloud.camera, cloud.uv_camera[near]), d_projector)
+    d_projector = directions(cloud.projector, around[row[near], column[near]].astype(np.float64))
+    depth = camera_depth(T[:3, :3], T[:3, 3], directions(cloud.camera, uv_camera[near]), d_projector)
     ray = directions(cloud.camera, np.array([pixel], dtype=np.float64))[0]
     return T_world_camera[:3, :3] @ (float(np.median(depth)) * ray) + T_world_camera[:3, 3]

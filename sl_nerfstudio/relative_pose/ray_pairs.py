@@ -1,5 +1,6 @@
 """Correspondences of one frame as pairs of rays, with what is needed to measure errors in projector pixels."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian, unproject
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, PatternBlocks
+
+_MOST_PIXELS = 1_500_000  # of an image of which every pixel is used
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,19 @@ class RayPairs:
         return sums
 
 
+def lattice_step(h: int, w: int) -> int:
+    """Of large images every second, third, .. row and column is enough: neighbouring coordinates err together."""
+    return math.ceil(math.sqrt(h * w / _MOST_PIXELS))
+
+
 def correspondences_of(
     coords: Float32[ndarray, "h w 2"],
 ) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
-    """Camera pixel centres and pattern coordinates of all decoded pixels."""
-    row, column = np.nonzero(np.isfinite(coords).all(-1))
-    return np.stack([column, row], -1) + 0.5, coords[row, column].astype(np.float64)
+    """Camera pixel centres and pattern coordinates of the decoded pixels; of large images, of those on a lattice."""
+    step = lattice_step(*coords.shape[:2])
+    some = coords[::step, ::step]
+    row, column = np.nonzero(np.isfinite(some).all(-1))
+    return np.stack([column, row], -1) * step + 0.5, some[row, column].astype(np.float64)
 
 
 def ray_pairs(

@@ -8,6 +8,7 @@ from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.registration.frame_cloud import frame_cloud, motion_by_pose_errors, reliable_points
 from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.relative_pose import ray_pairs
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
 from sl_nerfstudio.relative_pose.sampson import moved
@@ -89,6 +90,33 @@ def test_what_contradicts_the_pose_is_left_out_of_points_and_coordinates():
     cloud = frame_cloud("a", coords, *devices, known_pose(RIG.T_camera_projector[0].numpy(), *uv, *devices))
     assert np.isnan(cloud.coords[wrong[:, 0], wrong[:, 1]]).all()
     assert len(cloud.points) == np.isfinite(cloud.coords).all(-1).sum() == len(decoded) - len(wrong)
+
+
+@pytest.mark.parametrize("most, step", [(SIZE**2 // 3, 2), (SIZE**2 // 8, 3)])
+def test_of_large_images_points_are_on_a_lattice_and_coordinates_are_judged_everywhere(monkeypatch, most, step):
+    rng = np.random.default_rng(0)
+    coords = _image(0) + rng.normal(0, 0.1, (SIZE, SIZE, 2)).astype(np.float32)
+    decoded = np.argwhere(np.isfinite(coords).all(-1))
+    wrong = decoded[rng.random(len(decoded)) < 0.1]
+    coords[wrong[:, 0], wrong[:, 1]] += np.float32([30, -25])
+    coords[decoded[5][0], decoded[5][1], 1] = np.nan
+    devices = camera_of(SIZE), PROJECTORS["pinhole"]
+    every = estimate_relative_pose(*correspondences_of(coords), *devices)
+    whole = frame_cloud("a", coords, *devices, every)
+    monkeypatch.setattr(ray_pairs, "_MOST_PIXELS", most)
+    uv = correspondences_of(coords)
+    assert (np.floor(uv[0]) % step == 0).all() and len(uv[0]) == np.isfinite(coords[::step, ::step]).all(-1).sum()
+    thin = frame_cloud("a", coords, *devices, estimate_relative_pose(*uv, *devices))
+    assert thin.pose.inliers.sum() == len(thin.points) == len(correspondences_of(thin.coords)[0])
+    np.testing.assert_array_equal(correspondences_of(thin.coords)[0], thin.uv_camera)
+    assert not np.isfinite(thin.coords[wrong[:, 0], wrong[:, 1]]).any()
+    kept, before = (np.isfinite(one.coords).all(-1) for one in (thin, whole))
+    assert (kept != before).mean() < 0.002 and before.sum() > 0.85 * len(decoded)
+    place = {tuple(at): k for k, at in enumerate(whole.uv_camera.tolist())}
+    same = [(k, place[tuple(at)]) for k, at in enumerate(thin.uv_camera.tolist()) if tuple(at) in place]
+    a, b = np.array(same).T
+    off = np.linalg.norm(thin.points[a], axis=1) - np.linalg.norm(whole.points[b], axis=1)
+    assert (np.abs(off) < 4 * np.hypot(thin.sigma_pose[a], whole.sigma_pose[b])).all()
 
 
 def test_a_frame_without_points_is_refused_by_name():

@@ -23,7 +23,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, relative_pose_near
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, lattice_step
 from sl_nerfstudio.threads import results
 
 _FEWEST = 2  # frames that a registration may join
@@ -89,7 +89,8 @@ def _cloud(problem: Problem, k: int) -> FrameCloud | None:
 
 def _thinned(image: ndarray, side: int) -> Float32[ndarray, "h w 2"]:
     """Only every n-th decoded pixel of an image that is much larger than surfaces are compared at."""
-    step = max(round(max(image.shape[:2]) / side), 1)
+    used = lattice_step(*image.shape[:2])
+    step = used * max(round(max(image.shape[:2]) / (used * side)), 1)
     kept = np.full_like(image, np.nan, dtype=np.float32)
     kept[::step, ::step] = image[::step, ::step]
     return kept
