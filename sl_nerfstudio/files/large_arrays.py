@@ -25,7 +25,12 @@ _LIMITS = ("memory.max", "memory.limit_in_bytes")  # of control groups, versions
 
 def largest_in_memory() -> int:
     """Bytes beyond which an array is kept in a file."""
-    return usable_memory(ROOT, OWN) // _SHARE
+    return memory_of_process() // _SHARE
+
+
+def memory_of_process() -> int:
+    """Bytes of memory that this process may use."""
+    return usable_memory(ROOT, OWN)
 
 
 def usable_memory(root: Path, own: Path) -> int:

@@ -64,7 +64,8 @@ class ProcessConfig:
     """leave out the plane that the object stands on, walls, and what is not connected to the object; the report shows
     what was left out"""
     jobs: int | None = None
-    """number of processes that decode frames; default: one for each core"""
+    """number of processes that decode frames; default: one for each core, as far as there is memory for
+    them"""
     work: Path | None = None
     """folder in which decoded frames, the registration and the adjustment are kept for the next run; default:
     OUTPUT.work"""

@@ -7,14 +7,14 @@ from contextlib import closing
 
 import numpy as np
 
-from sl_nerfstudio.cores import cores
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.files.large_arrays import memory_of_process
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.kept.store import Manifest
-from sl_nerfstudio.processing.workers import no_interrupts, worker_pool
+from sl_nerfstudio.processing.workers import default_processes, no_interrupts, worker_pool
 from sl_nerfstudio.progress import track
 from sl_nerfstudio.threads import one_library_thread, only_one_library_thread
 
@@ -31,7 +31,8 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
     if job.masks is not None:
         settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
-    jobs, clouds = config.jobs or cores(), LargeClouds()
+    largest = max((w * h for w, h in captures.sizes.values()), default=0)
+    jobs, clouds = config.jobs or default_processes(largest, memory_of_process()), LargeClouds()
     with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
         for result in track(ready, "decoding and calibrating", len(todo)):
             found[result.name] = with_kept_cloud(result, clouds)

@@ -9,7 +9,18 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection, get_context, resource_tracker
 
+from sl_nerfstudio.cores import cores
+
 _EXIT_ORPHANED = 1
+_PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each of its pixels
+_MAIN_PROCESS = 1.0e9  # bytes of the process that collects the results, without the clouds that it may keep
+_FOR_PROCESSES = 0.85  # share of the memory that is left to the processes
+
+
+def default_processes(pixels: int, memory: int) -> int:
+    """One for each core, but not more than `memory` (bytes) is enough for; `pixels` of the largest photograph."""
+    room = _FOR_PROCESSES * memory - _MAIN_PROCESS
+    return max(1, min(cores(), int(room / (_PROCESS + _PIXEL * pixels))))
 
 
 @contextmanager
