@@ -12,8 +12,6 @@ from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, lattice_st
 from sl_nerfstudio.relative_pose.sampson import sampson
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings
 
-_ROWS = 64  # of the image at a time, which bounds the memory
-
 
 def agreeing_coords(
     coords: Float32[ndarray, "h w 2"],
@@ -34,8 +32,8 @@ def agreeing_coords(
         noise_px = np.full((5 * settings.blocks.along_longer_side) ** 2, pose.residual_px)
         known = np.isfinite(pose.noise_px)
         noise_px[block[known]] = pose.noise_px[known]
-        for first in range(0, len(coords), _ROWS):
-            rows = slice(first, first + _ROWS)
+        for first in range(0, len(coords), settings.lattice.rows):
+            rows = slice(first, first + settings.lattice.rows)
             agrees[rows] = _agree(coords[rows], first, camera, projector, pose, noise_px, settings)
     column, row = np.floor(uv_camera).astype(np.int64).T
     agrees[row, column] = pose.inliers

@@ -12,8 +12,6 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian,
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, PatternBlocks
 
-_MOST_PIXELS = 1_500_000  # of an image of which every pixel is used
-
 
 @dataclass(frozen=True)
 class RayPairs:
@@ -42,7 +40,7 @@ class RayPairs:
 
 def lattice_step(h: int, w: int) -> int:
     """Of large images every second, third, .. row and column is enough: neighbouring coordinates err together."""
-    return math.ceil(math.sqrt(h * w / _MOST_PIXELS))
+    return math.ceil(math.sqrt(h * w / RELATIVE_POSE_DEFAULTS.lattice.most_pixels))
 
 
 def correspondences_of(

@@ -100,6 +100,16 @@ class PatternBlocks:
 
 
 @dataclass(frozen=True)
+class LatticeSettings:
+    """Which pixels of large images the pose is found from, and where points are."""
+
+    most_pixels: int = 600_000
+    """pixels of an image of which every one is used; of larger ones, every second, third, .. row and column"""
+    rows: int = 64
+    """rows whose other pixels are compared with the pose at a time, which bounds the memory"""
+
+
+@dataclass(frozen=True)
 class DegeneracyLimits:
     """When a frame's correspondences count as degenerate."""
 
@@ -151,6 +161,8 @@ class RelativePoseSettings:
     """by how much two solutions of a frame differ: by more than unfinished refinements do"""
     blocks: PatternBlocks = field(default_factory=PatternBlocks)
     """squares of the pattern"""
+    lattice: LatticeSettings = field(default_factory=LatticeSettings)
+    """pixels of large images"""
     five_point: FivePointSettings = field(default_factory=FivePointSettings)
     """first solutions from random samples"""
     plane: PlaneSettings = field(default_factory=PlaneSettings)

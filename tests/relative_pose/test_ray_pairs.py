@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, ray_pairs, subsample
+from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, lattice_step, ray_pairs, subsample
 from sl_nerfstudio.relative_pose.settings import PatternBlocks
 from tests.relative_pose.two_views import CAMERA, PROJECTORS, view
 
@@ -24,6 +24,15 @@ def test_correspondences_are_the_decoded_pixels():
     assert uv_projector.tolist() == [[5.0, 7.0]]
     nothing = correspondences_of(np.full((3, 4, 2), np.nan, dtype=np.float32))
     assert [uv.shape for uv in nothing] == [(0, 2), (0, 2)]
+
+
+@pytest.mark.parametrize(
+    "size, step", [((600, 600), 1), ((640, 480), 1), ((1200, 1200), 2), ((3000, 4000), 5), ((4000, 6000), 7)]
+)
+def test_large_images_are_used_on_a_lattice_of_at_most_600000_pixels(size, step):
+    h, w = size
+    assert lattice_step(h, w) == step
+    assert (h // step) * (w // step) <= 600_000 < (h / step) * (w / step) * 4
 
 
 @pytest.mark.parametrize("projector", PROJECTORS)
