@@ -40,7 +40,7 @@ class RayPairs:
 
 def lattice_step(h: int, w: int) -> int:
     """Of large images every second, third, .. row and column is enough: neighbouring coordinates err together."""
-    return math.ceil(math.sqrt(h * w / RELATIVE_POSE_DEFAULTS.lattice.most_pixels))
+    return max(1, math.ceil(math.sqrt(h * w / RELATIVE_POSE_DEFAULTS.lattice.most_pixels)))
 
 
 def correspondences_of(
