@@ -147,12 +147,27 @@ def _relative_pose(
     )
     residual = sampson(found.R, found.t, frame.rays)
     noise = _noise_around(residual, frame.rays, found.noise_px, settings)
-    good = (np.abs(residual) < settings.inlier_sigmas * noise) & in_front(found.R, found.t, frame.rays)
+    good = agree(found.R, found.t, frame.rays, residual, noise, settings)
     inliers, noise_px = np.zeros(frame.correspondences, dtype=bool), np.full(frame.correspondences, np.nan)
     inliers[frame.usable], noise_px[frame.usable] = good, noise
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found.R, found.t
     return RelativePose(T, cov, inliers, found.noise_px, noise_px, solution.explained, degeneracies, alternatives)
+
+
+def agree(
+    R: Float64[ndarray, "3 3"],
+    t: Float64[ndarray, "3"],
+    rays: RayPairs,
+    residual: Float64[ndarray, "n"],
+    noise_px: Float64[ndarray, "n"],
+    settings: RelativePoseSettings,
+) -> Bool[ndarray, "n"]:
+    """Whether correspondences agree with a pose: near their epipolar curves for their noise, in front of both devices.
+
+    `residual` is Sampson's.
+    """
+    return (np.abs(residual) < settings.inlier_sigmas * noise_px) & in_front(R, t, rays)
 
 
 def _noise_around(

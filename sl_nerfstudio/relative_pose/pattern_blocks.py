@@ -17,6 +17,11 @@ def blocks_of(uv_projector: Float[ndarray, "n 2"], projector: Device, settings: 
     return (row + 1) * (5 * n) + column + 1
 
 
+def block_numbers(settings: PatternBlocks) -> int:
+    """All numbers that `blocks_of` gives are below this."""
+    return (5 * settings.along_longer_side) ** 2
+
+
 def block_count(projector: Device, settings: PatternBlocks) -> int:
     """Number of squares of the whole pattern, with those that its border cuts."""
     n, (shorter, longer) = settings.along_longer_side, sorted((projector.w, projector.h))

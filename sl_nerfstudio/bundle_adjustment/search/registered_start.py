@@ -89,7 +89,7 @@ def _cloud(problem: Problem, k: int) -> FrameCloud | None:
 
 def _thinned(image: ndarray, side: int) -> Float32[ndarray, "h w 2"]:
     """Only every n-th decoded pixel of an image that is much larger than surfaces are compared at."""
-    used = lattice_step(*image.shape[:2])
+    used = lattice_step(*image.shape[:2])  # correspondences are taken there only: a multiple loses none of the kept
     step = used * max(round(max(image.shape[:2]) / (used * side)), 1)
     kept = np.full_like(image, np.nan, dtype=np.float32)
     kept[::step, ::step] = image[::step, ::step]

@@ -78,21 +78,21 @@ class EdgeChooser:
 
 @compiled
 def _choose(
-    maps: ndarray, known: ndarray, steps: ndarray, first: int, last: int, step: ndarray, wrong: ndarray
+    maps: ndarray, known: ndarray, all_steps: ndarray, first: int, last: int, step: ndarray, wrong: ndarray
 ) -> None:
     """Fill rows `first` to `last` - 1: among the steps to places where something is known, the one scored highest.
 
     `maps` are those of `EdgeNetwork.maps`, (h, w, outputs), from row `first` on. Pixels without such a step are left.
     """
     h, w = known.shape
-    count, parts = len(steps), STRIDE * STRIDE
+    count, parts = len(all_steps), STRIDE * STRIDE
     for row in range(first, last):
         for column in range(w):
             at = maps[(row - first) // STRIDE, column // STRIDE]
             part = (row - first) % STRIDE * STRIDE + column % STRIDE
             best, highest = -1, -np.inf
             for k in range(count):
-                r, c = row + steps[k, 1], column + steps[k, 0]
+                r, c = row + all_steps[k, 1], column + all_steps[k, 0]
                 if 0 <= r < h and 0 <= c < w and known[r, c] and at[k * parts + part] > highest:
                     best, highest = k, at[k * parts + part]
             if best >= 0:
