@@ -15,9 +15,9 @@ PACKAGE = ROOT / "sl_nerfstudio"
 LAYERS = (
     "errors", "console", "progress", "control_groups", "cores", "memory", "threads", "side_by_side", "compiled",
     "late_compiler", "device_kernels", "files", "geometry", "scan", "pattern", "synthesis", "decoding", "capture",
-    "calibration", "relative_pose", "registration", "bundle_adjustment", "verdict", "object_separation", "processing",
-    "field", "rendering", "meshing", "dataparser", "model", "runs", "redecoding", "evaluation", "cli", "methods",
-    "__main__",
+    "calibration", "relative_pose", "matching", "registration", "bundle_adjustment", "verdict", "object_separation",
+    "processing", "field", "rendering", "meshing", "dataparser", "model", "runs", "redecoding", "evaluation", "cli",
+    "methods", "__main__",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds
 MOST_LINES, MOST_FILES = 400, 20

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import as_grey
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -25,11 +26,13 @@ _PERIODS = (9.0, 19.0)  # pixels, where the object is
 
 @dataclass(frozen=True)
 class Rendered:
-    """A grey photograph, the pattern, and true pattern pixels, NaN where it is not."""
+    """A grey photograph, the pattern, true pattern pixels, NaN where it is not, and both devices."""
 
     image: Float32[ndarray, "h w"]
     grid: GridPattern
     true: Float32[ndarray, "h w 2"]
+    camera: Device
+    projector: Device
 
 
 def rendered_captures(seed: int, number: int, frames: int) -> Iterator[Rendered]:
@@ -52,11 +55,12 @@ def rendered_captures(seed: int, number: int, frames: int) -> Iterator[Rendered]
             images_only=True,
         )
         setup = make_setup(config)
+    devices = setup.devices.camera, setup.devices.projector
     for frame in range(frames):
         if setup.photography is not None:
             photo = setup.photograph(frame, _SUPERSAMPLING, setup.photography, config.seed)
-            yield Rendered(as_grey(photo.image), grid, photo.coords)
+            yield Rendered(as_grey(photo.image), grid, photo.coords, *devices)
         else:
             view = setup.render(frame, _SUPERSAMPLING)
             image = disturb_image(view.radiance, GAIN, config.sensor_noise, rng)
-            yield Rendered(as_grey(image), grid, view.coords)
+            yield Rendered(as_grey(image), grid, view.coords, *devices)

@@ -4,6 +4,7 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 
@@ -40,6 +41,14 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
             status = f"failed in {result.stage}" if result.stage else done
             manifest.note(result.name, result.key, status, result.reason)
     return [found[frame.name] for frame in captures.frames]
+
+
+def run_frame_stage_again(
+    config: ProcessConfig, job: FrameJob, captures: Captures, before: Sequence[FrameStageResult]
+) -> list[FrameStageResult]:
+    """The same with another job, for frames that this run has decoded."""
+    resumed = {result.name: result.resumed for result in before}
+    return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
 
 
 def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:

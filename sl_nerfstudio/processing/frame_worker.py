@@ -1,4 +1,4 @@
-"""One frame by itself: decoding, the relative pose of the projector, triangulation."""
+"""One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,12 +11,13 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.processing.frame_matching import FrameMatcher
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.kept.store import DecodedStore
 from sl_nerfstudio.processing.selection.user_masks import UserMasks
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
+from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan.file_error import FileError
 
@@ -34,6 +35,7 @@ class FrameJob:
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
     stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
     projector_known: bool = True  # False: frames are only decoded, until the projector has been found
+    camera_known: bool = True  # False: nothing is matched along epipolar lines, until the camera has been found
 
     def camera_of(self, frame: CapturedFrame) -> Device:
         """The camera that took a frame."""
@@ -46,6 +48,7 @@ class FrameStageResult:
 
     frame: CapturedFrame
     key: str = ""  # of the decoded frame in the store; "" if it was not decoded
+    matched: str = ""  # of the frame matched along epipolar lines in the store; "" if it was not matched
     resumed: bool = False  # it had been decoded by an earlier run
     decode_rate: float = 0.0  # decoded pixels of those in the mask
     mask_share: float = 0.0  # of the image
@@ -82,6 +85,7 @@ class FrameWorker:
         self._job = job
         self._store = DecodedStore(job.work, job.decoder.key)
         self._stages = StageStore(job.work)
+        self._matcher = FrameMatcher(job.decoder, self._store)
 
     def __call__(self, frame: CapturedFrame) -> FrameStageResult:
         """Decode (or load) and calibrate a frame. A frame that fails is left out, with its reason."""
@@ -91,38 +95,64 @@ class FrameWorker:
             resumed = decoded is not None
             if decoded is None:
                 decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
-            decoded = self._selected(frame.name, decoded)
+            selected = self._selected(frame.name, decoded)
         except FileError as error:
             return FrameStageResult(frame, stage="reading", reason=str(error))
         except DecodingError as error:
             return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
-        share = float(decoded.mask.mean())
-        result = FrameStageResult(frame, key, resumed, decoded.rate, share)
-        return self.calibrate(result, decoded) if self._job.projector_known else result
+        share = float(selected.mask.mean())
+        result = FrameStageResult(frame, key, "", resumed, selected.rate, share)
+        return self._calibrated(result, decoded) if self._job.projector_known else result
 
-    def calibrate(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
+    def calibrate(self, result: FrameStageResult) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
-        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+        return self._calibrated(result, self._stored(result, result.key))
+
+    def load(self, result: FrameStageResult) -> Decoded:
+        """The maps of a frame, matched if it was, whichever worker stored them. Raises UserError if there are none."""
+        return self._selected(result.name, self._stored(result, result.matched or result.key))
+
+    def _calibrated(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
+        job, camera = self._job, self._job.camera_of(result.frame)
+        selected = self._selected(result.name, decoded)
         try:
-            pose = self._stages.kept(
-                f"calibration {result.name}",
-                (coords, camera, job.projector, job.seed),
-                lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
+            pose = self._pose(result, selected)
+            devices = camera, job.projector
+            found = (
+                self._matcher.matched(result.frame, result.key, decoded, devices, pose) if job.camera_known else None
             )
-            cloud = frame_cloud(result.name, coords, camera, job.projector, pose, light=decoded.light)
+            result = replace(result, matched="")
+            if found is not None:
+                selected = self._selected(result.name, found[1])
+                share = float(selected.mask.mean())
+                result = replace(result, matched=found[0], decode_rate=selected.rate, mask_share=share)
+                pose = self._pose(result, selected)
+            cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light)
+        except FileError as error:
+            return replace(result, cloud=None, stage="reading", reason=str(error))
+        except DecodingError as error:  # nothing that was matched is inside the user's mask
+            return replace(result, cloud=None, stage="decoding", reason=self._with_file(result.frame, error))
         except RelativePoseError as error:
             return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
         return replace(result, cloud=cloud)
 
-    def load(self, result: FrameStageResult) -> Decoded:
-        """The decoded maps of a frame, whichever worker stored them. Raises UserError if they were removed."""
-        decoded = self._store.load(result.frame, result.key)
+    def _pose(self, result: FrameStageResult, decoded: Decoded) -> RelativePose:
+        """From all coordinates, or as an earlier run found it."""
+        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+        return self._stages.kept(
+            f"calibration {result.name}",
+            (coords, camera, job.projector, job.seed),
+            lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
+        )
+
+    def _stored(self, result: FrameStageResult, key: str) -> Decoded:
+        decoded = self._store.load(result.frame, key)
         if decoded is None:
             raise UserError(
                 f"{self._job.work}: the decoded frame {result.name} is missing\n"
                 "    cause:  files were removed while sl-process was running\n    remedy: start again"
             )
-        return self._selected(result.name, decoded)
+        return decoded
 
     def _selected(self, name: str, decoded: Decoded) -> Decoded:
         """What the user's mask of a frame selects; without masks, everything."""

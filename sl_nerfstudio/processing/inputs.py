@@ -55,6 +55,7 @@ def read_inputs(config: ProcessConfig) -> Inputs:
             cameras.several,
             doubt,
             known_beam,
+            cameras.start is None,
         ),
         cameras,
         captures,

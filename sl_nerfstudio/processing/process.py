@@ -16,6 +16,7 @@ from sl_nerfstudio.processing.capture_files.cameras import refine_camera
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
+from sl_nerfstudio.processing.frame_stage import run_frame_stage_again
 from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
@@ -67,6 +68,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     if inputs.cameras.start is not None:
         job, results, camera = refine_camera(job, results, inputs.cameras.start, log)
         notes = notes.with_camera(camera.sentence(), camera.document())
+        results = run_frame_stage_again(config, job, captures, results)
         _require_clouds(config, inputs, results, make_report)
     wrong = (
         ""

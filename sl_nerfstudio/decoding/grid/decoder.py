@@ -30,12 +30,13 @@ class NetworkDecoder(Decoder[GridPattern]):
 
     def decode_image(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """The same for an image that was read, or computed."""
-        return self._images.decode(image)
+        return self.images.decode(image)
 
     def weights(self) -> Iterable[Path]:
         """The files of the trained networks."""
         return weight_files()
 
     @cached_property
-    def _images(self) -> GridImageDecoder:
+    def images(self) -> GridImageDecoder:
+        """What decodes single images."""
         return GridImageDecoder(self.layout)

@@ -25,6 +25,7 @@ _LEAST_AREA = 1.0  # smaller regions are left out, periods squared
 _FINEST = 12.0  # pixels per period: finer captures are averaged first
 _LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
+_WINDOW = 0.42  # of a shift, periods
 _ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
 _SMOOTHING = ((0.35, 0.05), (0.12, 0.1))  # windows in which coordinates are taken to be linear, and how far from them
 # the pixel's own may be for that; periods
@@ -112,18 +113,18 @@ def _refine(
     period = grids[0].period
     coords = _smooth(coords, inside, pixels_a_period, period)
     start, even = coords, Light.even(image.shape)
-    fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period) for grid in grids]
-    best = int(np.argmax([fit[1][inside].mean() for fit in fits]))
-    shift, light = fits[best][0], measure_light(image, coords, trust, grids[best], pixels_a_period)
+    fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period, _WINDOW) for grid in grids]
+    best = int(np.argmax([fit.agreement[inside].mean() for fit in fits]))
+    shift, light = fits[best].shift, measure_light(image, coords, trust, grids[best], pixels_a_period)
     for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)
         if index == 0:  # the network's remaining noise; smoothing in every round would flatten the surface
             coords = _smooth(coords, inside, pixels_a_period, period)
-        shift, _ = fit_shift(image, coords, trust, grids[best], light, pixels_a_period)
+        shift = fit_shift(image, coords, trust, grids[best], light, pixels_a_period, _WINDOW).shift
     # Judged in even light: what only the fitted light explains must not count as agreement.
-    return coords, fit_shift(image, coords, trust, grids[best], even, pixels_a_period)[1]
+    return coords, fit_shift(image, coords, trust, grids[best], even, pixels_a_period, _WINDOW).agreement
 
 
 def _smooth(

@@ -59,10 +59,19 @@ class GridImageDecoder:
         evidence = self.examine(grey, found)
         chosen = self.edges.choose(evidence, found.rectified, found.assignment.turn)
         coords = self._select(chosen, found.appearance.period)
-        mask = (evidence.probability > LEAST_MASK) | np.isfinite(coords[..., 0])
-        period = found.appearance.period
-        light = projected_light(grey, coords, self._soft, _LIGHT_WINDOW * period)
-        return Decoded(coords, mask, self._normalise(grey, mask, period), light)
+        return self.decoded(grey, coords, evidence.probability > LEAST_MASK, found.appearance.period)
+
+    def decoded(
+        self,
+        grey: Float32[ndarray, "h w"],
+        coords: Float32[ndarray, "h w 2"],
+        mask: Bool[ndarray, "h w"],
+        pixels_a_period: float,
+    ) -> Decoded:
+        """All maps of a capture with these coordinates; the mask holds every pixel that has any."""
+        mask = mask | np.isfinite(coords[..., 0])
+        light = projected_light(grey, coords, self._soft, _LIGHT_WINDOW * pixels_a_period)
+        return Decoded(coords, mask, self._normalise(grey, mask, pixels_a_period), light)
 
     def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
         """The grid in an image. Raises DecodingError if too little of it fits the pattern."""

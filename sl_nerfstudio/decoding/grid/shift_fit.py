@@ -4,6 +4,8 @@ Lucas and Kanade (1981), with brightness and contrast as further unknowns. All s
 moments of the image, the drawn pattern and its derivatives.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
@@ -14,7 +16,6 @@ from sl_nerfstudio.decoding.grid.smoothing import enlarge, gaussian_means
 
 # Windows.
 _SQUARES = 8  # per period, for which fits are made
-_SHIFT_WINDOW = 0.42  # of a shift, periods
 _LIGHT_WINDOW = 0.38  # in which the light is taken to be even, periods
 # Light.
 _LEAST_CONTRAST, _WELL_LIT = 0.25, 0.9  # share of the contrast at this quantile of the image
@@ -22,6 +23,15 @@ _LEAST_CONTRAST, _WELL_LIT = 0.25, 0.9  # share of the contrast at this quantile
 _LARGEST_STEP = 0.2  # periods
 _PRIOR = 0.1  # weight of a shift of one period, as a share of the window's contrast
 _LEAST_RELATIVE_CONTRAST = 0.05  # of the contrast that the image has in the window
+_LEAST_AGREEMENT, _LEAST_SEEN = 0.05, 0.05  # with which the variance of a shift is stated
+
+
+class ShiftFit(NamedTuple):
+    """What moves the drawn pattern onto the image at each pixel."""
+
+    shift: Float32[ndarray, "h w 2"]  # of the coordinates, periods
+    agreement: Float32[ndarray, "h w"]  # correlation of image and pattern
+    variance: Float32[ndarray, "h w"]  # of the shift along either axis if pixels err independently, periods squared
 
 
 def fit_shift(
@@ -31,14 +41,16 @@ def fit_shift(
     grid: DrawnGrid,
     light: Light,
     pixels_a_period: float,
-) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
-    """Shift of the coordinates, in periods, that moves the drawn pattern onto the image, and their correlation."""
+    window: float,
+) -> ShiftFit:
+    """The fit in a Gaussian window about each pixel, whose standard deviation is `window` periods."""
     step = _square_size(pixels_a_period)
     m = _moments(image, light.on(grid.at(coords)), trust, step)
-    found = np.empty((*m.shape[1:3], 3), dtype=np.float32)
-    _solve(gaussian_means(m, _SHIFT_WINDOW * pixels_a_period / step), found)
+    found = np.empty((*m.shape[1:3], 4), dtype=np.float32)
+    sigma = window * pixels_a_period
+    _solve(gaussian_means(m, sigma / step), np.float32(4 * np.pi * sigma**2), found)
     fit = enlarge(found, image.shape, step)
-    return fit[..., :2], fit[..., 2]
+    return ShiftFit(fit[..., :2], fit[..., 2], fit[..., 3])
 
 
 def measure_light(
@@ -110,8 +122,11 @@ def _contrast_and_brightness(
 
 
 @compiled
-def _solve(means: ndarray, out: ndarray) -> None:
-    """Shift (x, y) by least squares, brightness and contrast eliminated, and the correlation of image and pattern."""
+def _solve(means: ndarray, pixels: float, out: ndarray) -> None:
+    """Shift (x, y) by least squares, brightness and contrast eliminated, correlation of image and pattern, variance.
+
+    `pixels` are those that count in a whole window.
+    """
     h, w = out.shape[:2]
     for row in range(h):
         for column in range(w):
@@ -135,3 +150,6 @@ def _solve(means: ndarray, out: ndarray) -> None:
                 shift = (yy * ix - xy * iy if axis == 0 else xx * iy - xy * ix) / (determinant * contrast)
                 out[row, column, axis] = min(max(shift, -_LARGEST_STEP), _LARGEST_STEP) * trusted
             out[row, column, 2] = agreement
+            sure = min(max(agreement, np.float32(_LEAST_AGREEMENT)), np.float32(1))
+            seen = pixels * max(n, np.float32(_LEAST_SEEN))
+            out[row, column, 3] = (1 / (sure * sure) - 1) * pp * (xx + yy) / (2 * determinant * seen)

@@ -120,11 +120,11 @@ def refine_camera(
         refined = replace(job, camera=found.camera)
         worker, clouds = FrameWorker(refined), LargeClouds()
         again = [
-            result if result.cloud is None else with_kept_cloud(worker.calibrate(result, worker.load(result)), clouds)
+            result if result.cloud is None else with_kept_cloud(worker.calibrate(result), clouds)
             for result in track(again, "calibrating again", len(again))
         ]
     if found is None:
         raise ValueError("no frame has a pose")
     notes = CameraNotes(start, found)
     log(notes.sentence())
-    return refined, again, notes
+    return replace(refined, camera_known=True), again, notes

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage
+from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage, run_frame_stage_again
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult
 from sl_nerfstudio.processing.inputs import Inputs
 from sl_nerfstudio.processing.projector.estimation import find_projector
@@ -40,8 +40,7 @@ def calibrate_frames(config: ProcessConfig, inputs: Inputs, log: Log) -> Calibra
     found = find_projector(job, results, inputs.projector_stated)
     log(describe(found))
     job = replace(job, projector=found.projector, projector_known=True)
-    resumed = {result.name: result.resumed for result in results}
-    results = [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, inputs.captures)]
+    results = run_frame_stage_again(config, job, inputs.captures, results)
     log(describe_frame_stage(results))
     return _as_moved(config, CalibratedFrames(job, results, found))
 

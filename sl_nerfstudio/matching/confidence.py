@@ -1,0 +1,104 @@
+"""How probable it is that a matched pixel is right, by a logistic model of what is known about it.
+
+Its weights come from `python -m training.matching`.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.matching.semi_global import Matches
+
+FEATURES = (
+    "margin over the best rival, logarithm",
+    "cost of the match",
+    "matched where it was decoded",
+    "matched elsewhere than it was decoded",
+    "in the decoder's mask",
+    "distance from a jump, periods, logarithm",
+    "correlation after the fit",
+    "share of neighbours at the same distance",
+)
+_REACH, _STRIDE = 4, 2  # of those neighbours, pixels
+_SAME = 2.5  # steps of the inverse distance
+_FARTHEST = 2.0  # distance from a jump beyond which it does not count, periods
+_NEAREST = 0.07  # added to that distance, periods
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A constant, and a weight for each of `FEATURES`."""
+
+    constant: float
+    weights: tuple[float, ...]
+
+    def probability(self, features: Float32[ndarray, "h w f"]) -> Float32[ndarray, "h w"]:
+        """That a pixel is right."""
+        odds = features @ np.array(self.weights, dtype=np.float32) + np.float32(self.constant)
+        return 1 / (1 + np.exp(-odds))
+
+
+RIGHT = Logistic(-5.474, (-0.0211, -0.0120, 2.3435, -1.1318, 2.6117, 0.4201, 2.9702, 2.9666))
+
+
+def features_of(
+    matches: Matches,
+    fitted: Float32[ndarray, "h w 2"],
+    correlation: Float32[ndarray, "h w"],
+    decoded: Float32[ndarray, "h w 2"],
+    mask: Bool[ndarray, "h w"],
+    near: float,
+    jump: float,
+    pixels_a_period: float,
+) -> Float32[ndarray, "h w f"]:
+    """`FEATURES` of every pixel; `near` and `jump` are in pattern pixels. Unknown where nothing was fitted."""
+    apart = np.linalg.norm(fitted - decoded, axis=-1)
+    same = np.zeros(mask.shape, dtype=np.float32)
+    _count_same(matches.index, np.float32(_SAME), same)
+    from_jump = np.minimum(_distance_from_jumps(fitted, jump) / pixels_a_period, _FARTHEST)
+    return np.stack(
+        [
+            np.log1p(np.maximum(matches.margin, 0)),
+            matches.cost,
+            apart < near,
+            apart >= near,  # both False for NaN
+            mask,
+            np.log(from_jump + _NEAREST),
+            np.nan_to_num(correlation),
+            same,
+        ],
+        axis=-1,
+    ).astype(np.float32)
+
+
+def _distance_from_jumps(coords: Float32[ndarray, "h w 2"], jump: float) -> Float64[ndarray, "h w"]:
+    """Pixels to the nearest one beside which coordinates jump or end."""
+    smooth = np.ones(coords.shape[:2], dtype=np.uint8)
+    known = np.isfinite(coords[..., 0])
+    values = np.where(known[..., None], coords, np.float32(-1e6))
+    for axis in (0, 1):
+        torn = np.abs(np.diff(values, axis=axis)).max(-1) > jump
+        here, there = [slice(None)] * 2, [slice(None)] * 2
+        here[axis], there[axis] = slice(0, -1), slice(1, None)
+        smooth[tuple(here)] &= ~torn
+        smooth[tuple(there)] &= ~torn
+    return cv2.distanceTransform(smooth, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+
+
+@compiled
+def _count_same(index: ndarray, most: float, out: ndarray) -> None:
+    """Share of the pixels around, on a lattice, that are matched at nearly the same step."""
+    h, w = index.shape
+    side = 2 * (_REACH // _STRIDE) + 1
+    for row in range(h):
+        for column in range(w):
+            count = 0
+            for dr in range(-_REACH, _REACH + 1, _STRIDE):
+                for dc in range(-_REACH, _REACH + 1, _STRIDE):
+                    r, c = min(max(row + dr, 0), h - 1), min(max(column + dc, 0), w - 1)
+                    count += abs(index[r, c] - index[row, column]) < most
+            out[row, column] = count / (side * side)

@@ -1,0 +1,176 @@
+"""Where in the projector's image the ray of each camera pixel runs, by the inverse distance along it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
+from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
+
+_OUTSIDE = -1e6  # where nothing is seen
+_STEPS = 4  # of Gauss-Newton, to the nearest place on a line
+
+
+@dataclass(frozen=True)
+class EpipolarLines:
+    """The epipolar lines of all pixels of an image; curves, if a lens distorts.
+
+    A point at inverse distance w (in inverse baselines) is `ray + w * centre` in the projector's axes, but for its
+    length: `centre` is the camera's position there. `offset` is added to where the projector sees it.
+    """
+
+    ray: Float64[ndarray, "h w 3"]
+    centre: Float64[ndarray, "3"]
+    projector: Device
+    offset: Float32[ndarray, "h w 2"]
+
+    @staticmethod
+    def of(camera: Device, projector: Device, T_camera_projector: Float64[ndarray, "4 4"]) -> "EpipolarLines":
+        """Those of two devices; NaN where a pixel has no ray."""
+        shape, R = (camera.h, camera.w), np.ascontiguousarray(T_camera_projector[:3, :3])
+        rays = np.empty((*shape, 3))
+        _turned_rays(*_for_loops(camera), R, rays)
+        return EpipolarLines(rays, -R.T @ T_camera_projector[:3, 3], projector, np.zeros((*shape, 2), dtype=np.float32))
+
+    def part(self, box: tuple[slice, slice]) -> "EpipolarLines":
+        """Those of the pixels in a box."""
+        return replace(self, ray=np.ascontiguousarray(self.ray[box]), offset=np.ascontiguousarray(self.offset[box]))
+
+    def at(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+        """Coordinates at inverse distances; NaN where the projector does not see the point."""
+        out = np.empty(self.offset.shape, dtype=np.float32)
+        _follow(*self.arrays, w, out)
+        return out
+
+    def pixels_at(self, w: float, x: Float32[ndarray, "h w"], y: Float32[ndarray, "h w"]) -> None:
+        """Fill columns and rows in the pattern's image, the first pixel's centre being 0, at one inverse distance.
+
+        They are far outside where the projector does not see the point.
+        """
+        code, parameters, ray, centre, offset = self.arrays
+        if code == 0 and not parameters[4:].any():
+            _pinhole_pixels(parameters, ray, centre, offset, w, x, y)
+        else:
+            _pixels(code, parameters, ray, centre, offset, w, x, y)
+
+    def slopes(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+        """Derivative of the coordinates by the inverse distance."""
+        out = np.empty(self.offset.shape, dtype=np.float32)
+        _slopes(*self.arrays, w, out)
+        return out
+
+    def nearest(self, coords: Float32[ndarray, "h w 2"]) -> Float64[ndarray, "h w"]:
+        """Inverse distances at which the lines are nearest to given coordinates; NaN where there is none in front."""
+        out = np.empty(coords.shape[:2])
+        _nearest(*self.arrays, coords, out)
+        return out
+
+    @property
+    def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
+        """For compiled loops: model code and parameters of the projector, rays, centre, offsets."""
+        return *_for_loops(self.projector), self.ray, self.centre, self.offset
+
+
+def _for_loops(device: Device) -> tuple[int, ndarray]:
+    intrinsics = Intrinsics.of(device, torch.float64)
+    return MODELS[intrinsics.model].code, intrinsics.params.numpy()
+
+
+@compiled
+def _turned_rays(code: int, parameters: ndarray, R: ndarray, out: ndarray) -> None:
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            x, y, z = ray_of(code, column + 0.5, row + 0.5, parameters)
+            for axis in range(3):
+                out[row, column, axis] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
+
+
+@compiled
+def _follow(
+    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: ndarray, out: ndarray
+) -> None:
+    for row in range(w.shape[0]):
+        for column in range(w.shape[1]):
+            a, s = ray[row, column], w[row, column]
+            view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+            seen = view[2] and s == s
+            out[row, column, 0] = view[0] + offset[row, column, 0] if seen else np.nan
+            out[row, column, 1] = view[1] + offset[row, column, 1] if seen else np.nan
+
+
+@compiled
+def _pixels(
+    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: float, x: ndarray, y: ndarray
+) -> None:
+    for row in range(x.shape[0]):
+        for column in range(x.shape[1]):
+            a = ray[row, column]
+            u, v, front = pixel_of(code, a[0] + w * centre[0], a[1] + w * centre[1], a[2] + w * centre[2], parameters)
+            x[row, column] = u + offset[row, column, 0] - 0.5 if front else _OUTSIDE
+            y[row, column] = v + offset[row, column, 1] - 0.5 if front else _OUTSIDE
+
+
+@compiled
+def _pinhole_pixels(
+    parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: float, x: ndarray, y: ndarray
+) -> None:
+    """The same for a pinhole without distortion, several times as fast."""
+    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2] - 0.5, parameters[3] - 0.5
+    a, b, c = w * centre[0], w * centre[1], w * centre[2]
+    for row in range(x.shape[0]):
+        for column in range(x.shape[1]):
+            z = ray[row, column, 2] + c
+            q = -1 / min(z, -1e-12)
+            u = fx * (ray[row, column, 0] + a) * q + cx + offset[row, column, 0]
+            v = -fy * (ray[row, column, 1] + b) * q + cy + offset[row, column, 1]
+            x[row, column] = u if z < 0 else _OUTSIDE
+            y[row, column] = v if z < 0 else _OUTSIDE
+
+
+@compiled
+def _slopes(
+    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: ndarray, out: ndarray
+) -> None:
+    for row in range(w.shape[0]):
+        for column in range(w.shape[1]):
+            a, s = ray[row, column], w[row, column]
+            view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+            out[row, column, 0] = view[3] * centre[0] + view[4] * centre[1] + view[5] * centre[2]
+            out[row, column, 1] = view[6] * centre[0] + view[7] * centre[1] + view[8] * centre[2]
+
+
+@compiled
+def _nearest(
+    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, coords: ndarray, out: ndarray
+) -> None:
+    """From where the camera's ray passes the projector's, a few steps towards the least distance in pixels."""
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            out[row, column] = np.nan
+            u, v = coords[row, column, 0] - offset[row, column, 0], coords[row, column, 1] - offset[row, column, 1]
+            if not (u == u and v == v):
+                continue
+            x, y, z = ray_of(code, u, v, parameters)
+            a = ray[row, column]
+            # (ray + w centre) x (x, y, z) = 0
+            ax, ay, az = a[1] * z - a[2] * y, a[2] * x - a[0] * z, a[0] * y - a[1] * x
+            bx, by, bz = centre[1] * z - centre[2] * y, centre[2] * x - centre[0] * z, centre[0] * y - centre[1] * x
+            square = bx * bx + by * by + bz * bz
+            if not square > 0:
+                continue
+            s, front = -(ax * bx + ay * by + az * bz) / square, False
+            for _ in range(_STEPS):
+                view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+                front = view[2]
+                if not front:
+                    break
+                du = view[3] * centre[0] + view[4] * centre[1] + view[5] * centre[2]
+                dv = view[6] * centre[0] + view[7] * centre[1] + view[8] * centre[2]
+                s += (du * (u - view[0]) + dv * (v - view[1])) / max(du * du + dv * dv, 1e-300)
+            if front and s > 0:
+                out[row, column] = s

@@ -1,0 +1,46 @@
+"""The inverse distances that are tried for every pixel of an image, and where its epipolar lines really run."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy import ndarray
+
+from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
+from sl_nerfstudio.matching.settings import HypothesisSettings
+from sl_nerfstudio.pattern.gaussian_window import gaussian_window
+
+
+def with_offset(
+    lines: EpipolarLines,
+    coords: Float32[ndarray, "h w 2"],
+    period: float,
+    pixels_a_period: float,
+    settings: HypothesisSettings,
+) -> EpipolarLines:
+    """Lines that run through decoded coordinates, on average over a window: poses and lenses are not known exactly."""
+    apart = coords - lines.at(lines.nearest(coords))
+    good = np.hypot(apart[..., 0], apart[..., 1]) < settings.agreement * period  # False for NaN
+    values = np.dstack([np.where(good[..., None], apart, np.float32(0)), good.astype(np.float32)])
+    means = gaussian_window(values, settings.offset_window * pixels_a_period)
+    offset = means[..., :2] / (means[..., 2:] + np.float32(settings.offset_prior))
+    return replace(lines, offset=lines.offset + offset)
+
+
+def hypotheses(
+    lines: EpipolarLines, coords: Float32[ndarray, "h w 2"], period: float, settings: HypothesisSettings
+) -> Float64[ndarray, "k"] | None:
+    """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line."""
+    w = lines.nearest(coords)
+    apart = np.linalg.norm(coords - lines.at(w), axis=-1)
+    good = apart < settings.agreement * period
+    if good.sum() < settings.fewest:
+        return None
+    low, high = np.quantile(w[good], [settings.quantile, 1 - settings.quantile])
+    margin = settings.margin * (high - low)
+    low, high = max(low - margin, low / 2), high + margin
+    middle = np.full(w.shape, (low + high) / 2)
+    slope = np.linalg.norm(lines.slopes(middle), axis=-1)[good]
+    length = float(np.median(slope)) * (high - low)
+    count = int(np.clip(np.ceil(length / (settings.step * period)), settings.fewest, settings.most))
+    return np.linspace(low, high, count)
