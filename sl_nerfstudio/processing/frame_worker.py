@@ -11,8 +11,8 @@ from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.frame_matching import FrameMatcher
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
+from sl_nerfstudio.processing.kept.matched_frames import FrameMatcher
 from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.kept.store import DecodedStore
 from sl_nerfstudio.processing.selection.user_masks import UserMasks

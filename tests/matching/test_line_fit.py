@@ -13,7 +13,10 @@ from tests.matching.scene import PATTERN, PERIOD, step_scene
 SIZE = 200 / 15
 
 
-def fitted(scene, settings=LineFitSettings(), start=None):
+DEFAULTS = LineFitSettings()
+
+
+def fitted(scene, settings=DEFAULTS, start=None):
     grid = draw_sharpnesses(PATTERN.render(), PERIOD)[0]
     w = scene.inverse_distance if start is None else start
     return LineFit(grid, SIZE, settings).fitted(scene.image, scene.lines, w)
@@ -58,7 +61,7 @@ def test_a_pose_that_is_off_shows_across_the_lines():
     lines = replace(scene.lines, offset=scene.lines.offset - moved)  # as lines of a wrong pose run
     grid = draw_sharpnesses(PATTERN.render(), PERIOD)[0]
     w = lines.nearest(scene.coords)
-    coords = LineFit(grid, SIZE, LineFitSettings()).fitted(scene.image, lines, w)
+    coords = LineFit(grid, SIZE, DEFAULTS).fitted(scene.image, lines, w)
     _, across = errors(scene, coords)
     slope = scene.lines.slopes(scene.inverse_distance)
     direction = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
