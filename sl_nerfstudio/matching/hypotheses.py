@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
@@ -28,19 +28,35 @@ def with_offset(
 
 
 def hypotheses(
-    lines: EpipolarLines, coords: Float32[ndarray, "h w 2"], period: float, settings: HypothesisSettings
+    lines: EpipolarLines,
+    coords: Float32[ndarray, "h w 2"],
+    mask: Bool[ndarray, "h w"],
+    period: float,
+    settings: HypothesisSettings,
 ) -> Float64[ndarray, "k"] | None:
-    """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line."""
+    """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line.
+
+    What the mask shows may be as deep as it is wide: parts of which nothing was decoded may lie before or behind.
+    """
     w = lines.nearest(coords)
     apart = np.linalg.norm(coords - lines.at(w), axis=-1)
     good = apart < settings.agreement * period
     if good.sum() < settings.fewest:
         return None
-    low, high = np.quantile(w[good], [settings.quantile, 1 - settings.quantile])
+    low, middle, high = np.quantile(w[good], [settings.quantile, 0.5, 1 - settings.quantile])
+    depth = _half_width(lines.ray[mask | good], settings.quantile)
+    low, high = min(low, middle / (1 + depth)), max(high, middle / (1 - depth))
     margin = settings.margin * (high - low)
     low, high = max(low - margin, low / 2), high + margin
-    middle = np.full(w.shape, (low + high) / 2)
-    slope = np.linalg.norm(lines.slopes(middle), axis=-1)[good]
+    slope = np.linalg.norm(lines.slopes(np.full(w.shape, (low + high) / 2)), axis=-1)[good]
     length = float(np.median(slope)) * (high - low)
     count = int(np.clip(np.ceil(length / (settings.step * period)), settings.fewest, settings.most))
     return np.linspace(low, high, count)
+
+
+def _half_width(rays: Float64[ndarray, "n 3"], quantile: float) -> float:
+    """Of what the rays see, as a share of its distance; at most a half."""
+    rays = rays[np.isfinite(rays[:, 0])]
+    centre = rays.mean(0)
+    cosine = np.quantile(rays @ (centre / np.linalg.norm(centre)), quantile)
+    return min(float(np.sqrt(1 - min(cosine, 1.0) ** 2)), 0.5)

@@ -102,7 +102,7 @@ class LineMatcher:
     def _matched(self, image: DecodedImage, lines: EpipolarLines, size: float) -> MatchedImage | None:
         s, period = self._settings, self.pattern.period
         lines = with_offset(lines, image.coords, period, size, s.hypotheses)
-        tried = hypotheses(lines, image.coords, period, s.hypotheses)
+        tried = hypotheses(lines, image.coords, image.mask, period, s.hypotheses)
         if tried is None:
             return None
         sigma = s.costs.window * size
