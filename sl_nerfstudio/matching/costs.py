@@ -12,6 +12,7 @@ from sl_nerfstudio.matching.settings import CostSettings
 
 _HALF = 127  # the cost where image and pattern have nothing to do with each other
 OUTSIDE = 255  # the cost beside the pattern
+_TOGETHER = 16  # inverse distances whose costs are written at once
 
 Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
 """Mean of the image in the window of each pixel, and its variance, with what is added to it."""
@@ -42,11 +43,15 @@ def matching_costs(
     picture = np.ascontiguousarray(grid.layers[..., 0])
     out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
     x, y = np.empty(image.shape, dtype=np.float32), np.empty(image.shape, dtype=np.float32)
-    for k, w in enumerate(inverse_distances):
-        lines.pixels_at(w, x, y)
-        drawn = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        parts = (_window(part, sigma) for part in (drawn, cv2.multiply(drawn, drawn), cv2.multiply(drawn, image)))
-        _write_costs(*parts, mean, scale, x, y, picture.shape, settings.least_pattern_variance, k, out)
+    block = np.empty((_TOGETHER, *image.shape), dtype=np.uint8)
+    for first in range(0, len(inverse_distances), _TOGETHER):
+        some = inverse_distances[first : first + _TOGETHER]
+        for w, costs in zip(some, block, strict=False):
+            lines.pixels_at(w, x, y)
+            drawn = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            parts = (_window(part, sigma) for part in (drawn, cv2.multiply(drawn, drawn), cv2.multiply(drawn, image)))
+            _fill_costs(*parts, mean, scale, x, y, picture.shape, settings.least_pattern_variance, costs)
+        _interleave(block[: len(some)], first, out)
     return out
 
 
@@ -71,9 +76,9 @@ def _window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray
 
 
 @compiled
-def _write_costs(
+def _fill_costs(
     p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, x: ndarray, y: ndarray,
-    size: tuple[int, int], least: float, k: int, out: ndarray,
+    size: tuple[int, int], least: float, out: ndarray,
 ) -> None:  # fmt: skip
     half, bottom = np.float32(0.5), np.float32(least)
     right, lower = np.float32(size[1] - 0.5), np.float32(size[0] - 0.5)
@@ -85,4 +90,13 @@ def _write_costs(
             cost = min(max(np.float32(_HALF) * (1 - correlation), np.float32(0)), np.float32(2 * _HALF))
             u, v = x[row, column], y[row, column]
             inside = u >= -half and v >= -half and u <= right and v <= lower  # False for NaN
-            out[row, column, k] = np.uint8(cost) if inside else OUTSIDE
+            out[row, column] = np.uint8(cost) if inside else OUTSIDE
+
+
+@compiled
+def _interleave(block: ndarray, first: int, out: ndarray) -> None:
+    """Several images of costs into the volume: one at a time, each pixel would be a place of its own in memory."""
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            for k in range(len(block)):
+                out[row, column, first + k] = block[k, row, column]

@@ -39,7 +39,7 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
             found[result.name] = with_kept_cloud(result, clouds)
             done = "decoded before" if result.resumed else "decoded"
             status = f"failed in {result.stage}" if result.stage else done
-            manifest.note(result.name, result.key, status, result.reason)
+            manifest.note(result.name, result.matched or result.key, status, result.reason)
     return [found[frame.name] for frame in captures.frames]
 
 
