@@ -17,7 +17,12 @@ from sl_nerfstudio.processing.kept.stages import StageStore
 from sl_nerfstudio.processing.kept.store import DecodedStore
 from sl_nerfstudio.processing.selection.user_masks import UserMasks
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, estimate_relative_pose
+from sl_nerfstudio.relative_pose.estimation import (
+    RelativePose,
+    RelativePoseError,
+    estimate_relative_pose,
+    relative_pose_near,
+)
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan.file_error import FileError
 
@@ -126,7 +131,7 @@ class FrameWorker:
                 selected = self._selected(result.name, found[1])
                 share = float(selected.mask.mean())
                 result = replace(result, matched=found[0], decode_rate=selected.rate, mask_share=share)
-                pose = self._pose(result, selected)
+                pose = self._pose_near(pose, result, selected)
             cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light)
         except FileError as error:
             return replace(result, cloud=None, stage="reading", reason=str(error))
@@ -143,6 +148,16 @@ class FrameWorker:
             f"calibration {result.name}",
             (coords, camera, job.projector, job.seed),
             lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
+        )
+
+    def _pose_near(self, start: RelativePose, result: FrameStageResult, decoded: Decoded) -> RelativePose:
+        """From the coordinates that were matched with the pose `start`, beside which there is no other."""
+        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+        T = start.T_camera_projector
+        return self._stages.kept(
+            f"calibration {result.name}",
+            (coords, camera, job.projector, job.seed, T),
+            lambda: relative_pose_near(T, *correspondences_of(coords), camera, job.projector, job.seed),
         )
 
     def _stored(self, result: FrameStageResult, key: str) -> Decoded:

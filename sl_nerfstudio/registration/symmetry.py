@@ -2,8 +2,8 @@
 
 Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say different
 things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the surface to
-where it contradicts; a symmetry does not. Nor does a short way about the axis of something nearly round, a medal: but
-half of that way contradicts less still, so surfaces do tell. Half the turn of a nut contradicts more.
+where it contradicts; a symmetry does not. Nor does any turn about the axis of something round, a vase or a medal: but
+parts of that turn contradict no more, so it is no other side. Half the turn of a nut contradicts far more.
 """
 
 from collections.abc import Iterator, Sequence
@@ -50,16 +50,22 @@ def symmetric_turns_deg(
         same, contradicting = _moved(sides, nodes, turn, settings)
         if same < s.least_agreeing * agreeing or contradicting > misfit * (same + contradicting):
             continue
-        same_half, contradicting_half = _moved(sides, nodes, _half(turn), settings)
-        if contradicting * same_half < contradicting_half * same:
+        within = max(_share(_moved(sides, nodes, _part(turn, part), settings)) for part in s.parts)
+        if within - by_errors > s.least_excess * max(_share((same, contradicting)) - by_errors, 0.0):
             turns.append(angle_deg(turn.R))
     return tuple(sorted(turns))
 
 
-def _half(turn: Similarity) -> Similarity:
-    """The turn that gives `turn` if it is made twice: about the same axis, by half the angle."""
-    scale = turn.scale**0.5
-    R = Rotation.from_rotvec(Rotation.from_matrix(turn.R).as_rotvec() / 2).as_matrix()
+def _share(found: tuple[float, float]) -> float:
+    """Of points that contradict."""
+    agreeing, contradicting = found
+    return contradicting / (agreeing + contradicting) if agreeing + contradicting else 1.0
+
+
+def _part(turn: Similarity, part: float) -> Similarity:
+    """The turn about the same axis by a part of the angle, with the same part of the growth."""
+    scale = turn.scale**part
+    R = Rotation.from_rotvec(part * Rotation.from_matrix(turn.R).as_rotvec()).as_matrix()
     return Similarity(scale, R, np.linalg.solve(np.eye(3) + scale * R, turn.t))
 
 

@@ -13,7 +13,7 @@ from sl_nerfstudio.registration.pairs.surface_agreement import Side
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.symmetry import _half, symmetric_turns_deg
+from sl_nerfstudio.registration.symmetry import _part, symmetric_turns_deg
 from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 
@@ -103,12 +103,19 @@ def test_half_of_a_turn_made_twice_is_the_turn() -> None:
         axis = rng.standard_normal(3)
         R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
         turn = Similarity(1.03, R, rng.standard_normal(3))
-        half = _half(turn)
+        half = _part(turn, 0.5)
         twice = half @ half
         np.testing.assert_allclose(twice.R, turn.R, atol=1e-12)
         np.testing.assert_allclose(twice.t, turn.t, atol=1e-12)
         assert twice.scale == pytest.approx(1.03)
         assert Rotation.from_matrix(half.R).magnitude() == pytest.approx(np.radians(degrees / 2))
+
+
+def test_what_is_round_has_no_sides() -> None:
+    """A vase contradicts as little after any turn: which of two turns contradicts less is chance, and says nothing."""
+    vase = Scan("vase")
+    for degrees in (29.0, 60.0, 90.0):
+        assert vase.turns(contradicting(vase, degrees)) == ()
 
 
 def test_a_medal_that_slides_a_little_is_not_symmetric() -> None:
