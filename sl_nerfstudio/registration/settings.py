@@ -335,7 +335,7 @@ class SymmetrySettings:
     parts: tuple[float, ...] = (0.5, 0.38)
     """parts of a turn, after which the surface must not look the same: it would be round, and not have several sides"""
     least_excess: float = 2.0
-    """how much more must contradict after one of these than after the whole turn, beyond what contradicts without any"""
+    """how much more must contradict after one of these than after the whole turn, beyond what does without any"""
 
 
 @dataclass(frozen=True)
