@@ -53,13 +53,13 @@ class FrameStageResult:
 
     frame: CapturedFrame
     key: str = ""  # of the decoded frame in the store; "" if it was not decoded
-    matched: str = ""  # of the frame matched along epipolar lines in the store; "" if it was not matched
     resumed: bool = False  # it had been decoded by an earlier run
     decode_rate: float = 0.0  # decoded pixels of those in the mask
     mask_share: float = 0.0  # of the image
     cloud: FrameCloud | None = None  # None: the frame is left out
     stage: str = ""  # in which the frame failed: "reading", "decoding", "calibrating"; "" if it did not
     reason: str = ""  # problem, cause and remedy, with the file they are about
+    matched: str = ""  # key of the frame matched along epipolar lines in the store; "" if it was not matched
 
     @property
     def name(self) -> str:
@@ -106,7 +106,7 @@ class FrameWorker:
         except DecodingError as error:
             return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
         share = float(selected.mask.mean())
-        result = FrameStageResult(frame, key, "", resumed, selected.rate, share)
+        result = FrameStageResult(frame, key, resumed, selected.rate, share)
         return self._calibrated(result, decoded) if self._job.projector_known else result
 
     def calibrate(self, result: FrameStageResult) -> FrameStageResult:
