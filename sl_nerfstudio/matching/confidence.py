@@ -21,10 +21,10 @@ FEATURES = (
     "in the decoder's mask",
     "distance from a jump, periods, logarithm",
     "correlation after the fit",
-    "share of neighbours at the same distance",
+    "share of opposite neighbours with it between them",
 )
 _REACH, _STRIDE = 4, 2  # of those neighbours, pixels
-_SAME = 2.5  # steps of the inverse distance
+_BETWEEN = 2.0  # steps of the inverse distance from the middle of two neighbours
 _FARTHEST = 2.0  # distance from a jump beyond which it does not count, periods
 _NEAREST = 0.07  # added to that distance, periods
 
@@ -57,8 +57,8 @@ def features_of(
 ) -> Float32[ndarray, "h w f"]:
     """`FEATURES` of every pixel; `near` and `jump` are in pattern pixels. Unknown where nothing was fitted."""
     apart = np.linalg.norm(fitted - decoded, axis=-1)
-    same = np.zeros(mask.shape, dtype=np.float32)
-    _count_same(matches.index, np.float32(_SAME), same)
+    between = np.zeros(mask.shape, dtype=np.float32)
+    _count_between(matches.index, np.float32(_BETWEEN), between)
     from_jump = np.minimum(_distance_from_jumps(fitted, jump) / pixels_a_period, _FARTHEST)
     return np.stack(
         [
@@ -69,7 +69,7 @@ def features_of(
             mask,
             np.log(from_jump + _NEAREST),
             np.nan_to_num(correlation),
-            same,
+            between,
         ],
         axis=-1,
     ).astype(np.float32)
@@ -90,15 +90,21 @@ def _distance_from_jumps(coords: Float32[ndarray, "h w 2"], jump: float) -> Floa
 
 
 @compiled
-def _count_same(index: ndarray, most: float, out: ndarray) -> None:
-    """Share of the pixels around, on a lattice, that are matched at nearly the same step."""
+def _count_between(index: ndarray, most: float, out: ndarray) -> None:
+    """Share of the pairs of opposite pixels around, on a lattice, whose mean is nearly the pixel's own match.
+
+    All are on a plane, however steep it is.
+    """
     h, w = index.shape
-    side = 2 * (_REACH // _STRIDE) + 1
     for row in range(h):
         for column in range(w):
-            count = 0
-            for dr in range(-_REACH, _REACH + 1, _STRIDE):
+            count, pairs = 0, 0
+            for dr in range(0, _REACH + 1, _STRIDE):
                 for dc in range(-_REACH, _REACH + 1, _STRIDE):
-                    r, c = min(max(row + dr, 0), h - 1), min(max(column + dc, 0), w - 1)
-                    count += abs(index[r, c] - index[row, column]) < most
-            out[row, column] = count / (side * side)
+                    if dr == 0 and dc <= 0:
+                        continue
+                    a, b = min(row + dr, h - 1), min(max(column + dc, 0), w - 1)
+                    c, d = max(row - dr, 0), min(max(column - dc, 0), w - 1)
+                    pairs += 1
+                    count += abs((index[a, b] + index[c, d]) / 2 - index[row, column]) < most
+            out[row, column] = count / pairs

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
+from sl_nerfstudio.matching.semi_global import UNKNOWN
 from sl_nerfstudio.matching.settings import HypothesisSettings
 from sl_nerfstudio.pattern.gaussian_window import gaussian_window
 
@@ -52,6 +53,13 @@ def hypotheses(
     length = float(np.median(slope)) * (high - low)
     count = int(np.clip(np.ceil(length / (settings.step * period)), settings.fewest, settings.most))
     return np.linspace(low, high, count)
+
+
+def numbers_of(w: Float64[ndarray, "h w"], tried: Float64[ndarray, "k"]) -> Int32[ndarray, "h w"]:
+    """The nearest of the inverse distances that are tried; `UNKNOWN` for NaN and beyond their range."""
+    number = np.rint((w - tried[0]) / (tried[1] - tried[0]))
+    inside = (number >= 0) & (number < len(tried))  # False for NaN
+    return np.where(inside, number, UNKNOWN).astype(np.int32)
 
 
 def _half_width(rays: Float64[ndarray, "n 3"], quantile: float) -> float:

@@ -14,7 +14,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.confidence import RIGHT, features_of
 from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
-from sl_nerfstudio.matching.hypotheses import hypotheses, with_offset
+from sl_nerfstudio.matching.hypotheses import hypotheses, numbers_of, with_offset
 from sl_nerfstudio.matching.line_fit import LineFit
 from sl_nerfstudio.matching.resolution import enlarged, pixels_a_period
 from sl_nerfstudio.matching.semi_global import Matches, match_semi_globally
@@ -108,7 +108,7 @@ class LineMatcher:
         sigma = s.costs.window * size
         statistics = image_statistics(image.grey, image.decoded, sigma, s.costs)
         grid = self._sharpness(image, statistics, sigma)
-        matches = self._in_strips(image.grey, statistics, lines, tried, grid, size)
+        matches = self._in_strips(image, statistics, lines, tried, grid, size)
         w = tried[0] + matches.index.astype(np.float64) * (tried[1] - tried[0])
         fitted = LineFit(grid, size, s.fit).fitted(image.grey, lines, w)
         correlation = correlations(image.grey, statistics, fitted, grid, sigma, s.costs)
@@ -118,7 +118,7 @@ class LineMatcher:
 
     def _in_strips(
         self,
-        grey: Float32[ndarray, "h w"],
+        image: DecodedImage,
         statistics: Statistics,
         lines: EpipolarLines,
         tried: Float64[ndarray, "k"],
@@ -126,18 +126,20 @@ class LineMatcher:
         size: float,
     ) -> Matches:
         """Strips of rows that overlap, as high as memory allows."""
-        s, (h, w) = self._settings, grey.shape
+        s, (h, w) = self._settings, image.grey.shape
+        decoded = numbers_of(lines.nearest(image.coords), tried)
         margin = round(s.strip_margin * size)
         rows = max(s.most_bytes // (3 * w * len(tried)) - 2 * margin, margin, 1)
         parts = []
         for first in range(0, h, rows):
             begin, end = max(first - margin, 0), min(first + rows + margin, h)
             some = slice(begin, end)
-            costs = matching_costs(
-                grey[some], (statistics[0][some], statistics[1][some]), lines.part((some, slice(None))), tried, grid,
-                s.costs.window * size, s.costs,
-            )  # fmt: skip
-            parts.append(match_semi_globally(costs, s.smoothness).part(slice(first - begin, first - begin + rows)))
+            there = statistics[0][some], statistics[1][some]
+            strip, sigma = lines.part((some, slice(None))), s.costs.window * size
+            costs = matching_costs(image.grey[some], there, strip, tried, grid, sigma, s.costs)
+            parts.append(
+                match_semi_globally(costs, decoded[some], s.smoothness).part(slice(first - begin, first - begin + rows))
+            )
         return Matches.joined(parts)
 
     def _sharpness(self, image: DecodedImage, statistics: Statistics, sigma: float) -> DrawnGrid:

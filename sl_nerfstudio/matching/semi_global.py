@@ -2,18 +2,22 @@
 
 Semi-global matching: Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008. Costs
 are added up along eight ways to each pixel; changes of distance cost a little to the next one and more to any other.
+Changes are counted from the slope of the surface that was decoded, where one was: otherwise steep surfaces would cost
+more than those that face the camera (Scharstein, Taniai and Sinha, "Semi-global stereo matching with surface
+orientation priors", 3DV 2017).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.matching.settings import SmoothnessSettings
 
+UNKNOWN = -(2**20)  # far from the number of any inverse distance
 _WAYS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))  # steps (row, column)
 
 
@@ -35,11 +39,16 @@ class Matches:
         return Matches(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)))
 
 
-def match_semi_globally(costs: UInt8[ndarray, "h w k"], settings: SmoothnessSettings) -> Matches:
-    """The best match of every pixel. There must be at least three inverse distances."""
+def match_semi_globally(
+    costs: UInt8[ndarray, "h w k"], decoded: Int32[ndarray, "h w"], settings: SmoothnessSettings
+) -> Matches:
+    """The best match of every pixel. There must be at least three inverse distances.
+
+    `decoded` are the numbers of those that were decoded, `UNKNOWN` where nothing was.
+    """
     sums = np.zeros(costs.shape, dtype=np.uint16)
     for down, right in _WAYS:
-        _add_way(costs, down, right, settings.small, settings.large, sums)
+        _add_way(costs, decoded, down, right, settings.small, settings.large, settings.steepest, sums)
     h, w = costs.shape[:2]
     index, cost = np.empty((h, w), dtype=np.float32), np.empty((h, w), dtype=np.uint8)
     margin = np.empty((h, w), dtype=np.float32)
@@ -48,7 +57,9 @@ def match_semi_globally(costs: UInt8[ndarray, "h w k"], settings: SmoothnessSett
 
 
 @compiled
-def _add_way(costs: ndarray, down: int, right: int, small: int, large: int, sums: ndarray) -> None:
+def _add_way(
+    costs: ndarray, decoded: ndarray, down: int, right: int, small: int, large: int, steepest: int, sums: ndarray
+) -> None:
     """Add to `sums` what the least costly way in one direction to each pixel costs, less what all its ways share."""
     h, w, count = costs.shape
     # Of the row before and of this one, by column; beside the first and the last step there is nothing to go to.
@@ -71,10 +82,17 @@ def _add_way(costs: ndarray, down: int, right: int, small: int, large: int, sums
                 for k in range(2, count + 1):
                     least = min(least, came[k])
                 jump = np.int16(least + away)
-                for k in range(1, count + 1):
-                    beside = np.int16(min(came[k - 1], came[k + 1]) + near)
-                    cheapest = min(min(came[k], beside), jump)
+                slope = decoded[row, column] - decoded[row - down, last]
+                slope = slope if abs(slope) <= steepest else 0
+                first, end = max(1, 1 + slope), min(count, count + slope) + 1
+                for k in range(1, first):
+                    way[k] = np.int16(away + np.int16(costs[row, column, k - 1]))
+                for k in range(first, end):
+                    beside = np.int16(min(came[k - slope - 1], came[k - slope + 1]) + near)
+                    cheapest = min(min(came[k - slope], beside), jump)
                     way[k] = np.int16(cheapest - least + np.int16(costs[row, column, k - 1]))
+                for k in range(end, count + 1):
+                    way[k] = np.int16(away + np.int16(costs[row, column, k - 1]))
             for k in range(count):
                 sums[row, column, k] += np.uint16(way[k + 1])
         before, here = here, before

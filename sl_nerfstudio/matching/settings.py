@@ -45,6 +45,8 @@ class SmoothnessSettings:
     """to the next inverse distance"""
     large: int = 250
     """to any other"""
+    steepest: int = 4
+    """steps from one pixel to the next up to which a decoded surface is steep; beyond, it has a jump there"""
     apart: int = 3
     """steps from the best inverse distance within which another one is no rival"""
 

@@ -32,7 +32,7 @@ def test_features_are_what_their_names_say():
     decoded[:10] = np.nan
     decoded[10:20, :, 0] += 5
     found = features(matches, coords, decoded, np.arange(50)[None] < np.full((40, 1), 45))
-    margin, cost, at, elsewhere, mask, jump, correlation, same = np.moveaxis(found, -1, 0)
+    margin, cost, at, elsewhere, mask, jump, correlation, between = np.moveaxis(found, -1, 0)
     assert (margin == pytest.approx(np.log(100))) if np.isscalar(margin) else np.allclose(margin, np.log(100))
     assert (cost == 20).all() and (correlation == np.float32(0.9)).all()
     assert not at[:20].any() and at[20:].all()
@@ -41,7 +41,14 @@ def test_features_are_what_their_names_say():
     # The two columns beside the jump are at distance zero; the next ones are 1, 2, .. pixels of 14 a period away.
     expected = np.log(np.minimum(np.abs(np.arange(50) - 24.5) - 0.5, 28) / 14 + 0.07)
     np.testing.assert_allclose(jump[20], expected, atol=1e-5)
-    assert (same[:, 5:20] == 1).all() and (same[:, 24] < 0.7).all()
+    assert (between[:, 5:20] == 1).all() and (between[:, 24] < 0.7).all()
+
+
+def test_matches_on_a_steep_plane_lie_between_their_neighbours():
+    matches, coords = flat_matches()
+    y, x = np.mgrid[:40, :50].astype(np.float32)
+    steep = Matches((3 * x - 2 * y + 90).astype(np.float32), matches.cost, matches.margin)
+    assert (features(steep, coords)[4:-4, 4:-4, -1] == 1).all()
 
 
 def test_a_match_at_the_decoded_place_far_from_jumps_is_right_and_a_lonely_one_beside_them_is_not():

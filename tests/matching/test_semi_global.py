@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.matching.semi_global import Matches, match_semi_globally
+from sl_nerfstudio.matching.semi_global import UNKNOWN, Matches, match_semi_globally
 from sl_nerfstudio.matching.settings import SmoothnessSettings
 
-SMOOTHNESS = SmoothnessSettings(small=20, large=90, apart=1)
+SMOOTHNESS = SmoothnessSettings(small=20, large=90, steepest=2, apart=1)
 WAYS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 
 
-def sums_by_the_paper(costs, small, large):
-    """Equations 13 and 14 of Hirschmueller (2008), for every pixel, way and step by itself."""
+def nothing_decoded(costs):
+    return np.full(costs.shape[:2], UNKNOWN, np.int32)
+
+
+def sums_by_the_paper(costs, decoded, small, large, steepest):
+    """Equations 13 and 14 of Hirschmueller (2008), for every pixel, way and step by itself; with a known slope."""
     h, w, count = costs.shape
     total = np.zeros(costs.shape, np.int64)
     for down, right in WAYS:
@@ -21,12 +25,17 @@ def sums_by_the_paper(costs, small, large):
         for row in rows:
             for column in columns:
                 before = along.get((row - down, column - right))
+                slope = 0
+                if before is not None and abs(decoded[row, column] - decoded[row - down, column - right]) <= steepest:
+                    slope = decoded[row, column] - decoded[row - down, column - right]
                 here = []
                 for k in range(count):
                     value = int(costs[row, column, k])
                     if before is not None:
-                        ways = [before[k], min(before) + large]
-                        ways += [before[j] + small for j in (k - 1, k + 1) if 0 <= j < count]
+                        ways = [min(before) + large]
+                        if 0 <= k - slope < count:
+                            ways += [before[k - slope]]
+                            ways += [before[j] + small for j in (k - slope - 1, k - slope + 1) if 0 <= j < count]
                         value += min(ways) - min(before)
                     here.append(value)
                 along[row, column] = here
@@ -35,13 +44,15 @@ def sums_by_the_paper(costs, small, large):
     return total
 
 
+@pytest.mark.parametrize("known", [0.0, 0.8])
 @pytest.mark.parametrize("shape", [(6, 7, 5), (1, 9, 4), (8, 1, 3), (5, 4, 17)])
-def test_the_best_match_is_that_of_the_paper(shape):
+def test_the_best_match_is_that_of_the_paper(shape, known):
     rng = np.random.default_rng(sum(shape))
     costs = rng.integers(0, 256, shape).astype(np.uint8)
-    total = sums_by_the_paper(costs, SMOOTHNESS.small, SMOOTHNESS.large)
+    decoded = np.where(rng.random(shape[:2]) < known, rng.integers(0, shape[2], shape[:2]), UNKNOWN).astype(np.int32)
+    total = sums_by_the_paper(costs, decoded, SMOOTHNESS.small, SMOOTHNESS.large, SMOOTHNESS.steepest)
     best = total.argmin(-1)
-    found = match_semi_globally(costs, SMOOTHNESS)
+    found = match_semi_globally(costs, decoded, SMOOTHNESS)
     lowest = total.min(-1)
     rivals = np.where(abs(np.arange(shape[2]) - best[..., None]) > SMOOTHNESS.apart, total, 65535)
     np.testing.assert_array_equal(found.margin, rivals.min(-1) - lowest)
@@ -62,13 +73,27 @@ def test_a_slope_is_followed_through_pixels_that_show_nothing():
     costs = rng.integers(90, 160, (40, 60, 32))
     np.put_along_axis(costs, true[..., None], 20, axis=-1)
     costs[15:19] = 127
-    found = match_semi_globally(costs.astype(np.uint8), SmoothnessSettings())
+    costs = costs.astype(np.uint8)
+    found = match_semi_globally(costs, nothing_decoded(costs), SmoothnessSettings())
     assert abs(found.index - true).max() < 2.5 and abs(found.index - true).mean() < 0.6
     assert np.median(found.margin[15:19]) < np.median(found.margin[:10])
 
 
+def test_a_steep_surface_is_followed_where_it_was_decoded():
+    """Three steps a pixel: every change would be one of the costly kind, and the pixel's own evidence is weak."""
+    rng = np.random.default_rng(6)
+    true = np.broadcast_to(3 * np.arange(30) + 5, (25, 30)).astype(np.int32)
+    costs = rng.integers(60, 180, (25, 30, 100))
+    np.put_along_axis(costs, true[..., None], 75, axis=-1)
+    costs = costs.astype(np.uint8)
+    with_slope = match_semi_globally(costs, true + 7, SmoothnessSettings())  # the slope counts, not the place
+    without = match_semi_globally(costs, nothing_decoded(costs), SmoothnessSettings())
+    assert (abs(with_slope.index - true) < 1.5).mean() > 0.97 > 0.75 > (abs(without.index - true) < 1.5).mean()
+
+
 def test_strips_are_joined_in_order():
-    whole = match_semi_globally(np.random.default_rng(0).integers(0, 256, (9, 5, 6)).astype(np.uint8), SMOOTHNESS)
+    costs = np.random.default_rng(0).integers(0, 256, (9, 5, 6)).astype(np.uint8)
+    whole = match_semi_globally(costs, nothing_decoded(costs), SMOOTHNESS)
     joined = Matches.joined([whole.part(slice(0, 4)), whole.part(slice(4, 9))])
     np.testing.assert_array_equal(joined.index, whole.index)
     np.testing.assert_array_equal(joined.margin, whole.margin)
