@@ -187,7 +187,7 @@ LINE = "#b9c2cc"
 def draw_architecture() -> None:
     """Folders on a diagonal; from each, a line to the left and arrows up to the folders that it imports."""
     folders = [read_folder(name) for name in layout()]
-    figure, axis = plt.subplots(figsize=(12.6, 9.6), dpi=110)
+    figure, axis = plt.subplots(figsize=(13.6, 11.0), dpi=110)
     column = {folder.name: index * STEP for index, folder in enumerate(folders)}
     row = {folder.name: float(index) for index, folder in enumerate(folders)}
     longest = max(folder.lines for folder in folders)
@@ -209,7 +209,7 @@ def draw_folder(axis: Axes, folder: Folder, x: float, y: float, bar: float) -> N
     colour = NERFSTUDIO if folder.uses_nerfstudio else PLAIN
     width, height = BOX
     axis.add_patch(plt.Rectangle((x, y - height / 2), width, height, color=colour, zorder=3))
-    axis.text(x + width / 2, y, folder.name, color="white", ha="center", va="center", fontsize=9, zorder=4)
+    axis.text(x + width / 2, y, folder.name, color="white", ha="center", va="center", fontsize=7.2, zorder=4)
     axis.add_patch(plt.Rectangle((x + width, y - height / 6), bar, height / 3, color=colour, alpha=0.35, zorder=3))
     axis.text(x + width + bar + 0.08, y, f"{folder.lines}", color=MUTED, va="center", fontsize=8, zorder=4)
 
@@ -237,7 +237,7 @@ def legend(axis: Axes, right: float) -> None:
         ("Orange: imports nerfstudio.", NERFSTUDIO),
     )
     for index, (text, colour) in enumerate(lines):
-        axis.text(right, 0.1 + 0.62 * index, text, color=colour, ha="right", va="center", fontsize=9.5)
+        axis.text(right, 0.1 + 0.8 * index, text, color=colour, ha="right", va="center", fontsize=9.5)
 
 
 def save(figure: plt.Figure, name: str) -> None:
