@@ -61,7 +61,7 @@ class LineFitSettings:
     """standard deviation of the window of a shift, periods"""
     rounds: int = 6
     """each recovers a part of the detail that the window of the fit averages over"""
-    detail: float = 0.018
+    detail: float = 0.06
     """how far coordinates along the line are expected to be from that flat surface (1 sigma), periods"""
     across: float = 0.02
     """the same across the line: more than there is, because distances from it tell how large noise is"""

@@ -74,7 +74,7 @@ def test_noise_is_not_taken_for_detail(noise, share):
     """What the image says is weighed against the flat surface: errors along the lines stay below those without it."""
     scene = step_scene(noise=noise)
     start = rough_start(scene)
-    weighed, _ = errors(scene, fitted(scene, start=start))
+    weighed, _ = errors(scene, fitted(scene, LineFitSettings(detail=0.02), start=start))
     believed, _ = errors(scene, fitted(scene, LineFitSettings(detail=10.0), start=start))
     assert np.sqrt((weighed**2).mean()) < share * np.sqrt((believed**2).mean())
 
