@@ -332,10 +332,8 @@ class SymmetrySettings:
     """frames with which each one is compared after the turn"""
     most_compared: int = 12
     """turns that are tried"""
-    parts: tuple[float, ...] = (0.5, 0.38)
-    """parts of a turn, after which the surface must not look the same: it would be round, and not have several sides"""
     least_excess: float = 2.0
-    """how much more must contradict after one of these than after the whole turn, beyond what does without any"""
+    """how much more must contradict after a part of a turn than after all of it, or the surface is round, not symmetric"""
 
 
 @dataclass(frozen=True)

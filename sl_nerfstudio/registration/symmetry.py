@@ -50,7 +50,7 @@ def symmetric_turns_deg(
         same, contradicting = _moved(sides, nodes, turn, settings)
         if same < s.least_agreeing * agreeing or contradicting > misfit * (same + contradicting):
             continue
-        within = max(_share(_moved(sides, nodes, _part(turn, part), settings)) for part in s.parts)
+        within = max(_share(_moved(sides, nodes, part, settings)) for part in _parts(turn))
         if within - by_errors > s.least_excess * max(_share((same, contradicting)) - by_errors, 0.0):
             turns.append(angle_deg(turn.R))
     return tuple(sorted(turns))
@@ -62,10 +62,17 @@ def _share(found: tuple[float, float]) -> float:
     return contradicting / (agreeing + contradicting) if agreeing + contradicting else 1.0
 
 
-def _part(turn: Similarity, part: float) -> Similarity:
-    """The turn about the same axis by a part of the angle, with the same part of the growth."""
-    scale = turn.scale**part
-    R = Rotation.from_rotvec(part * Rotation.from_matrix(turn.R).as_rotvec()).as_matrix()
+def _parts(turn: Similarity) -> tuple[Similarity, Similarity]:
+    """Half of a turn and three eighths of it, about the same axis."""
+    half = _half(turn)
+    quarter = _half(half)
+    return half, quarter @ _half(quarter)
+
+
+def _half(turn: Similarity) -> Similarity:
+    """The turn that gives `turn` if it is made twice: about the same axis, by half the angle."""
+    scale = turn.scale**0.5
+    R = Rotation.from_rotvec(Rotation.from_matrix(turn.R).as_rotvec() / 2).as_matrix()
     return Similarity(scale, R, np.linalg.solve(np.eye(3) + scale * R, turn.t))
 
 

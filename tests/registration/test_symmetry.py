@@ -1,5 +1,6 @@
 """Objects that look the same after a turn: named where pairs of frames contradict each other by it, and only there."""
 
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from sl_nerfstudio.registration.pairs.surface_agreement import Side
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.symmetry import _part, symmetric_turns_deg
+from sl_nerfstudio.registration.symmetry import _half, _parts, symmetric_turns_deg
 from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 
@@ -27,12 +28,21 @@ class Scan:
         made = rendered(scene, tuple(range(FRAMES)), FRAMES, 90)
         rng = np.random.default_rng(0)
         self.nodes = made.S_world_camera
+        self.axis = np.zeros(3)
         self.sides = [Side.sampled(build_surface_map(c), 400, rng) for c in made.clouds]
         self.pairs = [self.pair(k, (k + 1) % FRAMES) for k in range(FRAMES)]
 
+    def aside(self, x: float) -> "Scan":
+        """The same scan with the world's origin beside the object's axis."""
+        other = copy(self)
+        other.nodes = [Similarity(1.0, np.eye(3), np.array([x, 0.0, 0.0])) @ node for node in self.nodes]
+        other.axis = np.array([x, 0.0, 0.0])
+        return other
+
     def turned(self, i: int, j: int, degrees: float, scale: float = 1.0) -> Similarity:
         """What a pair says that takes one side of the object for another: it is turned about the vertical axis."""
-        turn = Similarity(scale, Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
+        R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        turn = Similarity(scale, R, self.axis - scale * R @ self.axis)
         return self.nodes[j].inverse() @ turn @ self.nodes[i]
 
     def pair(self, i: int, j: int, rivals: tuple[Rival, ...] = ()) -> PairMatch:
@@ -103,12 +113,19 @@ def test_half_of_a_turn_made_twice_is_the_turn() -> None:
         axis = rng.standard_normal(3)
         R = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
         turn = Similarity(1.03, R, rng.standard_normal(3))
-        half = _part(turn, 0.5)
+        half = _half(turn)
         twice = half @ half
         np.testing.assert_allclose(twice.R, turn.R, atol=1e-12)
         np.testing.assert_allclose(twice.t, turn.t, atol=1e-12)
         assert twice.scale == pytest.approx(1.03)
         assert Rotation.from_matrix(half.R).magnitude() == pytest.approx(np.radians(degrees / 2))
+        first, second = _parts(turn)
+        np.testing.assert_allclose(first.t, half.t, atol=1e-12)
+        eight = second @ second @ second @ second @ second @ second @ second @ second
+        three = turn @ turn @ turn
+        np.testing.assert_allclose(eight.R, three.R, atol=1e-12)
+        np.testing.assert_allclose(eight.t, three.t, atol=1e-10)
+        assert Rotation.from_matrix(second.R).magnitude() == pytest.approx(np.radians(degrees * 3 / 8))
 
 
 def test_what_is_round_has_no_sides() -> None:
@@ -116,6 +133,7 @@ def test_what_is_round_has_no_sides() -> None:
     vase = Scan("vase")
     for degrees in (29.0, 60.0, 90.0):
         assert vase.turns(contradicting(vase, degrees)) == ()
+        assert vase.aside(25.0).turns(contradicting(vase.aside(25.0), degrees)) == ()
 
 
 def test_a_medal_that_slides_a_little_is_not_symmetric() -> None:
