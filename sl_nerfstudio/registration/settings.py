@@ -333,7 +333,7 @@ class SymmetrySettings:
     most_compared: int = 12
     """turns that are tried"""
     least_excess: float = 2.0
-    """how much more must contradict after a part of a turn than after all of it, or the surface is round, not symmetric"""
+    """how much more must contradict after a part of a turn than after all of it; less: it is round"""
 
 
 @dataclass(frozen=True)
