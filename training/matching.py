@@ -3,7 +3,7 @@
     python -m training.matching --output outputs/training/matching [--objects 40] [--frames 3] [--jobs 2] [--seed 0]
 
 Captures of random objects are rendered, decoded and matched as sl-process does, with the relative pose that it finds.
-The features of each object are kept in the folder; a run that was interrupted goes on. Half an hour on two cores.
+The features of each object are kept in the folder; a run that was interrupted goes on. Ten minutes on two cores.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import DecodingError
 from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.matching.confidence import FEATURES
+from sl_nerfstudio.matching.confidence import FEATURES, Logistic
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
 from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
 from sl_nerfstudio.matching.resolution import pixels_a_period
@@ -59,7 +59,7 @@ def main() -> None:
     for name, weight in zip(FEATURES, weights, strict=True):
         print(f"{weight:9.4f}  {name}")
     x, right = (np.concatenate([part[k] for part in samples[::_HELD_OUT]]) for k in (0, 1))
-    p = 1 / (1 + np.exp(-(x @ weights + constant)))
+    p = Logistic(constant, tuple(weights)).probability(x)
     for least in (0.5, 0.6, 0.7, 0.8, 0.9):
         kept = p > least
         print(f"held out, from {least}: {kept.mean():.1%} kept, of these {1 - right[kept].mean():.2%} wrong")

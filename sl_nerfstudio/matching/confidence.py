@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.decoding.regions import torn
 from sl_nerfstudio.matching.semi_global import Matches
 
 FEATURES = (
@@ -27,6 +28,7 @@ _REACH, _STRIDE = 4, 2  # of those neighbours, pixels
 _BETWEEN = 2.0  # steps of the inverse distance from the middle of two neighbours
 _FARTHEST = 2.0  # distance from a jump beyond which it does not count, periods
 _NEAREST = 0.07  # added to that distance, periods
+_NOWHERE = -1e6  # in place of unknown coordinates, so that known ones jump there
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Logistic:
     constant: float
     weights: tuple[float, ...]
 
-    def probability(self, features: Float32[ndarray, "h w f"]) -> Float32[ndarray, "h w"]:
+    def probability(self, features: Float32[ndarray, "*pixels f"]) -> Float32[ndarray, "*pixels"]:
         """That a pixel is right."""
         odds = features @ np.array(self.weights, dtype=np.float32) + np.float32(self.constant)
         return 1 / (1 + np.exp(-odds))
@@ -77,15 +79,8 @@ def features_of(
 
 def _distance_from_jumps(coords: Float32[ndarray, "h w 2"], jump: float) -> Float64[ndarray, "h w"]:
     """Pixels to the nearest one beside which coordinates jump or end."""
-    smooth = np.ones(coords.shape[:2], dtype=np.uint8)
-    known = np.isfinite(coords[..., 0])
-    values = np.where(known[..., None], coords, np.float32(-1e6))
-    for axis in (0, 1):
-        torn = np.abs(np.diff(values, axis=axis)).max(-1) > jump
-        here, there = [slice(None)] * 2, [slice(None)] * 2
-        here[axis], there[axis] = slice(0, -1), slice(1, None)
-        smooth[tuple(here)] &= ~torn
-        smooth[tuple(there)] &= ~torn
+    ended = np.where(np.isfinite(coords[..., :1]), coords, np.float32(_NOWHERE))
+    smooth = (~torn(ended, jump)).astype(np.uint8)
     return cv2.distanceTransform(smooth, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
 
 

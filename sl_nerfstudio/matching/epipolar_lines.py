@@ -91,13 +91,19 @@ def _turned_rays(code: int, parameters: ndarray, R: ndarray, out: ndarray) -> No
 
 
 @compiled
+def _point(ray: ndarray, centre: ndarray, w: float) -> tuple[float, float, float]:
+    """In the projector's axes, but for its length."""
+    return ray[0] + w * centre[0], ray[1] + w * centre[1], ray[2] + w * centre[2]
+
+
+@compiled
 def _follow(
     code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: ndarray, out: ndarray
 ) -> None:
     for row in range(w.shape[0]):
         for column in range(w.shape[1]):
             a, s = ray[row, column], w[row, column]
-            view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+            view = view_of(code, *_point(a, centre, s), parameters)
             seen = view[2] and s == s
             out[row, column, 0] = view[0] + offset[row, column, 0] if seen else np.nan
             out[row, column, 1] = view[1] + offset[row, column, 1] if seen else np.nan
@@ -109,8 +115,7 @@ def _pixels(
 ) -> None:
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
-            a = ray[row, column]
-            u, v, front = pixel_of(code, a[0] + w * centre[0], a[1] + w * centre[1], a[2] + w * centre[2], parameters)
+            u, v, front = pixel_of(code, *_point(ray[row, column], centre, w), parameters)
             x[row, column] = u + offset[row, column, 0] - 0.5 if front else _OUTSIDE
             y[row, column] = v + offset[row, column, 1] - 0.5 if front else _OUTSIDE
 
@@ -139,7 +144,7 @@ def _slopes(
     for row in range(w.shape[0]):
         for column in range(w.shape[1]):
             a, s = ray[row, column], w[row, column]
-            view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+            view = view_of(code, *_point(a, centre, s), parameters)
             out[row, column, 0] = view[3] * centre[0] + view[4] * centre[1] + view[5] * centre[2]
             out[row, column, 1] = view[6] * centre[0] + view[7] * centre[1] + view[8] * centre[2]
 
@@ -165,7 +170,7 @@ def _nearest(
                 continue
             s, front = -(ax * bx + ay * by + az * bz) / square, False
             for _ in range(_STEPS):
-                view = view_of(code, a[0] + s * centre[0], a[1] + s * centre[1], a[2] + s * centre[2], parameters)
+                view = view_of(code, *_point(a, centre, s), parameters)
                 front = view[2]
                 if not front:
                     break

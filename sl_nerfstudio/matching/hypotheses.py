@@ -31,15 +31,16 @@ def with_offset(
 def hypotheses(
     lines: EpipolarLines,
     coords: Float32[ndarray, "h w 2"],
+    w: Float64[ndarray, "h w"],
     mask: Bool[ndarray, "h w"],
     period: float,
     settings: HypothesisSettings,
 ) -> Float64[ndarray, "k"] | None:
     """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line.
 
-    What the mask shows may be as deep as it is wide: parts of which nothing was decoded may lie before or behind.
+    `w` are the inverse distances nearest to the decoded coordinates. What the mask shows may be as deep as it is wide:
+    parts of which nothing was decoded may lie before or behind.
     """
-    w = lines.nearest(coords)
     apart = np.linalg.norm(coords - lines.at(w), axis=-1)
     good = apart < settings.agreement * period
     if good.sum() < settings.fewest:

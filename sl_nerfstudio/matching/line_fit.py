@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
-from scipy.ndimage import find_objects
 
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, Light
 from sl_nerfstudio.decoding.grid.shift_fit import fit_shift, measure_light
-from sl_nerfstudio.decoding.grid.smoothing import local_planes
-from sl_nerfstudio.decoding.regions import number_regions
+from sl_nerfstudio.decoding.grid.smoothing import flattened
+from sl_nerfstudio.decoding.regions import large_regions
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
 from sl_nerfstudio.matching.settings import LineFitSettings
 
@@ -36,13 +35,9 @@ class LineFit:
         """Coordinates; NaN in small regions."""
         coords = lines.at(w)
         out = np.full_like(coords, np.nan)
-        number = number_regions(coords, self.settings.tear * self.grid.period)
-        least = self.settings.least_area * self.pixels_a_period**2
-        area = np.bincount(number.ravel())
-        for index, box in enumerate(find_objects(number), 1):
-            if area[index] >= least:
-                inside = number[box] == index
-                out[box][inside] = self._region(image[box], lines.part(box), w[box], inside)[inside]
+        largest, least = self.settings.tear * self.grid.period, self.settings.least_area * self.pixels_a_period**2
+        for box, inside in large_regions(coords, largest, least):
+            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside)[inside]
         return out
 
     def _region(
@@ -71,18 +66,16 @@ class LineFit:
     def _smooth(
         self, w: Float64[ndarray, "h w"], inside: Bool[ndarray, "h w"], slope: Float32[ndarray, "h w"]
     ) -> Float64[ndarray, "h w"]:
-        """Each pixel on the plane through the largest window that is near its own match, or else as it is.
-
-        Outside `inside`, values continue the nearest planes.
-        """
+        """On planes that are near the pixel's own match, along its line."""
         unit = float(np.median(w[inside]))
         scaled = np.where(inside, w / unit, 1).astype(np.float32)
-        both, out = np.dstack([scaled, scaled]), scaled.astype(np.float64)
-        for window, limit in reversed(self.settings.smoothing):
-            plane = local_planes(both, inside, window * self.pixels_a_period)[..., 0]
-            near = ~inside | (np.abs(plane - scaled) * unit * slope < limit * self.grid.period)
-            out = np.where(near, plane, out)
-        return out * unit
+
+        def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
+            return np.abs(apart[..., 0]) * unit * slope < limit * self.grid.period
+
+        windows = [(window * self.pixels_a_period, limit) for window, limit in self.settings.smoothing]
+        both = np.dstack([scaled, scaled])  # planes are fitted to two values at a time
+        return flattened(both, inside, windows, is_near)[..., 0].astype(np.float64) * unit
 
 
 @compiled

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
+from scipy.ndimage import find_objects
 
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
 from sl_nerfstudio.decoding.grid.smoothing import shrink
@@ -102,13 +103,14 @@ class LineMatcher:
     def _matched(self, image: DecodedImage, lines: EpipolarLines, size: float) -> MatchedImage | None:
         s, period = self._settings, self.pattern.period
         lines = with_offset(lines, image.coords, period, size, s.hypotheses)
-        tried = hypotheses(lines, image.coords, image.mask, period, s.hypotheses)
+        decoded = lines.nearest(image.coords)
+        tried = hypotheses(lines, image.coords, decoded, image.mask, period, s.hypotheses)
         if tried is None:
             return None
         sigma = s.costs.window * size
         statistics = image_statistics(image.grey, image.decoded, sigma, s.costs)
         grid = self._sharpness(image, statistics, sigma)
-        matches = self._in_strips(image, statistics, lines, tried, grid, size)
+        matches = self._in_strips(image.grey, statistics, lines, numbers_of(decoded, tried), tried, grid, size)
         w = tried[0] + matches.index.astype(np.float64) * (tried[1] - tried[0])
         fitted = LineFit(grid, size, s.fit).fitted(image.grey, lines, w)
         correlation = correlations(image.grey, statistics, fitted, grid, sigma, s.costs)
@@ -118,16 +120,16 @@ class LineMatcher:
 
     def _in_strips(
         self,
-        image: DecodedImage,
+        grey: Float32[ndarray, "h w"],
         statistics: Statistics,
         lines: EpipolarLines,
+        decoded: Int32[ndarray, "h w"],
         tried: Float64[ndarray, "k"],
         grid: DrawnGrid,
         size: float,
     ) -> Matches:
         """Strips of rows that overlap, as high as memory allows."""
-        s, (h, w) = self._settings, image.grey.shape
-        decoded = numbers_of(lines.nearest(image.coords), tried)
+        s, (h, w) = self._settings, grey.shape
         margin = round(s.strip_margin * size)
         rows = max(s.most_bytes // (3 * w * len(tried)) - 2 * margin, margin, 1)
         parts = []
@@ -136,7 +138,7 @@ class LineMatcher:
             some = slice(begin, end)
             there = statistics[0][some], statistics[1][some]
             strip, sigma = lines.part((some, slice(None))), s.costs.window * size
-            costs = matching_costs(image.grey[some], there, strip, tried, grid, sigma, s.costs)
+            costs = matching_costs(grey[some], there, strip, tried, grid, sigma, s.costs)
             parts.append(
                 match_semi_globally(costs, decoded[some], s.smoothness).part(slice(first - begin, first - begin + rows))
             )
@@ -163,9 +165,6 @@ class LineMatcher:
 
 
 def _box(seen: Bool[ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """The rectangle that holds all pixels, with a margin."""
-    sides = []
-    for axis in (1, 0):
-        some = np.flatnonzero(seen.any(axis))
-        sides.append(slice(max(int(some[0]) - margin, 0), int(some[-1]) + 1 + margin) if len(some) else slice(0, 0))
-    return sides[0], sides[1]
+    """The rectangle that holds all pixels, of which there must be some, with a margin."""
+    rows, columns = (slice(max(s.start - margin, 0), s.stop + margin) for s in find_objects(seen.astype(np.uint8))[0])
+    return rows, columns

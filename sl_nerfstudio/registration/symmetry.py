@@ -42,7 +42,7 @@ def symmetric_turns_deg(
         return ()
     usual = float(np.quantile(fitness, settings.edge.good_quantile))
     agreeing, as_it_is = _moved(sides, nodes, Similarity.identity(), settings)
-    by_errors = as_it_is / (agreeing + as_it_is) if agreeing else 0.0
+    by_errors = _share((agreeing, as_it_is)) if agreeing else 0.0
     # as much as a good connection may have: what assembly would take for right is not told from what is
     misfit = by_errors + settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
     turns = []

@@ -1,7 +1,5 @@
 """Costs and the inverse distances for which they are computed, on a scene that is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -73,7 +71,7 @@ def test_the_right_inverse_distance_costs_least_where_the_pattern_tells(scene, g
 def test_the_range_holds_all_distances_and_steps_are_a_tenth_of_a_period(scene, seen):
     coords = scene.coords.copy()
     coords[:, round(200 * seen) :] = np.nan
-    w = hypotheses(scene.lines, coords, everywhere(scene), PERIOD, HYPOTHESES)
+    w = hypotheses(scene.lines, coords, scene.lines.nearest(coords), everywhere(scene), PERIOD, HYPOTHESES)
     assert w[0] < scene.inverse_distance.min() and w[-1] > scene.inverse_distance.max()
     step = np.linalg.norm(scene.lines.slopes(scene.inverse_distance), axis=-1) * (w[1] - w[0])
     assert np.median(step) == pytest.approx(0.1 * PERIOD, rel=0.1)
@@ -81,7 +79,8 @@ def test_the_range_holds_all_distances_and_steps_are_a_tenth_of_a_period(scene, 
 
 def test_without_anything_near_its_line_there_is_no_range(scene):
     coords = np.full_like(scene.coords, np.nan)
-    assert hypotheses(scene.lines, coords, everywhere(scene), PERIOD, HYPOTHESES) is None
+    w = scene.lines.nearest(coords)
+    assert hypotheses(scene.lines, coords, w, everywhere(scene), PERIOD, HYPOTHESES) is None
 
 
 def test_lines_are_moved_to_what_was_decoded_and_wrong_coordinates_do_not_count(scene):
@@ -93,5 +92,5 @@ def test_lines_are_moved_to_what_was_decoded_and_wrong_coordinates_do_not_count(
     moved = with_offset(scene.lines, coords, PERIOD, 15.0, HYPOTHESES)
     found = ((moved.offset - scene.lines.offset) * across).sum(-1)
     assert abs(np.median(found) - 0.8) < 0.08  # the prior holds back a twentieth
-    again = with_offset(replace(moved), scene.coords, PERIOD, 15.0, HYPOTHESES)
+    again = with_offset(moved, scene.coords, PERIOD, 15.0, HYPOTHESES)
     assert abs(np.median(((again.offset - scene.lines.offset) * across).sum(-1))) < 0.08

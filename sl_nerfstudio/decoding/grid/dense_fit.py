@@ -5,18 +5,15 @@ In a Gaussian window about each place, brightness, contrast and a shift of the c
 the phases of the network only have to be roughly right.
 """
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
-from scipy.ndimage import find_objects
 
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, Light
 from sl_nerfstudio.decoding.grid.shift_fit import fit_shift, measure_light
-from sl_nerfstudio.decoding.grid.smoothing import local_planes, shrink
-from sl_nerfstudio.decoding.regions import number_regions
+from sl_nerfstudio.decoding.grid.smoothing import flattened, shrink
+from sl_nerfstudio.decoding.regions import large_regions
 
 # Regions.
 _TEAR = 0.35  # periods between neighbouring pixels
@@ -48,9 +45,7 @@ def fit_densely(
     agreement = np.zeros(image.shape, dtype=np.float32)
     factor = max(1, int(pixels_a_period / _FINEST))
     least = _LEAST_AREA * pixels_a_period**2
-    for box, inside in _regions(coords, grids[0].period):
-        if inside.sum() < least:
-            continue
+    for box, inside in large_regions(coords, _TEAR * grids[0].period, least):
         coarse = _coarser(image[box], coords[box], trust[box] * inside, inside, factor)
         values, fit = _refine(*coarse, grids, pixels_a_period / factor)
         values, fit = _finer(values, inside.shape, factor), _finer(fit, inside.shape, factor)
@@ -87,15 +82,6 @@ def _finer(values: Float32[ndarray, "a b *c"], shape: tuple[int, ...], factor: i
     return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
-def _regions(
-    coords: Float32[ndarray, "h w 2"], period: float
-) -> Iterator[tuple[tuple[slice, slice], Bool[ndarray, "a b"]]]:
-    """Connected regions without a tear: the bounding box of each, and its pixels within the box."""
-    number = number_regions(coords, _TEAR * period)
-    for index, box in enumerate(find_objects(number), 1):
-        yield box, number[box] == index
-
-
 def _refine(
     image: Float32[ndarray, "h w"],
     coords: Float32[ndarray, "h w 2"],
@@ -130,15 +116,10 @@ def _refine(
 def _smooth(
     coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], pixels_a_period: float, period: float
 ) -> Float32[ndarray, "h w 2"]:
-    """Each pixel on the plane through the largest window that is near its own coordinates, or else as it is.
+    """On planes that are near the pixel's own coordinates."""
 
-    In narrow parts, and beside edges that were read without a tear, a window holds more than one surface: its plane is
-    of none of them. Outside `inside`, values continue the nearest planes.
-    """
-    out = coords
-    for window, limit in reversed(_SMOOTHING):
-        plane = local_planes(coords, inside, window * pixels_a_period)
-        apart = plane - coords
-        near = ~inside | (apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2)
-        out = np.where(near[..., None], plane, out)
-    return out
+    def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
+        return apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2
+
+    windows = [(window * pixels_a_period, limit) for window, limit in _SMOOTHING]
+    return flattened(coords, inside, windows, is_near)

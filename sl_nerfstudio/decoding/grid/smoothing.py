@@ -1,5 +1,7 @@
 """Gaussian means, local planes and changes of resolution for images with unknown parts."""
 
+from collections.abc import Callable, Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -32,6 +34,26 @@ def local_planes(
     _multiply(coords, inside, centre, np.float32(sigma), products)
     out = np.empty_like(coords)
     _evaluate_planes(gaussian_means(products, sigma), centre, np.float32(sigma), out)
+    return out
+
+
+def flattened(
+    values: Float32[ndarray, "h w 2"],
+    inside: Bool[ndarray, "h w"],
+    windows: Sequence[tuple[float, float]],
+    is_near: Callable[[Float32[ndarray, "h w 2"], float], Bool[ndarray, "h w"]],
+) -> Float32[ndarray, "h w 2"]:
+    """Each pixel on the plane through the largest window that is near its own value, or else as it is.
+
+    `windows` are standard deviations, in pixels and largest first, each with the limit that `is_near` gets beside the
+    plane's distance from the value. In narrow parts, and beside edges that were read without a tear, a window holds
+    more than one surface: its plane is of none of them. Outside `inside`, values continue the nearest planes.
+    """
+    out = values
+    for sigma, limit in reversed(windows):
+        plane = local_planes(values, inside, sigma)
+        near = ~inside | is_near(plane - values, limit)
+        out = np.where(near[..., None], plane, out)
     return out
 
 

@@ -37,9 +37,6 @@ class FrameMatcher:
         """
         if self._decoder is None or self._matcher is None or pose.alternatives:
             return None
-        size = pixels_a_period(decoded.coords, self._decoder.layout.period)
-        if size is None:
-            return None
         new = digest((surroundings(), key, devices, pose.T_camera_projector))[:_KEY_LENGTH]
         kept = self._store.load(frame, new)
         if kept is not None:
@@ -47,6 +44,7 @@ class FrameMatcher:
         grey = as_grey(read_photograph(frame.images[0]))
         image = DecodedImage(grey, decoded.coords, decoded.mask)
         coords = self._matcher.match(image, *devices, pose.T_camera_projector)
-        if coords is decoded.coords:
+        size = pixels_a_period(decoded.coords, self._decoder.layout.period)
+        if coords is decoded.coords or size is None:
             return None
         return new, self._store.save(frame, new, self._decoder.images.decoded(grey, coords, decoded.mask, size))

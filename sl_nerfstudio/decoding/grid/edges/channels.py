@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.channels import network_channels
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid
 from sl_nerfstudio.decoding.grid.edges.continuation import continued, slopes, steps
 from sl_nerfstudio.decoding.grid.edges.evidence import Evidence
 from sl_nerfstudio.decoding.grid.rectify import RectifiedImage, integer_centres
 from sl_nerfstudio.decoding.grid.turned import from_pattern, to_pattern
+from sl_nerfstudio.decoding.regions import torn
 from sl_nerfstudio.pattern.grid import GridPattern
 
 CHANNELS = 23
@@ -47,7 +47,7 @@ class EdgeView:
         angle = 2 * np.pi * np.nan_to_num(self.fitted)
         phase = np.stack([f(angle[..., axis]) for axis in (0, 1) for f in (np.cos, np.sin)])
         move = np.clip(np.nan_to_num(self.read - self.fitted), -_LARGEST_MOVE, _LARGEST_MOVE) * _MOVE_SCALE
-        parts = [self.measured, known[None], phase * known, np.moveaxis(move, -1, 0), _tears(self.fitted)[None]]
+        parts = [self.measured, known[None], phase * known, np.moveaxis(move, -1, 0), torn(self.fitted, _TEAR)[None]]
         return np.concatenate([*parts, self.continued]).astype(np.float32)
 
 
@@ -81,26 +81,6 @@ def _drawn_if_continued(
     """The pattern where every pixel is continued from the place one step away; 0 where nothing is known there."""
     coords = continued(fitted, slope, np.broadcast_to(step, fitted.shape))
     return np.where(np.isfinite(coords[..., 0]), drawn.at(to_pattern(coords, grid, turn))[..., 0], np.float32(0))
-
-
-def _tears(coords: Float32[ndarray, "h w 2"]) -> Bool[ndarray, "h w"]:
-    """Pixels on both sides of a tear."""
-    torn = np.zeros(coords.shape[:2], dtype=np.bool_)
-    _mark_tears(coords, np.float32(_TEAR), torn)
-    return torn
-
-
-@compiled
-def _mark_tears(coords: ndarray, tear: float, torn: ndarray) -> None:
-    h, w = torn.shape
-    for row in range(h):
-        for column in range(w):
-            for r, c in ((row + 1, column), (row, column + 1)):
-                if r >= h or c >= w:
-                    continue
-                dx, dy = coords[r, c, 0] - coords[row, column, 0], coords[r, c, 1] - coords[row, column, 1]
-                if abs(dx) > tear or abs(dy) > tear:  # False for NaN
-                    torn[row, column] = torn[r, c] = True
 
 
 def _moved(layer: Float32[ndarray, "h w *k"], rectified: RectifiedImage, flags: int) -> Float32[ndarray, "a b *k"]:
