@@ -13,9 +13,10 @@ from sl_nerfstudio.threads import parallel, split, threads
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled for one thread; without the run-time type checks that tests wrap it in.
 
-    Other threads run beside it.
+    Other threads run beside it. Division by zero gives infinity or NaN: a check of every divisor would keep loops from
+    working on several numbers at once.
     """
-    return numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
 
 
 def compiled_range(function: Callable[..., None]) -> Callable[..., None]:
@@ -25,7 +26,7 @@ def compiled_range(function: Callable[..., None]) -> Callable[..., None]:
     result is called with the number of iterations in place of the range. Unlike an OpenMP team (numba's `prange`), idle
     threads sleep: a team spins at the end of every loop, and beside other busy processes takes many times its share.
     """
-    loop = numba.njit(cache=True, nogil=True)(inspect.unwrap(function))
+    loop = compiled(function)
 
     def run(count: int, *arguments: Any) -> None:
         parallel([partial(loop, first, last, *arguments) for first, last in split(count, threads(), 1)])

@@ -5,14 +5,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid
+from sl_nerfstudio.matching.cost_loops import fill_costs, interleave, mark_outside, sample
 from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
 from sl_nerfstudio.matching.settings import CostSettings
 
-_HALF = 127  # the cost where image and pattern have nothing to do with each other
-OUTSIDE = 255  # the cost beside the pattern
 _TOGETHER = 16  # inverse distances whose costs are written at once
+_BAND = 48  # rows whose costs are computed at once: all that is needed on the way stays in the processor's memory
 
 Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
 """Mean of the image in the window of each pixel, and its variance, with what is added to it."""
@@ -40,19 +39,29 @@ def matching_costs(
     """From 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
     mean, variance = statistics
     scale = 1 / np.sqrt(variance)
-    picture = np.ascontiguousarray(grid.layers[..., 0])
+    picture, weights = np.ascontiguousarray(grid.layers[..., 0]), _half_window(sigma)
+    least, h = np.float32(settings.least_pattern_variance), len(image)
     out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
-    x, y = np.empty(image.shape, dtype=np.float32), np.empty(image.shape, dtype=np.float32)
-    block = np.empty((_TOGETHER, *image.shape), dtype=np.uint8)
-    for first in range(0, len(inverse_distances), _TOGETHER):
-        some = inverse_distances[first : first + _TOGETHER]
-        for w, costs in zip(some, block, strict=False):
-            lines.pixels_at(w, x, y)
-            drawn = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            parts = (_window(part, sigma) for part in (drawn, cv2.multiply(drawn, drawn), cv2.multiply(drawn, image)))
-            _fill_costs(*parts, mean, scale, x, y, picture.shape, settings.least_pattern_variance, costs)
-        _interleave(block[: len(some)], first, out)
+    for first in range(0, h, _BAND):
+        inner, around = _with_window(first, h, len(weights) - 1)
+        band = lines.part((around, slice(None)))
+        x, y, drawn = (np.empty(image[around].shape, dtype=np.float32) for _ in range(3))
+        block = np.empty((_TOGETHER, *x.shape), dtype=np.uint8)
+        for start in range(0, len(inverse_distances), _TOGETHER):
+            some = inverse_distances[start : start + _TOGETHER]
+            for w, costs in zip(some, block, strict=False):
+                band.pixels_at(w, x, y)
+                sample(picture, x, y, drawn)
+                fill_costs(drawn, image[around], mean[around], scale[around], weights, least, costs)
+                mark_outside(x, y, picture.shape, costs)
+            interleave(block[: len(some), inner], start, out[first : first + _BAND])
     return out
+
+
+def _with_window(first: int, h: int, reach: int) -> tuple[slice, slice]:
+    """Rows of a band within those that its windows need, and the latter."""
+    begin, end = max(first - reach, 0), min(first + _BAND + reach, h)
+    return slice(first - begin, min(first + _BAND, h) - begin), slice(begin, end)
 
 
 def correlations(
@@ -72,31 +81,11 @@ def correlations(
 
 
 def _window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray, "h w *k"]:
-    return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    size = 2 * len(_half_window(sigma)) - 1
+    return cv2.GaussianBlur(values, (size, size), sigma, borderType=cv2.BORDER_REFLECT)
 
 
-@compiled
-def _fill_costs(
-    p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, x: ndarray, y: ndarray,
-    size: tuple[int, int], least: float, out: ndarray,
-) -> None:  # fmt: skip
-    half, bottom = np.float32(0.5), np.float32(least)
-    right, lower = np.float32(size[1] - 0.5), np.float32(size[0] - 0.5)
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            m = p[row, column]
-            spread = max(pp[row, column] - m * m, np.float32(0)) + bottom
-            correlation = (ip[row, column] - m * mean[row, column]) * scale[row, column] / np.sqrt(spread)
-            cost = min(max(np.float32(_HALF) * (1 - correlation), np.float32(0)), np.float32(2 * _HALF))
-            u, v = x[row, column], y[row, column]
-            inside = u >= -half and v >= -half and u <= right and v <= lower  # False for NaN
-            out[row, column] = np.uint8(cost) if inside else OUTSIDE
-
-
-@compiled
-def _interleave(block: ndarray, first: int, out: ndarray) -> None:
-    """Several images of costs into the volume: one at a time, each pixel would be a place of its own in memory."""
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            for k in range(len(block)):
-                out[row, column, first + k] = block[k, row, column]
+def _half_window(sigma: float) -> Float32[ndarray, "r"]:
+    """Weights from the middle of a Gaussian window to its end, at three standard deviations."""
+    reach = int(np.ceil(3 * sigma))
+    return cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)[reach:, 0].copy()

@@ -1,6 +1,7 @@
 """Where in the projector's image the ray of each camera pixel runs, by the inverse distance along it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -54,7 +55,7 @@ class EpipolarLines:
         """
         code, parameters, ray, centre, offset = self.arrays
         if code == 0 and not parameters[4:].any():
-            _pinhole_pixels(parameters, ray, centre, offset, w, x, y)
+            _pinhole_pixels(parameters, self._planes, centre, w, x, y)
         else:
             _pixels(code, parameters, ray, centre, offset, w, x, y)
 
@@ -70,7 +71,13 @@ class EpipolarLines:
         _nearest(*self.arrays, coords, out)
         return out
 
-    @property
+    @cached_property
+    def _planes(self) -> Float32[ndarray, "5 h w"]:
+        """Rays and offsets, one coordinate after the other."""
+        values = np.concatenate([self.ray, self.offset], axis=-1, dtype=np.float32)
+        return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+    @cached_property
     def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
         """For compiled loops: model code and parameters of the projector, rays, centre, offsets."""
         return *_for_loops(self.projector), self.ray, self.centre, self.offset
@@ -121,20 +128,21 @@ def _pixels(
 
 
 @compiled
-def _pinhole_pixels(
-    parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: float, x: ndarray, y: ndarray
-) -> None:
-    """The same for a pinhole without distortion, several times as fast."""
-    fx, fy, cx, cy = parameters[0], parameters[1], parameters[2] - 0.5, parameters[3] - 0.5
-    a, b, c = w * centre[0], w * centre[1], w * centre[2]
+def _pinhole_pixels(parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray) -> None:
+    """The same for a pinhole without distortion, ten times as fast."""
+    f = np.float32
+    fx, fy, cx, cy = f(parameters[0]), f(-parameters[1]), f(parameters[2] - 0.5), f(parameters[3] - 0.5)
+    a, b, c = f(w * centre[0]), f(w * centre[1]), f(w * centre[2])
+    outside, nearest = f(_OUTSIDE), f(-1e-12)
+    ray_x, ray_y, ray_z, du, dv = planes[0], planes[1], planes[2], planes[3], planes[4]
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
-            z = ray[row, column, 2] + c
-            q = -1 / min(z, -1e-12)
-            u = fx * (ray[row, column, 0] + a) * q + cx + offset[row, column, 0]
-            v = -fy * (ray[row, column, 1] + b) * q + cy + offset[row, column, 1]
-            x[row, column] = u if z < 0 else _OUTSIDE
-            y[row, column] = v if z < 0 else _OUTSIDE
+            z = ray_z[row, column] + c
+            q = f(-1) / min(z, nearest)
+            u = fx * (ray_x[row, column] + a) * q + cx + du[row, column]
+            v = fy * (ray_y[row, column] + b) * q + cy + dv[row, column]
+            x[row, column] = u if z < f(0) else outside
+            y[row, column] = v if z < f(0) else outside
 
 
 @compiled

@@ -18,7 +18,7 @@ from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.matching.settings import SmoothnessSettings
 
 UNKNOWN = -(2**20)  # far from the number of any inverse distance
-_WAYS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))  # steps (row, column)
+_NEVER = np.int16(16000)  # more than any way costs
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ def match_semi_globally(
     `decoded` are the numbers of those that were decoded, `UNKNOWN` where nothing was.
     """
     sums = np.zeros(costs.shape, dtype=np.uint16)
-    for down, right in _WAYS:
-        _add_way(costs, decoded, down, right, settings.small, settings.large, settings.steepest, sums)
+    for step in (1, -1):
+        _add_ways(costs, decoded, step, settings.small, settings.large, settings.steepest, sums)
     h, w = costs.shape[:2]
     index, cost = np.empty((h, w), dtype=np.float32), np.empty((h, w), dtype=np.uint8)
     margin = np.empty((h, w), dtype=np.float32)
@@ -57,45 +57,91 @@ def match_semi_globally(
 
 
 @compiled
-def _add_way(
-    costs: ndarray, decoded: ndarray, down: int, right: int, small: int, large: int, steepest: int, sums: ndarray
+def _add_ways(
+    costs: ndarray, decoded: ndarray, step: int, small: int, large: int, steepest: int, sums: ndarray
 ) -> None:
-    """Add to `sums` what the least costly way in one direction to each pixel costs, less what all its ways share."""
+    """Add to `sums` what the least costly way to each pixel costs, less what all its ways share, for four directions.
+
+    With a step of 1, they come from the left and from the three pixels above; with -1 from the opposite ones.
+    """
     h, w, count = costs.shape
-    # Of the row before and of this one, by column; beside the first and the last step there is nothing to go to.
-    before, here = np.zeros((w, count + 2), dtype=np.int16), np.zeros((w, count + 2), dtype=np.int16)
-    far = np.int16(16000)
-    before[:, 0], before[:, count + 1], here[:, 0], here[:, count + 1] = far, far, far, far
-    near, away = np.int16(small), np.int16(large)
+    beyond = steepest + 1  # places on both sides of a way for inverse distances that are not tried
+    shape = (3, w, count + 2 * beyond)
+    before, here = np.full(shape, _NEVER, dtype=np.int16), np.full(shape, _NEVER, dtype=np.int16)
+    least_before, least_here = np.zeros((3, w), dtype=np.int16), np.zeros((3, w), dtype=np.int16)
+    side, least_side = np.full((2, shape[2]), _NEVER, dtype=np.int16), np.int16(0)
+    away, near = np.int16(large), np.int16(small)
     for i in range(h):
-        row = i if down >= 0 else h - 1 - i
+        row = i if step > 0 else h - 1 - i
         for j in range(w):
-            column = j if right >= 0 else w - 1 - j
-            last = column - right
-            way = here[column]
-            if (down != 0 and i == 0) or last < 0 or last >= w:
-                for k in range(count):
-                    way[k + 1] = costs[row, column, k]
+            column = j if step > 0 else w - 1 - j
+            own, out = costs[row, column], side[j % 2]
+            if j == 0:
+                least_side = _begin(own, beyond, out)
             else:
-                came = here[last] if down == 0 else before[last]
-                least = came[1]
-                for k in range(2, count + 1):
-                    least = min(least, came[k])
-                jump = np.int16(least + away)
-                slope = decoded[row, column] - decoded[row - down, last]
-                slope = slope if abs(slope) <= steepest else 0
-                first, end = max(1, 1 + slope), min(count, count + slope) + 1
-                for k in range(1, first):
-                    way[k] = np.int16(away + np.int16(costs[row, column, k - 1]))
-                for k in range(first, end):
-                    beside = np.int16(min(came[k - slope - 1], came[k - slope + 1]) + near)
-                    cheapest = min(min(came[k - slope], beside), jump)
-                    way[k] = np.int16(cheapest - least + np.int16(costs[row, column, k - 1]))
-                for k in range(end, count + 1):
-                    way[k] = np.int16(away + np.int16(costs[row, column, k - 1]))
-            for k in range(count):
-                sums[row, column, k] += np.uint16(way[k + 1])
-        before, here = here, before
+                slope = _slope(decoded, row, column, row, column - step, steepest)
+                least_side = _go_on(own, side[(j + 1) % 2], least_side, beyond - slope, beyond, near, away, out)
+            for n in range(3):
+                last, out = column + n - 1, here[n, column]
+                if i == 0 or last < 0 or last >= w:
+                    least_here[n, column] = _begin(own, beyond, out)
+                else:
+                    slope = _slope(decoded, row, column, row - step, last, steepest)
+                    came, least = before[n, last], least_before[n, last]
+                    least_here[n, column] = _go_on(own, came, least, beyond - slope, beyond, near, away, out)
+            _add(side[j % 2], here[:, column], beyond, sums[row, column])
+        before, here, least_before, least_here = here, before, least_here, least_before
+
+
+@compiled
+def _slope(decoded: ndarray, row: int, column: int, row_before: int, column_before: int, steepest: int) -> int:
+    """Steps of the inverse distance from the pixel before to this one; 0 where there is a jump or nothing decoded."""
+    steps = decoded[row, column] - decoded[row_before, column_before]
+    return steps if abs(steps) <= steepest else 0
+
+
+@compiled
+def _begin(costs: ndarray, beyond: int, out: ndarray) -> np.int16:
+    """The first pixel of a way; returns the least of `out`."""
+    least = _NEVER
+    for k in range(len(costs)):
+        out[beyond + k] = costs[k]
+        least = min(least, np.int16(costs[k]))
+    return least
+
+
+@compiled
+def _go_on(
+    costs: ndarray,
+    came: ndarray,
+    least: np.int16,
+    first: int,
+    beyond: int,
+    near: np.int16,
+    away: np.int16,
+    out: ndarray,
+) -> np.int16:
+    """From one pixel to the next, in 16 bits throughout; returns the least of `out`.
+
+    The first inverse distance continues place `first` of the pixel before, the others the places after it.
+    """
+    count = len(costs)
+    below, same, above = came[first - 1 :], came[first:], came[first + 1 :]
+    ways, jump, smallest = out[beyond : beyond + count], np.int16(least + away), _NEVER
+    for k in range(count):
+        cheapest = min(min(np.int16(min(below[k], above[k]) + near), same[k]), jump)
+        way = np.int16(np.int16(cheapest - least) + np.int16(costs[k]))
+        ways[k] = way
+        smallest = min(smallest, way)
+    return smallest
+
+
+@compiled
+def _add(side: ndarray, others: ndarray, beyond: int, sums: ndarray) -> None:
+    count = len(sums)
+    a, b, c, d = side[beyond:], others[0, beyond:], others[1, beyond:], others[2, beyond:]
+    for k in range(count):
+        sums[k] += np.uint16(a[k] + b[k] + c[k] + d[k])
 
 
 @compiled

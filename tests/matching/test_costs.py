@@ -5,7 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
-from sl_nerfstudio.matching.costs import OUTSIDE, correlations, image_statistics, matching_costs
+from sl_nerfstudio.matching.cost_loops import OUTSIDE
+from sl_nerfstudio.matching.costs import correlations, image_statistics, matching_costs
 from sl_nerfstudio.matching.hypotheses import hypotheses, with_offset
 from sl_nerfstudio.matching.settings import CostSettings, HypothesisSettings
 from tests.matching.scene import PATTERN, PERIOD, step_scene
@@ -34,7 +35,7 @@ def test_costs_are_correlations_in_gaussian_windows(scene, grid):
     costs = matching_costs(scene.image, statistics, scene.lines, w, grid, SIGMA, COSTS)
 
     def mean(values):
-        return gaussian_filter(values.astype(np.float64), SIGMA, mode="mirror", truncate=4.0)
+        return gaussian_filter(values.astype(np.float64), SIGMA, mode="mirror", truncate=3.0)
 
     for k in (0, 7, 20):
         coords = scene.lines.at(np.full(scene.image.shape, w[k]))

@@ -33,9 +33,8 @@ def sums_by_the_paper(costs, decoded, small, large, steepest):
                     value = int(costs[row, column, k])
                     if before is not None:
                         ways = [min(before) + large]
-                        if 0 <= k - slope < count:
-                            ways += [before[k - slope]]
-                            ways += [before[j] + small for j in (k - slope - 1, k - slope + 1) if 0 <= j < count]
+                        steps = [(k - slope, 0), (k - slope - 1, small), (k - slope + 1, small)]
+                        ways += [before[j] + change for j, change in steps if 0 <= j < count]
                         value += min(ways) - min(before)
                     here.append(value)
                 along[row, column] = here
