@@ -4,6 +4,7 @@ So no two threads write to the same place, and sums do not depend on the number 
 delta and its rho (12); those common to all frames come after all others.
 """
 
+from sl_nerfstudio.bundle_adjustment.loops.vectors import add_6, add_12
 from sl_nerfstudio.compiled import compiled, compiled_range
 
 
@@ -45,32 +46,48 @@ def depth_couplings(first, last, by_anchor, own, cross, depth_by_own, depth_by_r
 
 
 @compiled
-def _add(H, x0, y0, w, J, first, K, second, width):
-    """H[x0 + x, y0 + y] += w J[:, first + x] . K[:, second + y] for x < 6 and y < width."""
+def _add_6(H, at, w, J, n, first, second):
+    """`H[x, y] += w J[n, :, first + x] . J[n, :, second + y]` for x and y < 6; H begins at `at` in its array."""
+    stride, row = H.shape[-1], 2 * n * J.shape[2]
     for x in range(6):
-        a, b = w * J[0, first + x], w * J[1, first + x]
-        row = H[x0 + x]
-        for y in range(width):
-            row[y0 + y] += a * K[0, second + y] + b * K[1, second + y]
+        add_6(H, at + x * stride, w * J[n, 0, first + x], J, row + second)
+        add_6(H, at + x * stride, w * J[n, 1, first + x], J, row + J.shape[2] + second)
 
 
 @compiled
-def _subtract(H, x0, y0, scale, v, u):
-    """H[x0 : x0 + 12, y0 : y0 + 12] -= scale v u^T."""
+def _add_12(H, at, w, J, n, first):
+    """`H[x, y] += w J[n, :, first + x] . J[n, :, 6 + y]` for x < 6 and y < 12; H begins at `at` in its array."""
+    stride, row = H.shape[-1], 2 * n * J.shape[2]
+    for x in range(6):
+        add_12(H, at + x * stride, w * J[n, 0, first + x], J, row + 6)
+        add_12(H, at + x * stride, w * J[n, 1, first + x], J, row + J.shape[2] + 6)
+
+
+@compiled
+def _add_common(border, s, first, w, J, n, second, common):
+    """The same for the columns `second` and later of J, which are those of the common unknowns."""
+    for x in range(6):
+        for y in range(common):
+            both = J[n, 0, second + x] * J[n, 0, J.shape[2] - common + y]
+            both += J[n, 1, second + x] * J[n, 1, J.shape[2] - common + y]
+            border[s, first + x, y] += w * both
+
+
+@compiled
+def _subtract(H, at, scale, v, i, u, j):
+    """`H[x, y] -= scale v[i, x] u[j, y]` for x and y < 12; H begins at `at` in its array."""
     for x in range(12):
-        a, row = scale * v[x], H[x0 + x]
-        for y in range(12):
-            row[y0 + y] -= a * u[y]
+        add_12(H, at + x * H.shape[-1], -scale * v[i, x], u, 12 * j)
 
 
 @compiled
-def _subtract_depth(H, g, border, scale, v, u, u_g):
+def _subtract_depth(H, g, border, s, scale, v, i, u, u_g):
     """What the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
-    _subtract(H, 0, 0, scale, v, v)
+    _subtract(H, 144 * s, scale, v, i, v, i)
     for x in range(12):
-        g[x] -= scale * v[x] * u_g
+        g[s, x] -= scale * v[i, x] * u_g
         for y in range(len(u)):
-            border[x, y] -= scale * v[x] * u[y]
+            border[s, x, y] -= scale * v[i, x] * u[y]
 
 
 @compiled
@@ -95,26 +112,25 @@ def frame_sums(first, last, chosen, groups, anchor, own, cross, couplings, H, g,
         f = chosen[s]
         for e in range(anchor_first[f], anchor_first[f + 1]):
             a = anchor_entries[e]
-            _add(H[s], 6, 6, w_own[a], J_own[a], 0, J_own[a], 0, 6)
-            _add(border[s], 6, 0, w_own[a], J_own[a], 0, J_own[a], 6, common)
+            _add_6(H, 144 * s + 78, w_own[a], J_own, a, 0, 0)  # rows and columns of rho
+            _add_common(border, s, 6, w_own[a], J_own, a, 0, common)
             _add_to_gradient(g[s], w_own[a], J_own[a], 0, 6, r_own[a], 6)
-            _subtract_depth(H[s], g[s], border[s], 1 / H_depth[a], by_own[a], by_common[a], g_depth[a])
+            _subtract_depth(H, g, border, s, 1 / H_depth[a], by_own, a, by_common[a], g_depth[a])
             for k in range(row_first[a], row_first[a + 1]):
                 n = row_entries[k]
                 if w_cross[n] > 0:
-                    J = J_cross[n]
-                    _add(H[s], 0, 0, w_cross[n], J, 0, J, 0, 6)
-                    _add(border[s], 0, 0, w_cross[n], J, 0, J, 18, common)
-                    _add_to_gradient(g[s], w_cross[n], J, 0, 6, r_cross[n], 0)
+                    _add_6(H, 144 * s, w_cross[n], J_cross, n, 0, 0)
+                    _add_common(border, s, 0, w_cross[n], J_cross, n, 0, common)
+                    _add_to_gradient(g[s], w_cross[n], J_cross[n], 0, 6, r_cross[n], 0)
         for e in range(seen_first[f], seen_first[f + 1]):
             n = seen_entries[e]
             if w_cross[n] > 0:
-                a, J = anchor[n], J_cross[n]
+                a = anchor[n]
                 for half in (0, 6):
-                    _add(H[s], half, 0, w_cross[n], J, 6 + half, J, 6, 12)
-                    _add(border[s], half, 0, w_cross[n], J, 6 + half, J, 18, common)
-                _add_to_gradient(g[s], w_cross[n], J, 6, 12, r_cross[n], 0)
-                _subtract_depth(H[s], g[s], border[s], 1 / H_depth[a], by_row[n], by_common[a], g_depth[a])
+                    _add_12(H, 144 * s + 12 * half, w_cross[n], J_cross, n, 6 + half)
+                    _add_common(border, s, half, w_cross[n], J_cross, n, 6 + half, common)
+                _add_to_gradient(g[s], w_cross[n], J_cross[n], 6, 12, r_cross[n], 0)
+                _subtract_depth(H, g, border, s, 1 / H_depth[a], by_row, n, by_common[a], g_depth[a])
 
 
 @compiled
@@ -134,31 +150,32 @@ def pair_sums(first, last, chosen, slot, groups, rows, cross, couplings, H):
     anchor, source, viewer = rows
     _, J_cross, _, w_cross = cross
     by_own, by_row, _, H_depth, _ = couplings
+    width = H.shape[1]
     for s in range(first, last):
-        f, at = chosen[s], 12 * s
+        f, at = chosen[s], 12 * s * width
         for e in range(anchor_first[f], anchor_first[f + 1]):
             a = anchor_entries[e]
             for k in range(row_first[a], row_first[a + 1]):
                 n = row_entries[k]
                 t = slot[viewer[n]]
                 if w_cross[n] > 0 and _own_side(s, t):
-                    _add(H, at, 12 * t, w_cross[n], J_cross[n], 0, J_cross[n], 6, 12)
-                    _subtract(H, at, 12 * t, 1 / H_depth[a], by_own[a], by_row[n])
+                    _add_12(H, at + 12 * t, w_cross[n], J_cross, n, 0)
+                    _subtract(H, at + 12 * t, 1 / H_depth[a], by_own, a, by_row, n)
         for e in range(seen_first[f], seen_first[f + 1]):
             n = seen_entries[e]
             if not w_cross[n] > 0:
                 continue
-            a, J, v = anchor[n], J_cross[n], by_row[n]
+            a = anchor[n]
             scale, t = 1 / H_depth[a], slot[source[n]]
             if _own_side(s, t):
                 for half in (0, 6):
-                    _add(H, at + half, 12 * t, w_cross[n], J, 6 + half, J, 0, 6)
-                _subtract(H, at, 12 * t, scale, v, by_own[a])
+                    _add_6(H, at + half * width + 12 * t, w_cross[n], J_cross, n, 6 + half, 0)
+                _subtract(H, at + 12 * t, scale, by_row, n, by_own, a)
             for k in range(row_first[a], row_first[a + 1]):
                 m = row_entries[k]
                 t = slot[viewer[m]]
                 if w_cross[m] > 0 and _own_side(s, t):
-                    _subtract(H, at, 12 * t, scale, v, by_row[m])
+                    _subtract(H, at + 12 * t, scale, by_row, n, by_row, m)
 
 
 @compiled_range
