@@ -332,8 +332,8 @@ class SymmetrySettings:
     """frames with which each one is compared after the turn"""
     most_compared: int = 12
     """turns that are tried"""
-    least_excess: float = 2.0
-    """how much more must contradict after a part of a turn than after all of it; less: it is round"""
+    least_excess: float = 4.0
+    """how many times as much must contradict after a part of a turn as after all of it; less: it is round, or long"""
 
 
 @dataclass(frozen=True)

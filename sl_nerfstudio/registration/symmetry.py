@@ -3,7 +3,8 @@
 Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say different
 things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the surface to
 where it contradicts; a symmetry does not. Nor does any turn about the axis of something round, a vase or a medal: but
-parts of that turn contradict no more, so it is no other side. Half the turn of a nut contradicts far more.
+parts of that turn contradict no more, so it is no other side. Nor does half a turn of a leaf on a table, which covers
+most of its place: parts of it contradict only twice as much. Half the turn of a nut contradicts forty times as much.
 """
 
 from collections.abc import Iterator, Sequence
