@@ -79,7 +79,7 @@ class LineFitSettings:
 class KeepingSettings:
     """Which pixels are kept."""
 
-    least_probability: float = 0.65
+    least_probability: float = 0.5
     """that a pixel is right"""
     near: float = 0.1
     """distance within which coordinates count as right, and matched ones as those that were decoded; periods"""

@@ -21,7 +21,15 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
-from sl_nerfstudio.registration.result import CoordinatesDisagree, PairsContradict, Registration, SeparatePoses
+from sl_nerfstudio.registration.result import (
+    CoordinatesDisagree,
+    Exclusion,
+    PairsContradict,
+    Registration,
+    SeparatePoses,
+    UndecidedProjector,
+    left_out,
+)
 from sl_nerfstudio.threads import one_library_thread, results
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups
@@ -96,7 +104,7 @@ def _undecidable(registration: Registration) -> set[int]:
     """Frames that fit at several places: all if the object looks the same from several sides."""
     if registration.by_order or registration.turns_deg:
         return set(range(len(registration.names)))
-    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict)}
+    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict | UndecidedProjector)}
     return {k for k, name in enumerate(registration.names) if name in torn}
 
 
@@ -170,36 +178,19 @@ def _without_contradictions(
 
 def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) -> Registration:
     """The registration with groups of frames as components of their own."""
-    registered, component = registration.registered.copy(), registration.component.copy()
-    T, baseline, fitness = (
-        registration.T_world_camera.copy(),
-        registration.baseline.copy(),
-        registration.fitness.copy(),
-    )
-    exclusions = list(registration.exclusions)
-    number, separate = int(component.max()) + 1, list(registration.separate)
+    T, baseline = registration.T_world_camera, registration.baseline
+    lost, exclusions, separate = registration.component.copy(), list[Exclusion](), list(registration.separate)
+    number = int(lost.max()) + 1
     for group in groups:
         frames = list(group)
         names = tuple(registration.names[k] for k in frames)
+        exclusions += [CoordinatesDisagree(name, names) for name in names]
+        lost[frames] = -1
         if len(frames) > 1:
             separate.append(SeparatePoses(names, T[frames], baseline[frames]))
-        exclusions += [CoordinatesDisagree(name, names) for name in names]
-        registered[frames] = False
-        T[frames], baseline[frames], fitness[frames] = np.nan, np.nan, np.nan
-        component[frames] = number if len(frames) > 1 else -1
-        number += len(frames) > 1
-    names = {registration.names[k] for group in groups for k in group}
-    return replace(
-        registration,
-        registered=registered,
-        component=component,
-        T_world_camera=T,
-        baseline=baseline,
-        fitness=fitness,
-        exclusions=tuple(exclusions),
-        uncertainties=tuple(u for u in registration.uncertainties if u.frame not in names),
-        separate=tuple(separate),
-    )
+            lost[frames] = number
+            number += 1
+    return replace(left_out(registration, exclusions), component=lost, separate=tuple(separate))
 
 
 def _adjusted(

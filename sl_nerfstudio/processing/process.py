@@ -37,7 +37,7 @@ from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import Registration, with_undecided
+from sl_nerfstudio.registration.result import Registration, without_undecided
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]
@@ -139,7 +139,7 @@ def _register(
         before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
         if choice.chosen != before.chosen:
             registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
-    return choice.chosen, with_undecided(registration, choice.undecided)
+    return choice.chosen, without_undecided(registration, choice.undecided)
 
 
 def _require_clouds(

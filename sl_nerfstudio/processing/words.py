@@ -7,7 +7,7 @@ from sl_nerfstudio.registration.result import (
     PairsContradict,
     SeparateComponent,
     SurfaceDisagrees,
-    Uncertainty,
+    UncertainRotation,
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
@@ -55,6 +55,11 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
             f"{exclusion.contradicting} of its {exclusion.pairs} pairs with other frames contradict the pose that the "
             "rest of them say; capture this view again, and views beside it"
         )
+    if isinstance(exclusion, UndecidedProjector):
+        return (
+            f"two poses of the projector, {exclusion.angle_deg:.0f} degrees apart, explain its coordinates, and the "
+            "other frames do not decide between them; show parts at other depths in this view"
+        )
     if isinstance(exclusion, CoordinatesDisagree):
         others = [name for name in exclusion.group if name != exclusion.frame]
         with_others = f" and those of {listed(others, _LISTED)} agree with each other but" if others else ""
@@ -76,13 +81,8 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
     )
 
 
-def uncertainty_sentence(uncertainty: Uncertainty) -> str:
+def uncertainty_sentence(uncertainty: UncertainRotation) -> str:
     """What is uncertain about a registered frame."""
-    if isinstance(uncertainty, UndecidedProjector):
-        return (
-            f"{uncertainty.frame}: two poses of the projector, {uncertainty.angle_deg:.0f} degrees apart, explain its "
-            "coordinates, and the other frames do not decide between them"
-        )
     return (
         f"{uncertainty.frame}: it may slip along the surface; its rotation is known only to "
         f"{uncertainty.sigma_deg:.1f} degrees (surface of revolution, or plane?)"

@@ -26,7 +26,6 @@ from sl_nerfstudio.registration.result import (
     SeparatePoses,
     SurfaceDisagrees,
     UncertainRotation,
-    Uncertainty,
 )
 from sl_nerfstudio.registration.settings import EdgeSettings
 from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
@@ -185,9 +184,9 @@ def _exclusion(
 
 def _uncertainties(
     names: Sequence[str], consistent: Sequence[PairMatch], registered: Bool[ndarray, "n"], graph: ViewGraph
-) -> list[Uncertainty]:
+) -> list[UncertainRotation]:
     """Registered frames that no pair determines well."""
-    out: list[Uncertainty] = []
+    out: list[UncertainRotation] = []
     frames: list[int] = np.flatnonzero(registered).tolist()
     for k in frames:
         mine = [e for e in consistent if k in (e.source, e.target)]

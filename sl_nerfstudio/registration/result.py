@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
@@ -74,16 +75,24 @@ class CoordinatesDisagree:
     group: tuple[str, ...]  # frames that agree with each other but not with the rest
 
 
-Exclusion = SurfaceDisagrees | NoCommonSurface | SeparateComponent | PoorPair | PairsContradict | CoordinatesDisagree
-"""Why a frame was not registered."""
-
-
 @dataclass(frozen=True)
 class UndecidedProjector:
-    """Two poses of a frame's projector explain its coordinates, and the other frames do not tell which is right."""
+    """A frame was left out because two poses of its projector explain its coordinates, and no other frame decides."""
 
     frame: str
     angle_deg: float  # between the two poses of the projector
+
+
+Exclusion = (
+    SurfaceDisagrees
+    | NoCommonSurface
+    | SeparateComponent
+    | PoorPair
+    | PairsContradict
+    | CoordinatesDisagree
+    | UndecidedProjector
+)
+"""Why a frame was not registered."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +101,6 @@ class UncertainRotation:
 
     frame: str
     sigma_deg: float  # of the least known rotation, by the best pair
-
-
-Uncertainty = UndecidedProjector | UncertainRotation
-"""What is uncertain about a registered frame."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +124,33 @@ class Registration:
     fitness: Float64[ndarray, "n"]  # share of each frame's judged points that agree; NaN where not registered
     edges: tuple[Edge, ...]
     exclusions: tuple[Exclusion, ...]  # one for each frame that was not registered
-    uncertainties: tuple[Uncertainty, ...]
+    uncertainties: tuple[UncertainRotation, ...]
     separate: tuple[SeparatePoses, ...] = ()  # of the other components
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that pairs contradict each other
     ordered: bool = True  # frames follow each other in the order of capture; False: stated, or found not to be so
     by_order: bool = False  # which side each frame shows was decided by the order of capture
 
 
-def with_undecided(registration: Registration, undecided: Sequence[UndecidedProjector]) -> Registration:
-    """The registration with what is uncertain about the projectors of its registered frames."""
+def left_out(registration: Registration, exclusions: Sequence[Exclusion]) -> Registration:
+    """The registration without the frames that the exclusions name, each as a frame by itself."""
+    names = {exclusion.frame for exclusion in exclusions}
+    out = np.array([name in names for name in registration.names])
+    return replace(
+        registration,
+        T_world_camera=np.where(out[:, None, None], np.nan, registration.T_world_camera),
+        baseline=np.where(out, np.nan, registration.baseline),
+        registered=registration.registered & ~out,
+        component=np.where(out, -1, registration.component),
+        fitness=np.where(out, np.nan, registration.fitness),
+        exclusions=(*registration.exclusions, *exclusions),
+        uncertainties=tuple(u for u in registration.uncertainties if u.frame not in names),
+    )
+
+
+def without_undecided(registration: Registration, undecided: Sequence[UndecidedProjector]) -> Registration:
+    """The registration without those of its frames whose projector may stand at two places.
+
+    The surface of such a frame is bent if the wrong one was taken, and hardly any agreement tells.
+    """
     names = {name for name, here in zip(registration.names, registration.registered, strict=True) if here}
-    doubts = tuple(u for u in undecided if u.frame in names)
-    return replace(registration, uncertainties=registration.uncertainties + doubts)
+    return left_out(registration, [doubt for doubt in undecided if doubt.frame in names])

@@ -73,7 +73,7 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     names = [f.name for f in facts.in_scan if f.undecided and f not in loose]
     if names:
         band = _share_band(len(names), len(facts.in_scan), settings)
-        yield Reason(band, f"{listed(names)}: the pose is undecided; another one fits nearly as well")
+        yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well")
 
 
 def symmetry_sentence(turns_deg: Sequence[float]) -> str:

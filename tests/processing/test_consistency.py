@@ -25,6 +25,7 @@ from sl_nerfstudio.registration.result import (
     PairsContradict,
     Registration,
     UncertainRotation,
+    UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from tests.bundle_adjustment import analytic
@@ -122,10 +123,11 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
 
 
 @pytest.mark.parametrize("doubt", [{"by_order": True}, {"turns_deg": (90.0,)}, {}])
-def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt):
-    """Every frame of a symmetric object does; of others, those whose pairs contradict each other."""
+@pytest.mark.parametrize("why", [PairsContradict(NAMES[MOVED], 9, 6), UndecidedProjector(NAMES[MOVED], 20.0)])
+def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt, why):
+    """Every frame of a symmetric object does; of others, those whose pairs contradict, or with two projectors."""
     without = without_groups(registration_of(RIG.T_world_camera.numpy()), [[1], [MOVED]])
-    torn = replace(without, exclusions=(without.exclusions[0], PairsContradict(NAMES[MOVED], 9, 6)), **doubt)
+    torn = replace(without, exclusions=(without.exclusions[0], why), **doubt)
     asked = []
 
     def none_placed(clouds, registration, poses, candidates):

@@ -49,18 +49,18 @@ def run(unordered):
     return *stages._register([], unordered, 0, None, log.append), log
 
 
-def test_the_same_poses_are_registered_once_and_what_all_frames_say_of_them_is_stated(registered):
+def test_the_same_poses_are_registered_once_and_what_all_frames_say_of_them_counts(registered):
     calls = registered((0, 1, 0), (0, 1, 0))
     chosen, found, log = run(unordered=False)
     assert calls == [((0, 1, 0), True)] and log == [ORDER]
-    assert chosen == (0, 1, 0) and found.uncertainties == (DOUBT,) and number(found) == 1
+    assert chosen == (0, 1, 0) and found.exclusions == (DOUBT,) and number(found) == 1
 
 
 def test_other_poses_are_registered_again(registered):
     calls = registered((0, 1, 0), (0, 0, 0))
     chosen, found, log = run(unordered=False)
     assert calls == [((0, 1, 0), True), ((0, 0, 0), False)] and log == [ORDER]
-    assert chosen == (0, 0, 0) and found.uncertainties == (DOUBT,) and number(found) == 2
+    assert chosen == (0, 0, 0) and found.exclusions == (DOUBT,) and number(found) == 2
 
 
 @pytest.mark.parametrize("unordered", [False, True])
@@ -69,4 +69,4 @@ def test_where_the_order_is_known_nothing_is_repeated(registered, unordered):
     chosen, found, log = run(unordered)
     wanted = (0, 0, 0) if unordered else (0, 1, 0)
     assert calls == [(wanted, not unordered)] and chosen == wanted and log == []
-    assert found.uncertainties == ((DOUBT,) if unordered else ())
+    assert found.exclusions == ((DOUBT,) if unordered else ())

@@ -14,7 +14,7 @@ from sl_nerfstudio.processing.scan_poses import find_scan_poses
 from sl_nerfstudio.processing.summary import left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation, UndecidedProjector
+from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 
@@ -80,7 +80,7 @@ def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results,
 
 
 def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(config, results, registration, poses):
-    doubts = (UncertainRotation(NAMES[1], 7.5), UndecidedProjector(NAMES[2], 9.0))
+    doubts = (UncertainRotation(NAMES[1], 7.5), UncertainRotation(NAMES[2], 2.0))
     result = summarise(config, "ramps", results, replace(registration, uncertainties=doubts), poses)
     assert result.verdict.band == "poor"
     assert result.verdict.reasons[0].startswith(f"{NAMES[1]}: rotation known only to 7.5 degrees")

@@ -16,7 +16,7 @@ from sl_nerfstudio.registration.result import (
     SurfaceDisagrees,
     UncertainRotation,
     UndecidedProjector,
-    with_undecided,
+    without_undecided,
 )
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AcceptanceSettings, EdgeSettings
 from tests.bundle_adjustment.analytic import rig_of
@@ -125,10 +125,15 @@ def test_what_is_being_done_is_reported(clouds):
     assert stages == ["registering pairs", "comparing all frames", "closing loops", "closing loops"]
 
 
-def test_projectors_that_are_undecided_are_told_of_registered_frames_only(clouds):
+def test_frames_whose_projector_is_undecided_are_left_out(clouds):
     found = register(clouds[:3])
     lost = replace(found, registered=np.array([True, True, False]))
     doubts = tuple(UndecidedProjector(name, 12.0) for name in found.names)
-    assert with_undecided(found, doubts).uncertainties == doubts
-    assert with_undecided(lost, doubts).uncertainties == doubts[:2]
-    assert with_undecided(found, ()) == found
+    one = without_undecided(found, doubts[1:2])
+    assert one.exclusions == (*found.exclusions, doubts[1]) and one.registered.tolist() == [True, False, True]
+    assert one.component.tolist() == [0, -1, 0]
+    for values, before in ((one.T_world_camera, found.T_world_camera), (one.baseline, found.baseline)):
+        assert np.isnan(values[1]).all()
+        np.testing.assert_array_equal(values[[0, 2]], before[[0, 2]])
+    assert without_undecided(lost, doubts).exclusions == (*lost.exclusions, *doubts[:2])
+    assert not without_undecided(lost, doubts).registered.any()

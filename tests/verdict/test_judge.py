@@ -32,7 +32,7 @@ def test_a_scan_without_any_doubt_is_good():
 @pytest.mark.parametrize(
     ("change", "one", "words"),
     [
-        ({"undecided": True}, "acceptable", "f03: the pose is undecided; another one fits nearly as well"),
+        ({"undecided": True}, "acceptable", "f03: the pose is undecided; along the surface, others fit as well"),
         ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
         ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
         ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
