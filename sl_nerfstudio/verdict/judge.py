@@ -65,9 +65,10 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     loose = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > settings.largest_sigma_deg]
     if loose:
         sigma = max(f.sigma_rotation_deg or 0.0 for f in loose)
+        said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
         yield Reason(
             "poor",
-            f"{listed([f.name for f in loose])}: rotation known only to {sigma:.2g} degrees (1 sigma of the least "
+            f"{listed([f.name for f in loose])}: rotation known only to {said} degrees (1 sigma of the least "
             f"certain; at most {settings.largest_sigma_deg:g})",
         )
     names = [f.name for f in facts.in_scan if f.undecided and f not in loose]
