@@ -44,7 +44,7 @@ def matching_costs(
     out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
     for first in range(0, h, _BAND):
         inner, around = _with_window(first, h, len(weights) - 1)
-        band = lines.part((around, slice(None)))
+        band, there = lines.part((around, slice(None))), (image[around], mean[around], scale[around])
         x, y, drawn = (np.empty(image[around].shape, dtype=np.float32) for _ in range(3))
         block = np.empty((_TOGETHER, *x.shape), dtype=np.uint8)
         for start in range(0, len(inverse_distances), _TOGETHER):
@@ -52,7 +52,7 @@ def matching_costs(
             for w, costs in zip(some, block, strict=False):
                 band.pixels_at(w, x, y)
                 sample(picture, x, y, drawn)
-                fill_costs(drawn, image[around], mean[around], scale[around], weights, least, costs)
+                fill_costs(drawn, *there, weights, least, costs)
                 mark_outside(x, y, picture.shape, costs)
             interleave(block[: len(some), inner], start, out[first : first + _BAND])
     return out
@@ -81,11 +81,16 @@ def correlations(
 
 
 def _window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray, "h w *k"]:
-    size = 2 * len(_half_window(sigma)) - 1
+    size = 2 * _reach(sigma) + 1
     return cv2.GaussianBlur(values, (size, size), sigma, borderType=cv2.BORDER_REFLECT)
 
 
 def _half_window(sigma: float) -> Float32[ndarray, "r"]:
-    """Weights from the middle of a Gaussian window to its end, at three standard deviations."""
-    reach = int(np.ceil(3 * sigma))
+    """Weights from the middle of a Gaussian window to its end."""
+    reach = _reach(sigma)
     return cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)[reach:, 0].copy()
+
+
+def _reach(sigma: float) -> int:
+    """Pixels from the middle of a Gaussian window to its end, at three standard deviations."""
+    return int(np.ceil(3 * sigma))

@@ -23,12 +23,11 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
-    Exclusion,
     PairsContradict,
     Registration,
     SeparatePoses,
     UndecidedProjector,
-    left_out,
+    without_frames,
 )
 from sl_nerfstudio.threads import one_library_thread, results
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
@@ -178,19 +177,16 @@ def _without_contradictions(
 
 def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) -> Registration:
     """The registration with groups of frames as components of their own."""
-    T, baseline = registration.T_world_camera, registration.baseline
-    lost, exclusions, separate = registration.component.copy(), list[Exclusion](), list(registration.separate)
-    number = int(lost.max()) + 1
-    for group in groups:
-        frames = list(group)
-        names = tuple(registration.names[k] for k in frames)
-        exclusions += [CoordinatesDisagree(name, names) for name in names]
-        lost[frames] = -1
-        if len(frames) > 1:
-            separate.append(SeparatePoses(names, T[frames], baseline[frames]))
-            lost[frames] = number
+    named = [tuple(registration.names[k] for k in group) for group in groups]
+    found = without_frames(registration, [CoordinatesDisagree(name, names) for names in named for name in names])
+    component, separate, number = found.component.copy(), list(found.separate), int(registration.component.max()) + 1
+    for group, names in zip(groups, named, strict=True):
+        if len(group) > 1:
+            frames = list(group)
+            separate.append(SeparatePoses(names, registration.T_world_camera[frames], registration.baseline[frames]))
+            component[frames] = number
             number += 1
-    return replace(left_out(registration, exclusions), component=lost, separate=tuple(separate))
+    return replace(found, component=component, separate=tuple(separate))
 
 
 def _adjusted(

@@ -131,7 +131,7 @@ class Registration:
     by_order: bool = False  # which side each frame shows was decided by the order of capture
 
 
-def left_out(registration: Registration, exclusions: Sequence[Exclusion]) -> Registration:
+def without_frames(registration: Registration, exclusions: Sequence[Exclusion]) -> Registration:
     """The registration without the frames that the exclusions name, each as a frame by itself."""
     names = {exclusion.frame for exclusion in exclusions}
     out = np.array([name in names for name in registration.names])
@@ -153,4 +153,4 @@ def without_undecided(registration: Registration, undecided: Sequence[UndecidedP
     The surface of such a frame is bent if the wrong one was taken, and hardly any agreement tells.
     """
     names = {name for name, here in zip(registration.names, registration.registered, strict=True) if here}
-    return left_out(registration, [doubt for doubt in undecided if doubt.frame in names])
+    return without_frames(registration, [doubt for doubt in undecided if doubt.frame in names])

@@ -137,3 +137,6 @@ def test_frames_whose_projector_is_undecided_are_left_out(clouds):
         np.testing.assert_array_equal(values[[0, 2]], before[[0, 2]])
     assert without_undecided(lost, doubts).exclusions == (*lost.exclusions, *doubts[:2])
     assert not without_undecided(lost, doubts).registered.any()
+    same = without_undecided(found, ())
+    assert same.exclusions == found.exclusions and same.uncertainties == found.uncertainties
+    np.testing.assert_array_equal(same.T_world_camera, found.T_world_camera)
