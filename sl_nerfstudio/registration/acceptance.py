@@ -28,7 +28,7 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
 )
 from sl_nerfstudio.registration.settings import EdgeSettings
-from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
+from sl_nerfstudio.registration.symmetry.symmetric_turns import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph
 from sl_nerfstudio.threads import results
 
@@ -80,7 +80,7 @@ def accept_frames(
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(graph.sides, edges, solution, settings, others),
+        symmetric_turns_deg(graph.sides, edges, solution, settings, [*others, *graph.put_aside]),
         ordered,
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
-from sl_nerfstudio.geometry.robust import geman_mcclure_weight
+from sl_nerfstudio.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.graph_residuals import EdgeArrays, Nodes, Pivots
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
@@ -60,19 +60,31 @@ def _optimised(
     weight: Float64[ndarray, "edges"],
     settings: PoseGraphSettings,
 ) -> Similarities:
-    """Gauss-Newton with a kernel that narrows."""
+    """Gauss-Newton with a kernel that narrows. Far from a minimum a step may lead away: it is shortened if it costs."""
     adjoints = edges.adjoints(pivots)
     width2 = settings.first_kernel_factor * settings.kernel_chi2
+    residuals = edges.residuals(nodes, pivots)
     for _ in range(settings.iterations):
-        step = np.zeros((len(pivots), 7))
+        step, cost = np.zeros((len(pivots), 7)), _cost(edges, residuals, weight, width2)
         if len(free):
-            residuals = edges.residuals(nodes, pivots)
             step[free] = _step(edges, adjoints, residuals, weight, width2, free, len(pivots), settings)
-        nodes = nodes @ exps_at(step, pivots.centre, pivots.radius, settings.largest_log_scale_step)
+        for factor in settings.step_factors:
+            moved = nodes @ exps_at(factor * step, pivots.centre, pivots.radius, settings.largest_log_scale_step)
+            there = edges.residuals(moved, pivots)
+            if _cost(edges, there, weight, width2) <= cost:
+                nodes, residuals = moved, there
+                break
         if width2 <= settings.kernel_chi2 and np.abs(step).max() < settings.converged:
             break
         width2 = max(settings.kernel_chi2, width2 / settings.kernel_shrinkage)
     return nodes
+
+
+def _cost(
+    edges: EdgeArrays, residuals: Float64[ndarray, "edges 7"], weight: Float64[ndarray, "edges"], width2: float
+) -> float:
+    """What all edges cost with a kernel of a squared width."""
+    return float(weight @ geman_mcclure_cost(edges.chi_square(residuals) / width2))
 
 
 def _step(

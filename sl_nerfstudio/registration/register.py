@@ -21,6 +21,7 @@ from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.symmetry.turning_back import turn_blocks_back
 from sl_nerfstudio.registration.view_graph import ViewGraph
 from sl_nerfstudio.side_by_side import tracked
 from sl_nerfstudio.threads import one_library_thread
@@ -64,6 +65,7 @@ def register(
         ordered = _in_order(graph.assemble(), n, selection.least_joined)
     if start is None and not ordered:
         report("comparing all frames")
+        graph = ViewGraph(maps, centred, np.random.default_rng(seed), settings)  # what chance neighbours say is no help
         graph.try_all()
     for _ in range(selection.rounds):
         report("closing loops")
@@ -71,6 +73,7 @@ def register(
         for component in (c for c in components if len(c) > 1):
             graph.try_overlapping(graph.solve(component).S_world_camera)
         graph.bridge(components)
+    turn_blocks_back(graph)
     names = tuple(c.name for c in clouds)
     found = accept_frames(names, graph, ordered)
     most_are_lost = found.registered.sum() <= n / 2

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -23,6 +23,7 @@ from sl_nerfstudio.registration.tone.cycles import with_confirmed_tones
 from sl_nerfstudio.side_by_side import tracked
 
 Pair = tuple[int, int]
+Snapshot = tuple[dict[Pair, PairMatch | None], list[PairMatch]]  # what pairs say, and what was put aside
 
 
 class ViewGraph:
@@ -39,6 +40,7 @@ class ViewGraph:
         self.sides = [Side.sampled(m, settings.pair.coarse_points, rng) for m in maps]
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
+        self._aside: list[PairMatch] = []
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -50,6 +52,36 @@ class ViewGraph:
         """Pairs that agree well enough; what only the tones of two frames say counts if a third frame confirms it."""
         accepted = [match for match in self.matches if is_accepted(match, self.settings.edge)]
         return with_confirmed_tones(accepted, self.pivots, self.settings.pair)
+
+    @property
+    def put_aside(self) -> list[PairMatch]:
+        """Pairs that put blocks of frames where most of the surface contradicts it."""
+        return list(self._aside)
+
+    def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
+        """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
+        largest = self.settings.symmetry.same_rotation_deg
+        for pair in {(min(p), max(p)) for p in pairs}:
+            match = self._tried.get(pair)
+            if match is None:
+                continue
+            placed = S_world_camera[match.target].inverse() @ S_world_camera[match.source]
+            if _turned_deg(match, placed) > largest:
+                self._aside.append(match)
+                del self._tried[pair]
+
+    def snapshot(self) -> Snapshot:
+        """What pairs say now, to come back to."""
+        return dict(self._tried), list(self._aside)
+
+    def restore(self, known: Snapshot) -> None:
+        """Make pairs say what they said."""
+        self._tried, self._aside = dict(known[0]), list(known[1])
+
+    def connected(self, component: Component, used: Bool[ndarray, "edges"]) -> bool:
+        """Whether those of the pairs that hold a component which are `used` lead to every frame of it."""
+        held = zip(self.holding(component), used, strict=True)
+        return _connected(component, [edge for edge, here in held if here])
 
     def try_pairs(self, pairs: Sequence[Pair], search: Search) -> None:
         """Register pairs without a guess, or from the rough poses of both where there are any."""

@@ -29,6 +29,8 @@ def local_planes(
     coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], sigma: float
 ) -> Float32[ndarray, "h w 2"]:
     """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best."""
+    if not inside.any():
+        return np.full_like(coords, np.nan)
     centre = np.nanmean(coords[inside], axis=0)
     products = np.zeros((3, *inside.shape, 4), dtype=np.float32)
     _multiply(coords, inside, centre, np.float32(sigma), products)

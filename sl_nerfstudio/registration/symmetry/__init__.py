@@ -1,0 +1,1 @@
+"""Objects that look the same, or nearly, from several sides."""

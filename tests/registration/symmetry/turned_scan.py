@@ -1,0 +1,53 @@
+"""Frames all around an object at their true places, and pairs that take one side of it for another."""
+
+from copy import copy
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
+from sl_nerfstudio.registration.pairs.surface_agreement import Side
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
+from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.symmetry.symmetric_turns import symmetric_turns_deg
+from tests.registration.graph_edges import edge
+from tests.registration.shaped_clouds import rendered
+
+FRAMES = 8  # all the way around
+
+
+class Scan:
+    """Frames at their true places, with right pairs of neighbours."""
+
+    def __init__(self, scene: str) -> None:
+        made = rendered(scene, tuple(range(FRAMES)), FRAMES, 90)
+        rng = np.random.default_rng(0)
+        self.nodes = made.S_world_camera
+        self.axis = np.zeros(3)
+        self.sides = [Side.sampled(build_surface_map(c), 400, rng) for c in made.clouds]
+        self.pairs = [self.pair(k, (k + 1) % FRAMES) for k in range(FRAMES)]
+
+    def aside(self, x: float) -> "Scan":
+        """The same scan with the world's origin beside the object's axis."""
+        other = copy(self)
+        other.nodes = [Similarity(1.0, np.eye(3), np.array([x, 0.0, 0.0])) @ node for node in self.nodes]
+        other.axis = np.array([x, 0.0, 0.0])
+        return other
+
+    def turned(self, i: int, j: int, degrees: float, scale: float = 1.0) -> Similarity:
+        """What a pair says that takes one side of the object for another: it is turned about the vertical axis."""
+        R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        turn = Similarity(scale, R, self.axis - scale * R @ self.axis)
+        return self.nodes[j].inverse() @ turn @ self.nodes[i]
+
+    def pair(self, i: int, j: int, rivals: tuple[Rival, ...] = ()) -> PairMatch:
+        return edge(self.nodes, i, j, rivals=rivals)
+
+    def turns(self, *others: PairMatch, used: bool = False) -> tuple[float, ...]:
+        edges = [*self.pairs, *others]
+        consistent = np.array([True] * len(self.pairs) + [used] * len(others))
+        return symmetric_turns_deg(
+            self.sides, edges, PoseGraphSolution(list(self.nodes), consistent), REGISTRATION_DEFAULTS
+        )
