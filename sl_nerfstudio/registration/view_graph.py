@@ -61,7 +61,7 @@ class ViewGraph:
     def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
         """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
         largest = self.settings.symmetry.same_rotation_deg
-        for pair in {(min(p), max(p)) for p in pairs}:
+        for pair in sorted({(min(p), max(p)) for p in pairs}):
             match = self._tried.get(pair)
             if match is None:
                 continue

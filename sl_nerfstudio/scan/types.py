@@ -58,8 +58,8 @@ class Scale:
 class PoseSigma:
     """One standard deviation of the starting poses; translations in the scan's unit.
 
-    `camera_*` is the frame as a whole (camera and projector together) in the world;
-    `relative_*` is the projector relative to the camera of the same frame.
+    `camera_*` is the frame as a whole (camera and projector together) in the world, rotating about the middle of the
+    scene; `relative_*` is the projector relative to the camera of the same frame.
     """
 
     camera_translation: float

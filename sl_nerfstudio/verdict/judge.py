@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
 from sl_nerfstudio.verdict.blocks import agreeing_groups, bridges
-from sl_nerfstudio.verdict.facts import PairFacts, ScanFacts
+from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
 from sl_nerfstudio.verdict.settings import VerdictSettings
 from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, listed, worst
 
@@ -62,19 +62,27 @@ def _left_out(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
 
 def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     """Frames in the scan whose pose is not certain."""
-    loose = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > settings.largest_sigma_deg]
+    good, largest = settings.good_sigma_deg, settings.largest_sigma_deg
+    lost = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > largest]
+    if lost:
+        yield Reason("poor", _known_only(lost, largest))
+    loose = [f for f in facts.in_scan if good < (f.sigma_rotation_deg or 0.0) <= largest]
     if loose:
-        sigma = max(f.sigma_rotation_deg or 0.0 for f in loose)
-        said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
-        yield Reason(
-            "poor",
-            f"{listed([f.name for f in loose])}: rotation known only to {said} degrees (1 sigma of the least "
-            f"certain; at most {settings.largest_sigma_deg:g})",
-        )
-    names = [f.name for f in facts.in_scan if f.undecided and f not in loose]
+        yield Reason(_share_band(len(loose), len(facts.in_scan), settings), _known_only(loose, good))
+    names = [f.name for f in facts.in_scan if f.undecided and f not in lost + loose]
     if names:
         band = _share_band(len(names), len(facts.in_scan), settings)
         yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well")
+
+
+def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
+    """That the rotation of frames is uncertain, with the most uncertain one."""
+    sigma = max(f.sigma_rotation_deg or 0.0 for f in frames)
+    said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
+    return (
+        f"{listed([f.name for f in frames])}: rotation known only to {said} degrees (1 sigma of the least certain; at "
+        f"most {limit_deg:g})"
+    )
 
 
 def symmetry_sentence(turns_deg: Sequence[float]) -> str:

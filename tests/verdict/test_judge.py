@@ -34,6 +34,7 @@ def test_a_scan_without_any_doubt_is_good():
     [
         ({"undecided": True}, "acceptable", "f03: the pose is undecided; along the surface, others fit as well"),
         ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
+        ({"sigma_rotation_deg": 1.3}, "acceptable", "f03: rotation known only to 1.3 degrees (1 sigma of the least"),
         ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
         ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
         ({"own_share": 0.1}, "acceptable", "f03: only 10% of the decoded pixels agree with the pose of the projector"),
@@ -50,6 +51,13 @@ def test_one_frame_is_enough_and_many_make_it_poor(change, one, words):
     assert verdict.band == one
     assert any(words in reason for reason in verdict.reasons)
     assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
+
+
+def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
+    verdict = judge_scan(scan({3: {"sigma_rotation_deg": 5.0}, 4: {"sigma_rotation_deg": 1.3}}))
+    lost, loose = verdict.reasons[:2]
+    assert lost.startswith("f03: rotation known only to 5 degrees") and "at most 3)" in lost
+    assert loose.startswith("f04: rotation known only to 1.3 degrees") and "at most 1)" in loose
 
 
 def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
