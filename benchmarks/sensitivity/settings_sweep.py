@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks.common.machine import write_rows
-from benchmarks.registration import FrameErrors, frame_errors, truth_of
+from benchmarks.registration.walks import FrameErrors, frame_errors, truth_of
 from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
 from sl_nerfstudio.registration.register import register

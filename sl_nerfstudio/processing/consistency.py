@@ -18,6 +18,8 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     find_registered_minimum,
     keep_registered,
 )
+from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.similarity import angle_deg
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
@@ -36,8 +38,13 @@ from sl_nerfstudio.verdict.scan_agreement import compare_frames
 from sl_nerfstudio.verdict.settings import VerdictSettings
 
 _ROUNDS = 4
+_MOVES = 3  # times that frames are tried at other places
 _INCLUSIONS = 3  # times that frames left out are placed
 _FEWEST = 2  # frames of a scan
+_DOUBTFUL_EXCESS = 1.25  # residual of a frame, relative to the better pairs, from which other places are tried
+_DOUBTFUL_SHARE = 0.015  # points that agree fewer than usual, as a share, from which they are tried
+_MOST_DOUBTFUL = 0.34  # share of the frames that are tried: the others must say where they belong
+_ELSEWHERE_DEG = 8.0  # rotation between two places of a frame
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,11 @@ def adjust_consistent(
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
+    for _ in range(_MOVES):
+        moved = _moved_elsewhere(clouds, found, log, settings)
+        if moved is None:
+            break
+        found = moved
     undecidable = _undecidable(registration)
     placed_before: set[int] = set()
     for _ in range(_INCLUSIONS):
@@ -97,6 +109,58 @@ def adjust_consistent(
         if not (found.registration.registered & ~known).any():
             break
     return ConsistentFrames(found.registration, found.minimum.with_other_minima(), found.cross)
+
+
+def _moved_elsewhere(
+    clouds: Sequence[FrameCloud],
+    found: _Group,
+    log: Callable[[str], None],
+    settings: RegisteredFramesSettings | None,
+) -> _Group | None:
+    """With frames that agree less well than the rest at other places; None if they do not agree better there.
+
+    Of an object that nearly looks the same from several sides, surfaces that are bent by the errors of their own
+    relative poses may not tell at which a frame is; adjusted ones do.
+    """
+    registration, poses = found.registration, found.minimum.frames.poses
+    index = np.flatnonzero(registration.registered).tolist()
+    doubtful = [index[n] for n in _doubtful(found.cross)]
+    if not doubtful:
+        return None
+    without = replace(registration, registered=registration.registered & ~np.isin(np.arange(len(clouds)), doubtful))
+    placed = _placed(clouds, replace(found, registration=without), doubtful)
+    turned = [
+        k for k in doubtful if placed.registered[k]
+        and angle_deg(placed.T_world_camera[k, :3, :3] @ poses.T_world_camera[k, :3, :3].T) > _ELSEWHERE_DEG
+    ]  # fmt: skip
+    if not turned:
+        return None
+    names = ", ".join(registration.names[k] for k in turned)
+    log(f"tried at other places, where they may agree better: {names}")
+    there = _adjusted(clouds, _with_places(registration, poses, placed, turned), settings)
+    before, after = ([group.cross.frames[index.index(k)] for k in turned] for group in (found, there))
+    better = all(b.excess <= a.excess and b.share >= a.share for a, b in zip(before, after, strict=True))
+    return _without_contradictions(clouds, there, log, settings) if better else None
+
+
+def _doubtful(cross: CrossFrameAgreement) -> list[int]:
+    """Places in `cross` of frames that agree less well than most, the worst first; at most a share of all."""
+    usual = float(np.median([frame.share for frame in cross.frames]))
+    doubts = {
+        n: max(usual - frame.share - _DOUBTFUL_SHARE, frame.excess - _DOUBTFUL_EXCESS)
+        for n, frame in enumerate(cross.frames)
+    }
+    worst = sorted((n for n, doubt in doubts.items() if doubt > 0), key=lambda n: -doubts[n])
+    return sorted(worst[: int(_MOST_DOUBTFUL * len(cross.frames))])
+
+
+def _with_places(
+    registration: Registration, poses: DevicePoses, placed: Registration, turned: Sequence[int]
+) -> Registration:
+    """The registration at adjusted poses, with some frames where they were placed."""
+    T, baseline = poses.T_world_camera.copy(), poses.baseline.copy()
+    T[turned], baseline[turned] = placed.T_world_camera[turned], placed.baseline[turned]
+    return replace(registration, T_world_camera=T, baseline=baseline)
 
 
 def _undecidable(registration: Registration) -> set[int]:

@@ -14,6 +14,7 @@ from sl_nerfstudio import registration, relative_pose
 from sl_nerfstudio.registration import settings as registration_settings
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
 from sl_nerfstudio.registration.settings import FrameCloudSettings
+from sl_nerfstudio.registration.symmetry import settings as symmetry_settings
 from sl_nerfstudio.registration.tone import settings as tone_settings
 from sl_nerfstudio.relative_pose import settings as relative_pose_settings
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
@@ -24,6 +25,7 @@ from tests.relative_pose.two_views import view
 MODULES = {
     relative_pose_settings: relative_pose,
     registration_settings: registration,
+    symmetry_settings: registration,
     tone_settings: registration,
 }
 CLASSES = [

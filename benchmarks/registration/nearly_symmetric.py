@@ -1,6 +1,6 @@
 """Registration of frames in no order, of objects that look the same, or nearly, from several sides.
 
-    python -m benchmarks.nearly_symmetric [--things key hub ...] [--seeds 1 2] [--output FILE]
+    python -m benchmarks.registration.nearly_symmetric [--things key hub ...] [--seeds 1 2] [--output FILE]
 
 Each of 24 shuffled frames (220 x 220 pixels, noise of 0.35 pattern pixels, 1 % wrong pixels) is calibrated by itself;
 then all are registered. A frame is wrong if its camera is turned by more than 5 degrees against the largest group of

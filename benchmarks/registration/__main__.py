@@ -1,0 +1,5 @@
+"""`python -m benchmarks.registration`: see `walks`."""
+
+from benchmarks.registration.walks import main
+
+main()
