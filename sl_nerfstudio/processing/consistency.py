@@ -41,9 +41,9 @@ _ROUNDS = 4
 _MOVES = 3  # times that frames are tried at other places
 _INCLUSIONS = 3  # times that frames left out are placed
 _FEWEST = 2  # frames of a scan
-_DOUBTFUL_EXCESS = 1.25  # residual of a frame, relative to the better pairs, from which other places are tried
-_DOUBTFUL_SHARE = 0.015  # points that agree fewer than usual, as a share, from which they are tried
-_MOST_DOUBTFUL = 0.34  # share of the frames that are tried: the others must say where they belong
+_DOUBTFUL_EXCESS = 1.3  # residual of a frame, relative to the better pairs, from which other places are tried
+_DOUBTFUL_SHARE = 0.02  # points that agree fewer than usual, as a share, from which they are tried
+_MOST_DOUBTFUL = 6  # frames that are tried at once, at most a third: the others must say where they belong
 _ELSEWHERE_DEG = 8.0  # rotation between two places of a frame
 
 
@@ -78,20 +78,23 @@ def adjust_consistent(
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
+    Frames that agree less well than most are tried at other places, and stay where they agree better.
+
     Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
     again as long as frames come in, because each shows more of the surface to the rest. Each frame is placed once: if
     it contradicts the others there, too, it stays out. What surfaces do not tell before, they do not tell afterwards
-    either: frames that fit at several places stay out. How far other minima are is asked of the last group only.
+    either: frames that fit at several places stay out, and of what looks the same from several sides no frame is moved.
+    How far other minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
     found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
-    for _ in range(_MOVES):
+    undecidable = _undecidable(registration)
+    for _ in range(0 if len(undecidable) == len(clouds) else _MOVES):
         moved = _moved_elsewhere(clouds, found, log, settings)
         if moved is None:
             break
         found = moved
-    undecidable = _undecidable(registration)
     placed_before: set[int] = set()
     for _ in range(_INCLUSIONS):
         candidates = [k for k in found.missing() if k not in placed_before | undecidable]
@@ -144,14 +147,14 @@ def _moved_elsewhere(
 
 
 def _doubtful(cross: CrossFrameAgreement) -> list[int]:
-    """Places in `cross` of frames that agree less well than most, the worst first; at most a share of all."""
-    usual = float(np.median([frame.share for frame in cross.frames]))
-    doubts = {
-        n: max(usual - frame.share - _DOUBTFUL_SHARE, frame.excess - _DOUBTFUL_EXCESS)
-        for n, frame in enumerate(cross.frames)
-    }
+    """Places in `cross` of frames that agree less well than most; of many, the worst."""
+    judged = {n: frame for n, frame in enumerate(cross.frames) if np.isfinite(frame.share)}
+    if not judged:
+        return []
+    usual = float(np.median([frame.share for frame in judged.values()]))
+    doubts = {n: max(usual - f.share - _DOUBTFUL_SHARE, f.excess - _DOUBTFUL_EXCESS) for n, f in judged.items()}
     worst = sorted((n for n, doubt in doubts.items() if doubt > 0), key=lambda n: -doubts[n])
-    return sorted(worst[: int(_MOST_DOUBTFUL * len(cross.frames))])
+    return sorted(worst[: min(_MOST_DOUBTFUL, len(cross.frames) // 3)])
 
 
 def _with_places(
