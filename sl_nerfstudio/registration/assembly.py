@@ -233,7 +233,7 @@ class Assembly:
         agreeing = contradicting = 0.0
         for sums in pairs:
             agreeing += float(sums.agreeing[0])
-            contradicting += float(sums.in_front[0] + behind * sums.behind[0])
+            contradicting += float(sums.contradicting(behind)[0])
         return agreeing, contradicting
 
     def _held_by_tone(self, joint: Joint, first: Component, second: Component) -> bool:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from sl_nerfstudio.geometry.similarity import angle_deg
 from sl_nerfstudio.processing import consistency
@@ -15,6 +14,7 @@ from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgree
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 from tests.registration.shaped_clouds import rendered
+from tests.registration.symmetry.turned_scan import write_bar
 
 pytestmark = pytest.mark.long
 
@@ -27,12 +27,7 @@ def test_a_frame_on_the_wrong_side_is_moved_to_where_it_agrees(tmp_path: Path) -
     A frame that is turned by half a turn agrees to 97 % with the others, as frames of real scans do; where it belongs,
     to 100 %.
     """
-    parts = [trimesh.creation.box((90, 40, 24))]
-    for x, height in ((30, 22), (-30, 12)):
-        boss = trimesh.creation.box((16, 20, height))
-        boss.apply_translation((x, 0, 12 + height / 2))
-        parts.append(boss)
-    trimesh.util.concatenate(parts).export(tmp_path / "bar.ply")
+    write_bar(tmp_path / "bar.ply")
     made = rendered(str(tmp_path / "bar.ply"), tuple(range(FRAMES)), FRAMES, 130)
     T = made.T_world_camera.copy()
     T[TURNED] = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T[TURNED]

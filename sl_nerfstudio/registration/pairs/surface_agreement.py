@@ -76,9 +76,13 @@ class Agreement:
         """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
         return self.agreeing + self.in_front + self.behind
 
+    def contradicting(self, behind: float) -> Float64[ndarray, "k"]:
+        """Fraction that contradicts, of which points behind count as `behind`."""
+        return self.in_front + behind * self.behind
+
     def score(self, penalty: float, behind: float) -> Float64[ndarray, "k"]:
         """Points that agree less `penalty` times those that contradict, of which points behind count as `behind`."""
-        return self.agreeing - penalty * (self.in_front + behind * self.behind)
+        return self.agreeing - penalty * self.contradicting(behind)
 
 
 def agreement(

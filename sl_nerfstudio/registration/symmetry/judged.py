@@ -55,7 +55,7 @@ def judged(
     for i, j, S in facing(nodes, turn, neighbours, settings):
         found = agreement(sides[i], sides[j], Hypotheses.of(S), width, width, agrees)
         agreeing[row[i], row[j]] = found.agreeing[0]
-        contradicting[row[i], row[j]] = found.in_front[0] + agrees.behind * found.behind[0]
+        contradicting[row[i], row[j]] = found.contradicting(agrees.behind)[0]
     return Judged(agreeing, contradicting)
 
 

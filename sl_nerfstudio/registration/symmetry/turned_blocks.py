@@ -32,14 +32,20 @@ class TurnedBlock:
 
 
 def turned_blocks(
-    sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+    sides: Sequence[Side],
+    edges: Sequence[PairMatch],
+    solution: PoseGraphSolution,
+    before: Judged,
+    settings: RegistrationSettings,
 ) -> list[TurnedBlock]:
-    """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first."""
+    """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first.
+
+    `before`: the frames of the solution as they are.
+    """
     s, nodes = settings.blocks, solution.S_world_camera
     frames = [k for k, S in enumerate(nodes) if S is not None]
     if len(frames) < s.fewest_frames:
         return []
-    before = judged(sides, nodes, Similarity.identity(), s.neighbours, settings)
     usual = _usual(before, settings)
     contradicting, found = _excess(before, usual), list[TurnedBlock]()
     if contradicting.sum() < s.least_contradicting:

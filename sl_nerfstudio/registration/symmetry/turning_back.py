@@ -2,8 +2,9 @@
 
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.assembly import Component
-from sl_nerfstudio.registration.graph_residuals import Nodes, node_at
-from sl_nerfstudio.registration.symmetry.judged import judged
+from sl_nerfstudio.registration.graph_residuals import node_at
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.registration.symmetry.judged import Judged, judged
 from sl_nerfstudio.registration.symmetry.turned_blocks import TurnedBlock, turned_blocks
 from sl_nerfstudio.registration.view_graph import ViewGraph
 
@@ -18,16 +19,14 @@ def turn_blocks_back(graph: ViewGraph) -> None:
 def turned_back(graph: ViewGraph, component: Component) -> bool:
     """Turn the block of a component back that contradicts most; whether there was one."""
     solution, settings = graph.solve(component), graph.settings
-    blocks = turned_blocks(graph.sides, graph.holding(component), solution, settings)
-    if not blocks:
-        return False
-    before = _contradicting(graph, solution.S_world_camera)
+    before = _as_they_are(graph, solution)
+    blocks = turned_blocks(graph.sides, graph.holding(component), solution, before, settings)
     for block in blocks[: settings.blocks.most_tried]:
         moved = {k: node_at(solution.S_world_camera, k) for k in component}
         moved |= {k: block.turn @ moved[k] for k in block.frames}
         known = graph.snapshot()
         _register_across(graph, moved, block)
-        if _confirmed(graph, moved, before):
+        if _confirmed(graph, moved, before.share):
             return True
         graph.restore(known)
     return False
@@ -44,10 +43,10 @@ def _confirmed(graph: ViewGraph, moved: Component, before: float) -> bool:
     solution = graph.solve(moved)
     if not graph.connected(moved, solution.consistent):
         return False
-    return _contradicting(graph, solution.S_world_camera) < graph.settings.blocks.least_improvement * before
+    return _as_they_are(graph, solution).share < graph.settings.blocks.least_improvement * before
 
 
-def _contradicting(graph: ViewGraph, nodes: Nodes) -> float:
-    """Share of all points."""
+def _as_they_are(graph: ViewGraph, solution: PoseGraphSolution) -> Judged:
+    """How the frames of a solution agree and contradict each other."""
     neighbours = graph.settings.blocks.neighbours
-    return judged(graph.sides, nodes, Similarity.identity(), neighbours, graph.settings).share
+    return judged(graph.sides, solution.S_world_camera, Similarity.identity(), neighbours, graph.settings)

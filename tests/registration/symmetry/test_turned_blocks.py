@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.geometry.similarity import angle_deg
+from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.graph_residuals import node_at
 from sl_nerfstudio.registration.pairs.pair_match import PairMatch
 from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
+from sl_nerfstudio.registration.symmetry.judged import judged
 from sl_nerfstudio.registration.symmetry.turned_blocks import TurnedBlock, _best_cut, turned_blocks
 from sl_nerfstudio.registration.symmetry.turning_back import turned_back
 from sl_nerfstudio.registration.view_graph import ViewGraph
-from tests.registration.symmetry.turned_scan import FRAMES, Scan
+from tests.registration.symmetry.turned_scan import FRAMES, Scan, write_bar
 
 BLOCK = (3, 4, 5)
 
@@ -24,12 +25,7 @@ BLOCK = (3, 4, 5)
 def bar(tmp_path_factory: pytest.TempPathFactory) -> Scan:
     """Two bosses, one on each end, of unequal height."""
     path: Path = tmp_path_factory.mktemp("meshes") / "bar.ply"
-    parts = [trimesh.creation.box((90, 40, 24))]
-    for x, height in ((30, 22), (-30, 12)):
-        boss = trimesh.creation.box((16, 20, height))
-        boss.apply_translation((x, 0, 12 + height / 2))
-        parts.append(boss)
-    trimesh.util.concatenate(parts).export(path)
+    write_bar(path)
     return Scan(str(path))
 
 
@@ -46,7 +42,9 @@ def misplaced(scan: Scan, degrees: float = 180.0) -> tuple[list[PairMatch], Pose
 
 
 def found_in(scan: Scan, edges: list[PairMatch], solution: PoseGraphSolution) -> list[TurnedBlock]:
-    return turned_blocks(scan.sides, edges, solution, REGISTRATION_DEFAULTS)
+    settings = REGISTRATION_DEFAULTS
+    before = judged(scan.sides, solution.S_world_camera, Similarity.identity(), settings.blocks.neighbours, settings)
+    return turned_blocks(scan.sides, edges, solution, before, settings)
 
 
 def test_the_turned_block_is_found_with_its_turn(bar: Scan) -> None:

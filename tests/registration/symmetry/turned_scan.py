@@ -1,8 +1,10 @@
 """Frames all around an object at their true places, and pairs that take one side of it for another."""
 
 from copy import copy
+from pathlib import Path
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.similarity import Similarity
@@ -16,6 +18,16 @@ from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 
 FRAMES = 8  # all the way around
+
+
+def write_bar(path: Path) -> None:
+    """A bar of 90 mm with a boss on each end, 22 and 12 mm high: nearly the same after half a turn."""
+    parts = [trimesh.creation.box((90, 40, 24))]
+    for x, height in ((30, 22), (-30, 12)):
+        boss = trimesh.creation.box((16, 20, height))
+        boss.apply_translation((x, 0, 12 + height / 2))
+        parts.append(boss)
+    trimesh.util.concatenate(parts).export(path)
 
 
 class Scan:
