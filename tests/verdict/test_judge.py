@@ -60,6 +60,14 @@ def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
     assert loose.startswith("f04: rotation known only to 1.3 degrees") and "at most 1)" in loose
 
 
+def test_the_usual_uncertainty_of_a_registration_is_no_fault_of_its_frames():
+    rough = {k: {"sigma_rotation_deg": 1.3} for k in range(N)}
+    verdict = judge_scan(scan(rough, adjusted=False))
+    assert verdict.band == "acceptable"
+    assert [r for r in verdict.reasons if "known only" in r] == []
+    assert judge_scan(scan(rough | {3: {"sigma_rotation_deg": 5.0}}, adjusted=False)).band == "poor"
+
+
 def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
     verdict = judge_scan(scan(turns_deg=(60.0, 119.8)))
     assert verdict.band == "poor"
