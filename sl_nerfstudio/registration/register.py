@@ -88,7 +88,7 @@ def _by_order(names: tuple[str, ...], graph: ViewGraph, settings: RegistrationSe
     `graph` is without it: frames are at other sides than they show, or most could not be placed.
     """
     step_deg = typical_step_deg(graph.matches, settings)
-    if step_deg is None or not sides_are_open(graph.matches, settings):
+    if step_deg is None or not sides_are_open(graph.said, settings):
         return None
     chain = chain_of_small_steps(graph.maps, step_deg, graph.rng, settings)
     near = ViewGraph(graph.maps, [None] * len(names), graph.rng, settings)
@@ -96,7 +96,7 @@ def _by_order(names: tuple[str, ...], graph: ViewGraph, settings: RegistrationSe
     near.try_overlapping(chain, within)
     for _ in range(settings.selection.rounds):
         near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, within)
-    placed = accept_frames(names, near, True, graph.matches)
+    placed = accept_frames(names, near, True, graph.said)
     return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
 
 

@@ -58,6 +58,11 @@ class ViewGraph:
         """Pairs that put blocks of frames where most of the surface contradicts it."""
         return list(self._aside)
 
+    @property
+    def said(self) -> list[PairMatch]:
+        """All that pairs say or said, right or not: at which sides of the object frames fit."""
+        return [*self.matches, *self._aside]
+
     def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
         """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
         largest = self.settings.symmetry.same_rotation_deg

@@ -81,6 +81,7 @@ def test_pairs_across_are_registered_anew_where_the_block_belongs(bar: Scan) -> 
     assert any((e.source in BLOCK) != (e.target in BLOCK) for e in graph.matches)
     aside = graph.put_aside
     assert aside and all(off_deg(bar, e) > 170 for e in aside)
+    assert graph.said == [*graph.matches, *aside]
 
 
 def test_nothing_changes_where_pairs_do_not_confirm_a_turn(bar: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
