@@ -1,6 +1,7 @@
 """`sl-check DIR`: every fault of a scan folder at once, or those of a training run."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,20 +44,27 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     if result.faults:
         raise ScanError(result.faults, str(folder))
     from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
+    from sl_nerfstudio.verdict.shared_surface import decoded_shares_of_scan
 
-    scan = result.scan
-    cross = None
+    scan, said = result.scan, ""
     if scan is not None:
         cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
-    sys.stdout.write(summary(result) + ("" if cross is None else agreement(result, cross)))
+        said = agreement(result, cross, decoded_shares_of_scan(scan))
+    sys.stdout.write(summary(result) + said)
 
 
-def agreement(result: "FolderCheck", cross: "CrossFrameAgreement") -> str:
-    """What the coordinates of the frames say about each other under the starting poses, and the verdict."""
+def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decoded: Sequence[float | None]) -> str:
+    """What the coordinates of the frames say about each other under the starting poses, and the verdict.
+
+    `shared_decoded`: of the surface that others show, how much each frame decoded; None where not known.
+    """
     from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
     from sl_nerfstudio.verdict.judge import judge_scan
 
-    frames = tuple(FrameFacts(content.name, decoded_share=content.decoded) for content in result.contents)
+    frames = tuple(
+        FrameFacts(content.name, decoded_share=content.decoded, shared_decoded=shared)
+        for content, shared in zip(result.contents, shared_decoded, strict=True)
+    )
     verdict = judge_scan(ScanFacts(frames, cross=cross))
     seen = [frame.seen for frame in cross.frames]
     lines = [

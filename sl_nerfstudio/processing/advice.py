@@ -67,9 +67,11 @@ def _used(edges: Sequence[EdgeRecord]) -> set[frozenset[str]]:
 def _weak(frame: FrameRecord) -> list[str]:
     """What makes a frame of the scan unreliable."""
     advice = [f"{frame.name}: {degeneracy}" for degeneracy in frame.degeneracies]
-    if frame.decode_rate is not None and frame.decode_rate < _LOW_RATE:
+    shared = frame.shared_decoded is not None
+    rate, what = (frame.shared_decoded, "surface that other frames show") if shared else (frame.decode_rate, "pattern")
+    if rate is not None and rate < _LOW_RATE:
         advice.append(
-            f"{frame.name}: only {frame.decode_rate:.0%} of the pattern was decoded; focus better, use more light from "
+            f"{frame.name}: only {rate:.0%} of the {what} was decoded; focus better, use more light from "
             "the projector and less from the room, and expose so that lines are neither faint nor saturated"
         )
     if frame.mask_share is not None and frame.mask_share < _SMALL_SHARE:

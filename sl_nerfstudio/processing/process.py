@@ -8,16 +8,18 @@ Decoded frames, the registration and the adjustment are kept in the work folder,
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.processing.capture_files.cameras import refine_camera
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
 from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
 from sl_nerfstudio.processing.frame_stage import run_frame_stage_again
-from sl_nerfstudio.processing.frame_worker import FrameStageResult, clouds_of, with_clouds
+from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_clouds
 from sl_nerfstudio.processing.given_poses import GivenPoses
 from sl_nerfstudio.processing.inputs import Inputs, read_inputs
 from sl_nerfstudio.processing.kept.stages import StageStore
@@ -38,6 +40,7 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration, without_undecided
+from sl_nerfstudio.verdict.shared_surface import decoded_shares
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]
@@ -116,7 +119,8 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     registration = consistent.registration
     adjusted = within_stated_doubt(consistent.adjusted, job.stated)
     poses = find_scan_poses(clouds, registration, adjusted, inputs.known, given)
-    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, found, wrong)
+    shared = _shared_decoded(job, results, registration, adjusted.poses)
+    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, shared, found, wrong)
     result = replace(result, captured=notes)
     if config.object_only:
         parts = find_object_only(job, results, registration, poses)
@@ -140,6 +144,21 @@ def _register(
         if choice.chosen != before.chosen:
             registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
     return choice.chosen, without_undecided(registration, choice.undecided)
+
+
+def _shared_decoded(
+    job: FrameJob, results: Sequence[FrameStageResult], registration: Registration, poses: DevicePoses
+) -> list[float | None]:
+    """Of the surface that other frames show, how much each registered frame decoded, where it sees the pattern."""
+    index, worker = np.flatnonzero(registration.registered), FrameWorker(job)
+    frames, clouds = [result for result in results if result.cloud is not None], clouds_of(results)
+    return decoded_shares(
+        [job.camera_of(frames[k].frame) for k in index],
+        job.projector,
+        poses[index],
+        (clouds[k].coords for k in index),
+        (worker.load(frames[k]).mask for k in index),
+    )
 
 
 def _require_clouds(

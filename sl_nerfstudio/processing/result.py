@@ -20,8 +20,9 @@ class FrameRecord:
     in_scan: bool
     stage: str  # in which it failed: reading, decoding, calibrating, registering, separating; "" if it did not
     reason: str  # problem, cause and remedy
-    decode_rate: float | None = None
+    decode_rate: float | None = None  # of the visible pattern
     mask_share: float | None = None
+    shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's projector
     relative_sigma_rotation_deg: float | None = None  # of the projector against the camera, from this frame alone

@@ -53,15 +53,17 @@ def summarise(
     registration: Registration | None,
     poses: ScanPoses | None,
     cross: CrossFrameAgreement | None = None,
+    shared_decoded: Sequence[float | None] = (),
     found: FoundProjector | None = None,
     contradicted: str = "",
 ) -> ProcessResult:
-    """The result of a run; without `poses` no frame is in a scan. `cross` is of the registered frames.
+    """The result of a run; without `poses` no frame is in a scan.
 
+    `cross` and `shared_decoded` (how much each decoded of what others show) are of the registered frames.
     `found`: the projector, if it was found from the frames. `contradicted`: which intrinsics the epipolar geometry
     contradicts; what the joint adjustment finds is said where this is empty.
     """
-    frames = _with_cross([_record(result, registration, poses) for result in results], cross)
+    frames = _with_others([_record(result, registration, poses) for result in results], cross, shared_decoded)
     edges = () if registration is None else registration.edges
     records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
     adjusted = None if poses is None else poses.adjusted
@@ -103,17 +105,21 @@ def summarise(
     )
 
 
-def _with_cross(frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None) -> tuple[FrameRecord, ...]:
+def _with_others(
+    frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None, shared_decoded: Sequence[float | None]
+) -> tuple[FrameRecord, ...]:
     """The records with what the other frames say about each."""
-    found = iter(() if cross is None else cross.frames)
-    return tuple(_agreeing(f, next(found)) if f.in_scan and cross is not None else f for f in frames)
+    if cross is None:
+        return tuple(frames)
+    found = iter(zip(cross.frames, shared_decoded or [None] * len(cross.frames), strict=True))
+    return tuple(_agreeing(f, *next(found)) if f.in_scan else f for f in frames)
 
 
-def _agreeing(frame: FrameRecord, found: FrameCrossAgreement) -> FrameRecord:
+def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shared_decoded: float | None) -> FrameRecord:
     figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
                "cross_excess": found.excess}  # fmt: skip
     known = {key: value for key, value in figures.items() if np.isfinite(value)}
-    return replace(frame, seen_share=found.seen, **known)
+    return replace(frame, seen_share=found.seen, shared_decoded=shared_decoded, **known)
 
 
 def _facts(frame: FrameRecord) -> FrameFacts:
@@ -125,6 +131,7 @@ def _facts(frame: FrameRecord) -> FrameFacts:
         frame.undecided,
         frame.sigma_rotation_deg,
         frame.decode_rate,
+        frame.shared_decoded,
         frame.own_share,
         bool(frame.degeneracies),
     )

@@ -217,11 +217,15 @@ def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgre
 
 def _decoding(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     """Frames with little decoded, and frames whose coordinates contradict their own pose."""
-    for key, least, words in (
-        ("decoded_share", settings.least_decoded, "of the visible pattern was decoded"),
-        ("own_share", settings.least_own_share, "of the decoded pixels agree with the pose of the projector"),
+    own = "of the decoded pixels agree with the pose of the projector"
+    seen = [(f.shared_decoded, f) for f in facts.in_scan]
+    alone = [(f.decoded_share, f) for f in facts.in_scan if f.shared_decoded is None]
+    for shares, least, words in (
+        (seen, settings.least_decoded, "of the surface that other frames show was decoded"),
+        (alone, settings.least_decoded, "of the visible pattern was decoded"),
+        ([(f.own_share, f) for f in facts.in_scan], settings.least_own_share, own),
     ):
-        weak = [(value, f.name) for f in facts.in_scan if (value := getattr(f, key)) is not None and value < least]
+        weak = [(value, f.name) for value, f in shares if value is not None and value < least]
         if weak:
             share, name = min(weak)
             others = f"; also little in {listed([n for _, n in weak if n != name])}" if len(weak) > 1 else ""

@@ -53,7 +53,8 @@ class VerdictSettings:
     most_frames: float = 0.25
     """Share of the frames that may be left out, undecided, unconfirmed or weakly decoded before the scan is poor."""
     least_decoded: float = 0.5
-    """Share of the visible pattern that must be decoded in every frame."""
+    """Share of the surface that other frames show which must be decoded in every frame; of the visible pattern, where
+    others show too little."""
     least_own_share: float = 0.5
     """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
     pose could explain the majority."""

@@ -23,6 +23,8 @@ def test_every_reason_is_named():
         _frame("b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"),
         _frame("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
         _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
+        _frame("e", decode_rate=0.9, shared_decoded=0.5),
+        _frame("f", decode_rate=0.1, shared_decoded=0.9),  # background that no frame decoded
     ]
     said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)
     assert said[0] == "b: capture it again; it was left out (b.png: is black)"
@@ -31,6 +33,7 @@ def test_every_reason_is_named():
     assert "a: only 30% of the pattern was decoded" in text
     assert "c: all points lie in one plane" in text and "c: the pattern fills only 1.0% of the image" in text
     assert "d: only 40% of its points agree" in text
+    assert "e: only 50% of the surface that other frames show was decoded" in text and "f: only" not in text
 
 
 def test_unordered_frames_with_a_single_connection():

@@ -69,7 +69,8 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
 
 def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results, registration, poses):
     cross = compare_registered(clouds_of(results), registration, poses.adjusted)
-    result = summarise(config, "ramps", results, registration, poses, cross)
+    result = summarise(config, "ramps", results, registration, poses, cross, [0.9, 0.8, None, 0.7])
+    assert [frame.shared_decoded for frame in result.frames] == [0.9, 0.8, None, 0.7]
     assert (
         result.verdict.band == "good" and result.document()["verdict"] == "good" and result.document()["reasons"] == []
     )

@@ -36,6 +36,11 @@ def test_a_scan_without_any_doubt_is_good():
         ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
         ({"sigma_rotation_deg": 1.3}, "acceptable", "f03: rotation known only to 1.3 degrees (1 sigma of the least"),
         ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
+        (
+            {"decoded_share": 0.9, "shared_decoded": 0.3},
+            "acceptable",
+            "f03: only 30% of the surface that other frames show was decoded (at least 50%)",
+        ),
         ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
         ({"own_share": 0.1}, "acceptable", "f03: only 10% of the decoded pixels agree with the pose of the projector"),
         ({"in_scan": False, "component": None}, "acceptable", "1 of 12 frames were left out: f03"),
@@ -58,6 +63,11 @@ def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
     lost, loose = verdict.reasons[:2]
     assert lost.startswith("f03: rotation known only to 5 degrees") and "at most 3)" in lost
     assert loose.startswith("f04: rotation known only to 1.3 degrees") and "at most 1)" in loose
+
+
+def test_background_that_no_frame_decodes_is_no_fault():
+    verdict = judge_scan(scan({k: {"decoded_share": 0.2, "shared_decoded": 0.8} for k in range(N)}))
+    assert verdict.band == "good" and verdict.reasons == ()
 
 
 def test_the_usual_uncertainty_of_a_registration_is_no_fault_of_its_frames():

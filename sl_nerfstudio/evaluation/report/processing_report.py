@@ -112,8 +112,8 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
         return [math.nan if getattr(f, key) is None else factor * getattr(f, key) for f in frames]
 
     drawn = [
-        ("Decode rate: share of the visible pattern that was decoded", "% of the pattern",
-         [charts.Bars("decoded", values("decode_rate", 100.0))]),
+        ("Decoded: share of the visible pattern, and of the surface that other frames show", "%",
+         [charts.Bars("pattern", values("decode_rate", 100.0)), charts.Bars("surface", values("shared_decoded", 100.0))]),
         ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
          [charts.Bars("epipolar", values("epipolar_px"))]),
         ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
