@@ -113,7 +113,8 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
 
     drawn = [
         ("Decoded: share of the visible pattern, and of the surface that other frames show", "%",
-         [charts.Bars("pattern", values("decode_rate", 100.0)), charts.Bars("surface", values("shared_decoded", 100.0))]),
+         [charts.Bars("pattern", values("decode_rate", 100.0)),
+          charts.Bars("surface", values("shared_decoded", 100.0))]),
         ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
          [charts.Bars("epipolar", values("epipolar_px"))]),
         ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
