@@ -1,7 +1,7 @@
 """How much of the surface that other frames show did a frame decode?
 
 Of the visible pattern, a part may lie on a table or a wall far behind the object, too fine or too blurred to be
-decoded. That says nothing against the frame. What the others decoded does: it is known to be there, and to be decodable.
+decoded. That says nothing against the frame. What the others decoded does: it is there, and can be decoded.
 """
 
 from collections.abc import Iterable, Sequence
