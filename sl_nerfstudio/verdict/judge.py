@@ -68,7 +68,7 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         yield Reason("poor", _known_only(lost, largest))
     loose = [f for f in facts.in_scan if good < (f.sigma_rotation_deg or 0.0) <= largest]
     if loose and facts.adjusted:  # without the adjustment, it is so in every frame of any scan
-        yield Reason(_share_band(len(loose), len(facts.in_scan), settings), _known_only(loose, good))
+        yield Reason("acceptable", _known_only(loose, good))
     names = [f.name for f in facts.in_scan if f.undecided and f not in lost + loose]
     if names:
         band = _share_band(len(names), len(facts.in_scan), settings)

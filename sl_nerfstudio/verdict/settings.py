@@ -59,8 +59,8 @@ class VerdictSettings:
     """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
     pose could explain the majority."""
     good_sigma_deg: float = 1.0
-    """Standard deviation of a frame's rotation, in degrees, up to which a scan is good: by more than that, edges of the
-    object are smeared by a hundredth of its size."""
+    """Standard deviation of a frame's rotation, in degrees, up to which a scan is good, and beyond which it is
+    acceptable: edges of the object may be smeared by a hundredth of its size."""
     largest_sigma_deg: float = 3.0
     """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong and the scan is
     poor."""

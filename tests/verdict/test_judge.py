@@ -34,7 +34,6 @@ def test_a_scan_without_any_doubt_is_good():
     [
         ({"undecided": True}, "acceptable", "f03: the pose is undecided; along the surface, others fit as well"),
         ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
-        ({"sigma_rotation_deg": 1.3}, "acceptable", "f03: rotation known only to 1.3 degrees (1 sigma of the least"),
         ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
         (
             {"decoded_share": 0.9, "shared_decoded": 0.3},
@@ -56,6 +55,14 @@ def test_one_frame_is_enough_and_many_make_it_poor(change, one, words):
     assert verdict.band == one
     assert any(words in reason for reason in verdict.reasons)
     assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
+
+
+@pytest.mark.parametrize("frames", [1, N])
+def test_rotations_known_to_a_degree_are_acceptable_however_many(frames):
+    verdict = judge_scan(scan({k: {"sigma_rotation_deg": 1.3 + 0.1 * k} for k in range(frames)}))
+    worst = 1.3 + 0.1 * (frames - 1)
+    assert verdict.band == "acceptable" and len(verdict.reasons) == 1
+    assert f"rotation known only to {worst:.2g} degrees (1 sigma of the least certain; at most 1)" in verdict.reasons[0]
 
 
 def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
