@@ -37,8 +37,7 @@ def cross_frame_agreement(
     """
     s = settings or CrossFrameSettings()
     generator = torch.Generator().manual_seed(0)
-    per_frame = max(s.least_pixels_per_frame, min(s.pixels_per_frame, s.most_pixels // rig.frames))
-    anchors = place_anchors(rig, maps, per_frame, generator)
+    anchors = place_anchors(rig, maps, s.pixels_of_each(rig.frames), generator)
     most = rig.frames if rig.frames <= s.compared_frames else s.partners
     together = partners(rig, anchors, maps, most, s.least_cosine, generator)
     rows = observe(rig, anchors, maps, rig.frames, float("inf"), s.least_cosine, generator, together)

@@ -45,6 +45,10 @@ class CrossFrameSettings:
     contradicting_excess: float = 2.5
     """Residual of a pair relative to that reference, beyond which the two frames contradict each other."""
 
+    def pixels_of_each(self, frames: int) -> int:
+        """Decoded pixels of each of so many frames that are looked up."""
+        return max(self.least_pixels_per_frame, min(self.pixels_per_frame, self.most_pixels // frames))
+
 
 @dataclass(frozen=True)
 class VerdictSettings:

@@ -8,17 +8,16 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32
 from numpy import ndarray
-from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.observations import place_anchors
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors
 from sl_nerfstudio.bundle_adjustment.rig import Rig
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.devices import Device, project
-from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.rays import world_pixels
+from sl_nerfstudio.geometry.se3 import rotate, transform
 from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan.types import Scan
 from sl_nerfstudio.threads import one_library_thread
@@ -53,34 +52,17 @@ def decoded_shares(
     s = settings or CrossFrameSettings()
     maps = CoordinateMaps.of(torch.from_numpy(image) for image in coords)
     rig = Rig.of(cameras, projector, poses, Similarity.identity())
-    per_frame = max(s.least_pixels_per_frame, min(s.pixels_per_frame, s.most_pixels // rig.frames))
-    anchors = place_anchors(rig, maps, per_frame, torch.Generator().manual_seed(0))
+    anchors = place_anchors(rig, maps, s.pixels_of_each(rig.frames), torch.Generator().manual_seed(0))
     T = rig.T_world_camera[anchors.frame]
-    p_world, normal = transform(T, anchors.depth[:, None] * anchors.d_camera), rotate(T, anchors.normal)
+    p_world = transform(T, anchors.depth[:, None] * anchors.d_camera).numpy()
+    normal, source = rotate(T, anchors.normal).numpy(), anchors.frame.numpy()
     shares: list[float | None] = []
     for k, mask in enumerate(masks):
+        uv, inside = world_pixels(cameras[k], poses.T_world_camera[k], p_world)
+        sight = poses.T_world_camera[k, :3, 3] - p_world
+        facing = (sight * normal).sum(1) > s.least_cosine * np.linalg.norm(sight, axis=1)
+        column, row = uv[inside & facing & (source != k)].astype(np.int64).T
         decoded = maps.image(k).isfinite().all(-1).numpy()
-        row, column = _pixels(rig, k, anchors, p_world, normal, s.least_cosine, decoded.shape)
         found = decoded[row, column][(mask | decoded)[row, column]]
         shares.append(float(found.mean()) if len(found) >= s.fewest_judged else None)
     return shares
-
-
-def _pixels(
-    rig: Rig,
-    viewer: int,
-    anchors: Anchors,
-    p_world: Float[Tensor, "n 3"],
-    normal_world: Float[Tensor, "n 3"],
-    least_cosine: float,
-    size: tuple[int, ...],
-) -> tuple[ndarray, ndarray]:
-    """Rows and columns of the points of other frames in an image of (height, width), of surface that faces it."""
-    T = inverse(rig.T_world_camera[viewer])
-    p, normal = transform(T, p_world), rotate(T, normal_world)
-    facing = -(normal * p).sum(-1) > least_cosine * p.norm(dim=-1)
-    uv, in_front = project(rig.camera[torch.full_like(anchors.frame, viewer)], p)
-    pixel = uv.floor()
-    inside = (pixel >= 0).all(-1) & (pixel < torch.tensor([size[1], size[0]])).all(-1)
-    column, row = pixel[facing & in_front & inside & (anchors.frame != viewer)].long().numpy().T
-    return np.asarray(row), np.asarray(column)
