@@ -37,7 +37,7 @@ def camera_depth_by_pose(
     depth = (N * n).sum(-1, keepdims=True) * over
     by_p = over * (cross(n, np.broadcast_to(t, p.shape)) + cross(N - 2 * depth * n, d_camera))
     by_t = over * cross(p, n)
-    by_b = by_t @ np.cross(direction_basis(t), t, axisa=0, axisb=0).T
+    by_b = by_t @ (direction_basis(t)[:, ::-1] * [-1, 1])
     return np.concatenate([cross(p, by_p), by_b], 1)
 
 

@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.relative_pose.epipolar_fit import distinct
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
+from sl_nerfstudio.relative_pose.sampson import cross
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings, Separation
 
 
@@ -37,9 +38,9 @@ def five_point_starts(
 def in_front(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs) -> Bool[ndarray, "n"]:
     """Whether the two rays of each pair are nearest to each other in front of both devices."""
     d_p = rays.d_projector @ R.T
-    normal = np.cross(rays.d_camera, d_p)
-    camera = (np.cross(t, d_p) * normal).sum(-1)
-    projector = (np.cross(t, rays.d_camera) * normal).sum(-1)
+    normal = cross(rays.d_camera, d_p)
+    camera = (cross(np.broadcast_to(t, d_p.shape), d_p) * normal).sum(-1)
+    projector = (cross(np.broadcast_to(t, d_p.shape), rays.d_camera) * normal).sum(-1)
     return (camera > 0) & (projector > 0)
 
 

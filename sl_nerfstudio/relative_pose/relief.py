@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.geometry.robust import geman_mcclure_weight
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, DegeneracyLimits
@@ -53,10 +54,24 @@ def _cross_row(d: Float64[ndarray, "n 3"], axis: int) -> Float64[ndarray, "n 3"]
 
 def _error_px(predicted: Float64[ndarray, "n 3"], rays: RayPairs) -> Float64[ndarray, "n"]:
     """Distance of predicted projector rays from the decoded ones, in projector pixels."""
-    X = rays.d_projector_by_uv
-    inverse = np.linalg.inv(np.einsum("nic,nid->ncd", X, X))
-    gap = np.einsum("nic,ni->nc", X, predicted - rays.d_projector)
-    return np.sqrt((np.einsum("ncd,nd->nc", inverse, gap) ** 2).sum(-1))
+    out = np.empty(len(rays))
+    _gaps_px(predicted, rays.d_projector, rays.d_projector_by_uv, out)
+    return out
+
+
+@compiled
+def _gaps_px(predicted, decoded, by_uv, out):
+    """By least squares: the pixels whose change explains the gap between two rays best."""
+    for n in range(len(out)):
+        aa, ab, bb, a, b = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            by_u, by_v, gap = by_uv[n, i, 0], by_uv[n, i, 1], predicted[n, i] - decoded[n, i]
+            aa += by_u * by_u
+            ab += by_u * by_v
+            bb += by_v * by_v
+            a += by_u * gap
+            b += by_v * gap
+        out[n] = np.hypot(bb * a - ab * b, aa * b - ab * a) / (aa * bb - ab * ab)
 
 
 def _trimmed_rms(r: Float64[ndarray, "n"], share: float) -> float:
