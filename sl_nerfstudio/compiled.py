@@ -9,6 +9,9 @@ import numba
 
 from sl_nerfstudio.threads import parallel, split, threads
 
+_njit: Any = numba.njit  # its overloads do not accept options in a set
+_ANY_ORDER = {"contract", "reassoc", "nsz"}
+
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled for one thread; without the run-time type checks that tests wrap it in.
@@ -17,6 +20,11 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     working on several numbers at once.
     """
     return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
+def compiled_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function compiled for one thread, with sums in any order: so several numbers are added at once."""
+    return _njit(cache=True, nogil=True, error_model="numpy", fastmath=_ANY_ORDER)(inspect.unwrap(function))
 
 
 def compiled_range(function: Callable[..., None]) -> Callable[..., None]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from sl_nerfstudio.geometry.se3 import hat
 from sl_nerfstudio.geometry.similarity import Similarity
 from tests.kinds import NotComparable, kinds_for
-from tests.type_checks import checked
+from tests.type_checks import EVERY, checked
 
 
 @checked
@@ -55,10 +55,10 @@ def test_the_package_is_checked():
     for _ in range(2):
         assert Similarity(1.0, T[:3, :3], T[:3, 3]).scale == 1
         np.testing.assert_array_equal(hat(torch.zeros(2, 3)), torch.zeros(2, 3, 3))
-        with pytest.raises(TypeCheckError):
-            Similarity(1.0, T, T[:3, 3])
-        with pytest.raises(TypeCheckError):
-            hat(torch.zeros(2, 4))
+        for wrong in (lambda: Similarity(1.0, T, T[:3, 3]), lambda: hat(torch.zeros(2, 4))):
+            with pytest.raises(TypeCheckError):
+                for _ in range(EVERY):  # other tests of this process may have called them often
+                    wrong()
 
 
 def test_what_was_right_stays_right_and_is_returned():
@@ -132,6 +132,18 @@ def test_closures_are_checked_each_with_its_own_values():
         made(np.arange(3))(np.ones(2))
     with pytest.raises(TypeCheckError):
         made(np.ones(2))(np.ones(2))
+
+
+def test_of_many_calls_some_are_checked():
+    @checked
+    def give(x: int) -> int:
+        return x
+
+    for _ in range(1000):
+        give(1)
+    with pytest.raises(TypeCheckError):
+        for _ in range(EVERY):
+            give("1")
 
 
 def test_errors_of_the_function_are_its_own():

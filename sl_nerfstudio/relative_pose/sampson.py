@@ -47,8 +47,8 @@ def sampson_jacobian(
     """Residuals and their derivatives by (w, b).
 
     For a vector q in projector axes, q . m changes with w by R q x n and with b by (R q x d) A, where m is the normal n
-    in projector axes and A = t x B = (B2, -B1). The residual a / g has two such products: a, and each part of h, of which g is the
-    length; so its change is that of one vector p.
+    in projector axes and A = t x B = (B2, -B1). The residual a / g has two such products: a, and each part of h, of
+    which g is the length; so its change is that of one vector p.
     """
     r, J = np.empty(len(rays)), np.empty((len(rays), 5))
     A = direction_basis(t)[:, ::-1] * [1, -1]
@@ -68,7 +68,7 @@ def _plane(R, t, d):
 
 @compiled
 def _distance(mx, my, mz, e, by):
-    """Residual of a projector ray `e` that changes by `by` with its pixel; its gradient's direction, and over its length."""
+    """Residual of a projector ray `e` whose derivative is `by`; direction of its gradient, and one over its length."""
     a = mx * e[0] + my * e[1] + mz * e[2]
     h = mx * by[0, 0] + my * by[1, 0] + mz * by[2, 0]
     k = mx * by[0, 1] + my * by[1, 1] + mz * by[2, 1]

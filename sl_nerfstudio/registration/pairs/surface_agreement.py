@@ -9,21 +9,17 @@ c: `p <- c + exp(l) exp(w) (p - c) + v`.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.compiled import compiled, compiled_range
-from sl_nerfstudio.geometry.devices.models import pixel_of
-from sl_nerfstudio.geometry.robust import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.pairs.agreement_loops import agreement_sums
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surface_map import SurfaceMap
-
-_kernel_weight = compiled(geman_mcclure_weight)
-_kernel_cost = compiled(geman_mcclure_cost)
 
 
 @dataclass(frozen=True)
@@ -34,6 +30,11 @@ class Side:
     points: Float64[ndarray, "n 3"]
     normals: Float64[ndarray, "n 3"]
     sigma: Float64[ndarray, "n"]  # along the normals
+
+    @cached_property
+    def rows(self) -> Float64[ndarray, "6 n"]:
+        """Points and normals, for compiled loops."""
+        return np.ascontiguousarray(np.concatenate([self.points, self.normals], 1).T)
 
     @staticmethod
     def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
@@ -104,10 +105,10 @@ def agreement(
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
-        _sums(
-            len(scale), mover.points, mover.normals, mover.sigma, scale, R, t, bool(reverse),
-            m.point, m.normal, m.sigma, m.valid, m.model_code, m.parameters, target.map.centroid, tolerances,
-            settings.least_facing_cosine, settings.kernel_cutoff, H, g, counts[reverse],
+        agreement_sums(
+            len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid, m.model_code,
+            m.parameters, target.map.centroid, tolerances, settings.least_facing_cosine, settings.kernel_cutoff,
+            H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
     squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
@@ -125,82 +126,3 @@ def agreement_at(
     """How two frames agree under one similarity."""
     source, target = (Side.sampled(m, settings.coarse_points, rng) for m in maps)
     return agreement(source, target, Hypotheses.of(S_target_source), tolerance, tolerance, settings.agreement)
-
-
-@compiled_range
-def _sums(
-    first, last, points, normals, sigma, scale, R, t, reverse, map_point, map_normal, map_sigma, valid, code, camera, c,
-    tolerances, least_facing, cutoff, H, g, counts
-):  # fmt: skip
-    """Adds to H, g and counts (agreeing, in front, behind, squares, cost); `reverse`: points are the target's."""
-    h, w = valid.shape
-    hidden = tolerances[2]
-    for k in range(first, last):
-        s = scale[k]
-        J = np.zeros(7)
-        for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            a, b, d = normals[n, 0], normals[n, 1], normals[n, 2]
-            if reverse:
-                x, y, z = (x - t[k, 0]) / s, (y - t[k, 1]) / s, (z - t[k, 2]) / s
-                X = R[k, 0, 0] * x + R[k, 1, 0] * y + R[k, 2, 0] * z
-                Y = R[k, 0, 1] * x + R[k, 1, 1] * y + R[k, 2, 1] * z
-                Z = R[k, 0, 2] * x + R[k, 1, 2] * y + R[k, 2, 2] * z
-                A = R[k, 0, 0] * a + R[k, 1, 0] * b + R[k, 2, 0] * d
-                B = R[k, 0, 1] * a + R[k, 1, 1] * b + R[k, 2, 1] * d
-                C = R[k, 0, 2] * a + R[k, 1, 2] * b + R[k, 2, 2] * d
-            else:
-                X = s * (R[k, 0, 0] * x + R[k, 0, 1] * y + R[k, 0, 2] * z) + t[k, 0]
-                Y = s * (R[k, 1, 0] * x + R[k, 1, 1] * y + R[k, 1, 2] * z) + t[k, 1]
-                Z = s * (R[k, 2, 0] * x + R[k, 2, 1] * y + R[k, 2, 2] * z) + t[k, 2]
-                A = R[k, 0, 0] * a + R[k, 0, 1] * b + R[k, 0, 2] * d
-                B = R[k, 1, 0] * a + R[k, 1, 1] * b + R[k, 1, 2] * d
-                C = R[k, 2, 0] * a + R[k, 2, 1] * b + R[k, 2, 2] * d
-            if A * X + B * Y + C * Z > 0:  # turned away from the camera
-                continue
-            column, row, in_front = pixel_of(code, X, Y, Z, camera)
-            if not (in_front and column >= 0 and row >= 0 and column < w and row < h):
-                continue
-            i, j = int(row), int(column)
-            if not valid[i, j]:
-                continue
-            na, nb, nc = map_normal[i, j, 0], map_normal[i, j, 1], map_normal[i, j, 2]
-            r = na * (X - map_point[i, j, 0]) + nb * (Y - map_point[i, j, 1]) + nc * (Z - map_point[i, j, 2])
-            if reverse:
-                r *= s
-                spread = np.hypot(sigma[n], s * map_sigma[i, j])
-            else:
-                spread = np.hypot(s * sigma[n], map_sigma[i, j])
-            tau, width = max(tolerances[0], tolerances[3] * spread), max(tolerances[1], tolerances[4] * spread)
-            facing = na * A + nb * B + nc * C
-            if abs(r) < tau and facing > least_facing:
-                counts[k, 0] += 1
-                counts[k, 3] += (r / spread) ** 2
-            elif r > tau:
-                counts[k, 1] += 1
-            elif r > -hidden:
-                counts[k, 2] += 1
-            if r > -hidden:
-                counts[k, 4] += _kernel_cost((r / width) ** 2)
-            if facing < least_facing or abs(r) > cutoff * width:
-                continue
-            weight = _kernel_weight((r / width) ** 2) * facing
-            if reverse:  # the normal, in the target's axes and against the motion of the source
-                ma = -(R[k, 0, 0] * na + R[k, 0, 1] * nb + R[k, 0, 2] * nc)
-                mb = -(R[k, 1, 0] * na + R[k, 1, 1] * nb + R[k, 1, 2] * nc)
-                mc = -(R[k, 2, 0] * na + R[k, 2, 1] * nb + R[k, 2, 2] * nc)
-                X, Y, Z = points[n, 0], points[n, 1], points[n, 2]
-            else:
-                ma, mb, mc = na, nb, nc
-            X, Y, Z = X - c[0], Y - c[1], Z - c[2]
-            J[0], J[1], J[2] = ma, mb, mc
-            J[3], J[4], J[5] = Y * mc - Z * mb, Z * ma - X * mc, X * mb - Y * ma
-            J[6] = ma * X + mb * Y + mc * Z
-            for p in range(7):
-                wp = weight * J[p]
-                g[k, p] += wp * r
-                for m in range(p + 1):
-                    H[k, p, m] += wp * J[m]
-        for p in range(7):
-            for m in range(p):
-                H[k, m, p] = H[k, p, m]

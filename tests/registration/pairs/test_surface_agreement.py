@@ -16,7 +16,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement, agreement_at
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import SurfaceMap, View, build_surface_map
+from sl_nerfstudio.registration.surface_map import SurfaceMap, View, build_surface_map, tangent_planes
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
 
@@ -61,7 +61,8 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     sigma = rng.uniform(0.005, 0.03, valid.shape)
     even = np.ones(int(valid.sum()))
     tone = np.full(valid.shape, np.nan, dtype=np.float32)
-    return SurfaceMap(camera, point, normal, sigma, valid, tone, even, centroid, radius, (View(centroid, radius),))
+    plane = tangent_planes(point, normal, sigma)
+    return SurfaceMap(camera, point, plane, valid, tone, even, centroid, radius, (View(centroid, radius),))
 
 
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
@@ -224,5 +225,5 @@ def test_agreement_does_not_depend_on_the_unit_of_either_frame(maps, a, b, by_le
 
 
 def in_unit(m: SurfaceMap, factor: float) -> SurfaceMap:
-    lengths = {key: getattr(m, key) * factor for key in ("point", "sigma", "centroid", "radius")}
-    return replace(m, **lengths)
+    lengths = {key: getattr(m, key) * factor for key in ("point", "centroid", "radius")}
+    return replace(m, plane=tangent_planes(m.point * factor, m.normal, m.sigma * factor), **lengths)
