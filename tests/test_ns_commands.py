@@ -47,6 +47,8 @@ SMALL = [
     "32",
     "--pipeline.model.adjustment.other-minima.searches",
     "0",
+    "--pipeline.model.adjustment.hops.most",
+    "0",
     "--pipeline.datamanager.train-num-rays-per-batch",
     "256",
     "--logging.steps-per-log",

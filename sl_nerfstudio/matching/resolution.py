@@ -14,7 +14,10 @@ _FEWEST = 100  # pixels from which a size is told
 def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float | None:
     """Pixels of the image in a period of the pattern, median; None where hardly anything is decoded."""
     by_x, by_y = np.diff(coords[:-1], axis=1), np.diff(coords[:, :-1], axis=0)
-    smooth = (np.abs(by_x).max(-1) < _TEAR * period) & (np.abs(by_y).max(-1) < _TEAR * period)
+    smooth = np.ones(by_x.shape[:2], dtype=bool)
+    for step in (by_x, by_y):
+        for part in (step[..., 0], step[..., 1]):  # numpy takes the larger of two far more slowly
+            smooth &= np.abs(part) < _TEAR * period
     area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])[smooth]
     area = area[area > 0]
     return period / float(np.sqrt(np.median(area))) if len(area) >= _FEWEST else None

@@ -12,7 +12,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import with_known_length
 from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, OtherMinimaSettings
+from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.dataparser.fingerprint import scan_fingerprint
 from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
@@ -55,7 +55,11 @@ pytestmark = pytest.mark.long
 FRAMES, SIZE, MM = 6, 80, 50.0
 S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
 QUICK = AdjustmentSettings(
-    anchors_per_frame=80, frames_per_anchor=3, max_iterations=14, other_minima=OtherMinimaSettings(searches=0)
+    anchors_per_frame=80,
+    frames_per_anchor=3,
+    max_iterations=14,
+    hops=HopSettings(most=0),
+    other_minima=OtherMinimaSettings(searches=0),
 )
 
 
