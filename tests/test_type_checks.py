@@ -50,15 +50,17 @@ def length(of: tuple[int, ...] | Sequence[int], names: tuple[str, int] = ("", 0)
 def of_size(n: int, x: Float[ndarray, "{n} 2"]) -> None: ...
 
 
-def test_the_package_is_checked():
+def test_the_package_is_checked(monkeypatch):
     T = np.eye(4)
+    for function in (Similarity.__init__, hat):  # other tests of this process may have called them often
+        monkeypatch.setattr(function.checks, "calls", 0)
     for _ in range(2):
         assert Similarity(1.0, T[:3, :3], T[:3, 3]).scale == 1
         np.testing.assert_array_equal(hat(torch.zeros(2, 3)), torch.zeros(2, 3, 3))
-        for wrong in (lambda: Similarity(1.0, T, T[:3, 3]), lambda: hat(torch.zeros(2, 4))):
-            with pytest.raises(TypeCheckError):
-                for _ in range(EVERY):  # other tests of this process may have called them often
-                    wrong()
+        with pytest.raises(TypeCheckError):
+            Similarity(1.0, T, T[:3, 3])
+        with pytest.raises(TypeCheckError):
+            hat(torch.zeros(2, 4))
 
 
 def test_what_was_right_stays_right_and_is_returned():
