@@ -28,12 +28,10 @@ def agreement_sums(
     n = points.shape[1]
     mapped, place, some, rows = np.empty((6, n)), np.empty(n), np.empty(n, np.int64), np.empty((9, n))
     flat_plane, flat_valid = plane.reshape(h * w, 5), valid.reshape(h * w)
-    M, shift = np.empty((3, 3)), np.empty(3)
+    M, shift, turn = np.empty((3, 3)), np.empty(3), np.eye(3)
     for k in range(first, last):
         s = scale[k]
-        for i in range(3):
-            for j in range(3):
-                M[i, j] = R[k, j, i] if reverse else R[k, i, j]
+        M[:] = R[k].T if reverse else R[k]
         for i in range(3):
             shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
         _map(points, M, 1 / s if reverse else s, shift, code, camera, h, w, mapped, place)
@@ -43,12 +41,8 @@ def agreement_sums(
             mapped, sigma, place, flat_plane, scales, tolerances, least_facing, cutoff, some, count, rows, counts[k]
         )
         if reverse:  # the normal, in the target's axes and against the motion of the source
-            for i in range(3):
-                for j in range(3):
-                    M[i, j] = -R[k, i, j]
-            _derive(points, M, c, some, count, rows)
-        else:
-            _derive(mapped, np.eye(3), c, some, count, rows)
+            turn[:] = -R[k]
+        _derive(points if reverse else mapped, turn, c, some, count, rows)
         _add_normal_equations(rows, count, H[k], g[k])
 
 
