@@ -10,7 +10,8 @@ import numba
 from sl_nerfstudio.threads import parallel, split, threads
 
 _njit: Any = numba.njit  # its overloads do not accept options in a set
-_ANY_ORDER = {"contract", "reassoc", "nsz"}
+ANY_ORDER = {"contract", "reassoc", "nsz"}
+"""For numba's `fastmath`: fused multiply-add, and sums in any order; infinity and NaN stay what they are."""
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -24,7 +25,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def compiled_sums(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled for one thread, with sums in any order: so several numbers are added at once."""
-    return _njit(cache=True, nogil=True, error_model="numpy", fastmath=_ANY_ORDER)(inspect.unwrap(function))
+    return _njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)(inspect.unwrap(function))
 
 
 def compiled_range(function: Callable[..., None]) -> Callable[..., None]:

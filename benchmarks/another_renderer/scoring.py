@@ -27,8 +27,8 @@ class FrameError:
     projector_deg: float
     shift: float  # median over its points, share of the object's size
     camera_deg_by_cameras: float  # after alignment by camera poses
-    rotation_sigma: float
-    translation_sigma: float
+    rotation_sigma: float  # of the frame as a whole, after alignment by points
+    translation_sigma: float  # of the frame as a whole, at the middle of the object
     relative_rotation_sigma: float
     relative_translation_sigma: float
 
@@ -102,8 +102,8 @@ def score(scan: Path, captures: Path) -> Score:
             rows[name],
             document,
             truth[name],
-            S,
-            C,
+            (S, C),
+            thing.bounds.mean(0),
             float(np.median(np.linalg.norm(S.points(q) - p, axis=1)) / size),
         )
         for name, q, p in zip(judged, found, true, strict=True)
@@ -131,16 +131,17 @@ def _error(
     row: dict[str, Any],
     document: dict[str, Any],
     true: TrueFrame,
-    S: Similarity,
-    C: Similarity,
+    alignments: tuple[Similarity, Similarity],
+    middle: ndarray,
     shift: float,
 ) -> FrameError:
     T_camera, T_projector = _poses(row)
     sigma = row.get("sl_pose_sigma", document.get("sl_pose_sigma", {}))
-    by_points_, by_cameras_ = S.pose(T_camera), C.pose(T_camera)
-    turn = angle_deg(true.T_camera[:3, :3].T @ by_points_[:3, :3])
-    other = angle_deg(true.T_camera[:3, :3].T @ by_cameras_[:3, :3])
-    moved = float(np.linalg.norm(by_cameras_[:3, 3] - true.T_camera[:3, 3]))
+    S, C = alignments
+    turn = angle_deg(true.T_camera[:3, :3].T @ S.pose(T_camera)[:3, :3])
+    other = angle_deg(true.T_camera[:3, :3].T @ C.pose(T_camera)[:3, :3])
+    motion = S.pose(T_camera) @ np.linalg.inv(true.T_camera)
+    moved = float(np.linalg.norm(motion[:3, :3] @ middle + motion[:3, 3] - middle))
     relative, wanted = (np.linalg.inv(a) @ b for a, b in ((T_camera, T_projector), (true.T_camera, true.T_projector)))
 
     def over(error: float, stated: str, scale: float = 1.0) -> float:
@@ -148,9 +149,9 @@ def _error(
 
     return FrameError(
         name, turn, angle_deg(true.T_projector[:3, :3].T @ S.R @ T_projector[:3, :3]), shift, other,
-        over(other, "camera_rotation_deg"), over(moved, "camera_translation", C.s),
+        over(turn, "camera_rotation_deg"), over(moved, "camera_translation", S.s),
         over(angle_deg(wanted[:3, :3].T @ relative[:3, :3]), "relative_rotation_deg"),
-        over(float(np.linalg.norm(C.s * relative[:3, 3] - wanted[:3, 3])), "relative_translation", C.s),
+        over(float(np.linalg.norm(S.s * relative[:3, 3] - wanted[:3, 3])), "relative_translation", S.s),
     )  # fmt: skip
 
 

@@ -80,6 +80,16 @@ def test_frames_that_are_turned_about_the_object_are_wrong_and_no_others(capture
     assert off["shot_002"].rotation_sigma == pytest.approx(angle / np.sqrt(3) / 0.1, rel=0.01)
     assert off["shot_002"].relative_rotation_sigma == pytest.approx(0, abs=1e-3)
     assert off["shot_000"].translation_sigma < 0.01
+    assert off["shot_002"].translation_sigma < 0.01  # it turns about the middle of the object, which stays where it is
+
+
+def test_a_shift_of_a_frame_is_judged_by_what_is_stated_for_it(captures):
+    shift = np.eye(4)
+    shift[:3, 3] = (3.0, -2.0, 1.0)
+    found = written(captures, lambda k, T: shift @ T if k == 4 else T)
+    off = found.errors[4]
+    assert off.right and off.rotation_sigma < 0.01
+    assert off.translation_sigma == pytest.approx(np.sqrt(14) * MOTION.s / np.sqrt(3) / 0.01, rel=0.01)
 
 
 def test_alignments_are_not_moved_by_a_third_of_the_frames():

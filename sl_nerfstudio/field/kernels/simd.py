@@ -18,6 +18,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
 
+from sl_nerfstudio.compiled import ANY_ORDER
 from sl_nerfstudio.field import hash_grid
 
 intrinsic: Any = _intrinsic  # callers omit the typing context, which type checkers cannot know
@@ -30,7 +31,7 @@ WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 
 
 _njit: Any = njit  # its overloads do not accept options in a dictionary
-_OPTIONS = {"nogil": True, "fastmath": {"contract", "reassoc", "nsz"}}
+_OPTIONS = {"nogil": True, "fastmath": ANY_ORDER}
 
 
 def part(function: Callable[..., Any]) -> Any:

@@ -1,6 +1,7 @@
 """Scenes by name, and from mesh files."""
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def make_scene(name: str, file_unit: float = 1.0) -> Scene:
     Raises UserError for a name that is neither.
     """
     if name in BUILT_IN:
-        return BUILT_IN[name]()
+        return _built_in(name)
     path = Path(name)
     if path.suffix.lower() not in MESH_FORMATS:
         raise UserError(
@@ -51,6 +52,16 @@ def make_scene(name: str, file_unit: float = 1.0) -> Scene:
             f"nor a mesh file ({' '.join(MESH_FORMATS)})"
         )
     return _read_mesh(path, file_unit)
+
+
+@cache
+def _built_in(name: str) -> Scene:
+    """Meshed once in a process: of the finest that takes seconds. Nobody may write to it."""
+    scene = BUILT_IN[name]()
+    for values in (scene.vertices, scene.faces, scene.vertex_normals):
+        if values is not None:
+            values.flags.writeable = False
+    return scene
 
 
 def _read_mesh(path: Path, file_unit: float) -> Scene:
