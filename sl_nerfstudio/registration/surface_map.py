@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled_range
-from sl_nerfstudio.geometry.devices import PARAMETERS, Device
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.plane_fit import solve_plane
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, reliable_points
@@ -51,7 +51,7 @@ class SurfaceMap:
     @property
     def parameters(self) -> Float64[ndarray, "8"]:
         """PARAMETERS of the map's camera, for compiled loops."""
-        return np.array([getattr(self.camera, key) for key in PARAMETERS])
+        return self.camera.parameters
 
     @property
     def model_code(self) -> int:

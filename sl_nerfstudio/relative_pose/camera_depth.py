@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.relative_pose.sampson import cross, direction_basis
+from sl_nerfstudio.relative_pose.sampson import direction_basis
 
 
 def camera_depth(
@@ -35,10 +35,10 @@ def camera_depth_by_pose(
     p, n, N = _products(R, t, d_camera, d_projector)
     over = 1 / (n * n).sum(-1, keepdims=True).clip(1e-300)
     depth = (N * n).sum(-1, keepdims=True) * over
-    by_p = over * (cross(n, np.broadcast_to(t, p.shape)) + cross(N - 2 * depth * n, d_camera))
-    by_t = over * cross(p, n)
+    by_p = over * (_cross(n, np.broadcast_to(t, p.shape)) + _cross(N - 2 * depth * n, d_camera))
+    by_t = over * _cross(p, n)
     by_b = by_t @ (direction_basis(t)[:, ::-1] * [-1, 1])
-    return np.concatenate([cross(p, by_p), by_b], 1)
+    return np.concatenate([_cross(p, by_p), by_b], 1)
 
 
 def _products(
@@ -49,4 +49,10 @@ def _products(
 ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
     """The projector's rays p in camera axes, d x p and t x p."""
     p = d_projector @ R.T
-    return p, cross(d_camera, p), cross(np.broadcast_to(t, p.shape), p)
+    return p, _cross(d_camera, p), _cross(np.broadcast_to(t, p.shape), p)
+
+
+def _cross(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+    """As numpy's, in half of its time, and of a few vectors in a tenth."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.compiled import compiled, compiled_sums
 from sl_nerfstudio.relative_pose.epipolar_fit import distinct
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
-from sl_nerfstudio.relative_pose.sampson import cross
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings, Separation
 
 
@@ -37,11 +37,9 @@ def five_point_starts(
 
 def in_front(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs) -> Bool[ndarray, "n"]:
     """Whether the two rays of each pair are nearest to each other in front of both devices."""
-    d_p = rays.d_projector @ R.T
-    normal = cross(rays.d_camera, d_p)
-    camera = (cross(np.broadcast_to(t, d_p.shape), d_p) * normal).sum(-1)
-    projector = (cross(np.broadcast_to(t, d_p.shape), rays.d_camera) * normal).sum(-1)
-    return (camera > 0) & (projector > 0)
+    front = np.empty(len(rays), dtype=np.bool_)
+    _in_front(np.ascontiguousarray(R), t, rays.d_camera, rays.d_projector, front)
+    return front
 
 
 def essential_matrices(sample: RayPairs) -> list[Float64[ndarray, "3 3"]]:
@@ -65,10 +63,9 @@ def poses_of(E: Float64[ndarray, "3 3"], sample: RayPairs) -> list[tuple[ndarray
 
 def _scores(E: Float64[ndarray, "m 3 3"], rays: RayPairs, outlier_px: float) -> Float64[ndarray, "m"]:
     """Mean of the squared residuals (as `sampson`), each at most 1, for every matrix."""
-    m = np.einsum("ni,kij->knj", rays.d_camera, E)
-    a = np.einsum("knj,nj->kn", m, rays.d_projector)
-    h = np.einsum("knj,njc->knc", m, rays.d_projector_by_uv)
-    return np.minimum(a * a / (h * h).sum(-1).clip(1e-300) / outlier_px**2, 1.0).mean(-1)
+    scores = np.empty(len(E))
+    _score(np.ascontiguousarray(E), rays.d_camera, rays.d_projector, rays.d_projector_by_uv, outlier_px**2, scores)
+    return scores
 
 
 def _distinct_starts(
@@ -83,3 +80,33 @@ def _distinct_starts(
         if len(kept) >= count:
             break
     return kept
+
+
+@compiled_sums
+def _score(E, d_camera, d_projector, by_uv, limit, scores):
+    for k in range(len(E)):
+        M, total = E[k], 0.0
+        for i in range(len(d_camera)):
+            d, e, by = d_camera[i], d_projector[i], by_uv[i]
+            x = d[0] * M[0, 0] + d[1] * M[1, 0] + d[2] * M[2, 0]
+            y = d[0] * M[0, 1] + d[1] * M[1, 1] + d[2] * M[2, 1]
+            z = d[0] * M[0, 2] + d[1] * M[1, 2] + d[2] * M[2, 2]
+            a = x * e[0] + y * e[1] + z * e[2]
+            h, g = x * by[0, 0] + y * by[1, 0] + z * by[2, 0], x * by[0, 1] + y * by[1, 1] + z * by[2, 1]
+            total += min(a * a / max(limit * (h * h + g * g), 1e-300), 1.0)
+        scores[k] = total / len(d_camera)
+
+
+@compiled
+def _in_front(R, t, d_camera, d_projector, front):
+    """By the signs of the depths along both rays where they are nearest to each other."""
+    for i in range(len(front)):
+        a, b, c = d_camera[i, 0], d_camera[i, 1], d_camera[i, 2]
+        u, v, w = d_projector[i, 0], d_projector[i, 1], d_projector[i, 2]
+        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
+        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
+        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+        camera = (t[1] * z - t[2] * y) * p + (t[2] * x - t[0] * z) * q + (t[0] * y - t[1] * x) * r
+        projector = (t[1] * c - t[2] * b) * p + (t[2] * a - t[0] * c) * q + (t[0] * b - t[1] * a) * r
+        front[i] = camera > 0 and projector > 0

@@ -4,11 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian, unproject
+from sl_nerfstudio.compiled import compiled
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
+from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, PatternBlocks
 
@@ -26,7 +28,7 @@ class RayPairs:
         """Number of pairs."""
         return len(self.d_camera)
 
-    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "RayPairs":
+    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"] | slice) -> "RayPairs":
         """Some of the pairs."""
         return RayPairs(self.d_camera[index], self.d_projector[index], self.d_projector_by_uv[index], self.block[index])
 
@@ -64,24 +66,49 @@ def ray_pairs(
 
     A DOE has no ray beyond 90 degrees; coordinates that are not finite have none at all.
     """
-    d_camera = directions(camera, uv_camera)
-    d_projector = directions(projector, uv_projector)
+    d_camera, (d_projector, by_uv) = directions(camera, uv_camera), directions_by_uv(projector, uv_projector)
     usable = np.flatnonzero(np.isfinite(d_camera).all(-1) & np.isfinite(d_projector).all(-1))
-    d_camera, d_projector = d_camera[usable], d_projector[usable]
-    intrinsics = Intrinsics.of(projector, torch.float64)
-    J = project_jacobian(intrinsics, torch.from_numpy(d_projector))
-    # Projection does not depend on the length of a ray, so J d = 0: the right inverse whose columns are perpendicular
-    # to d is the pseudo-inverse.
-    by_uv = J.transpose(-1, -2) @ torch.linalg.inv(J @ J.transpose(-1, -2))
-    return RayPairs(d_camera, d_projector, by_uv.numpy(), blocks_of(uv_projector[usable], projector, blocks)), usable
+    block = blocks_of(uv_projector[usable], projector, blocks)
+    return RayPairs(d_camera[usable], d_projector[usable], by_uv[usable], block), usable
 
 
 def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """Unit directions of pixels in the device's axes; NaN where there is none."""
-    pixels = torch.from_numpy(np.ascontiguousarray(uv, dtype=np.float64))
-    return unproject(Intrinsics.of(device, torch.float64), pixels).numpy()
+    d = np.empty((len(uv), 3))
+    _directions(MODELS[device.model].code, device.parameters, np.ascontiguousarray(uv, dtype=np.float64), d)
+    return d
+
+
+def directions_by_uv(
+    device: Device, uv: Float[ndarray, "n 2"]
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3 2"]]:
+    """Unit directions of pixels, and their derivatives by the pixels; NaN where there is none."""
+    d, by_uv = directions(device, uv), np.empty((len(uv), 3, 2))
+    _by_uv(MODELS[device.model].code, device.parameters, d, by_uv)
+    return d, by_uv
 
 
 def subsample(index: Int64[ndarray, "n"], most: int, rng: np.random.Generator) -> Int64[ndarray, "m"]:
     """All of the indices, or a random choice of `most` of them."""
     return index if len(index) <= most else rng.choice(index, most, replace=False)
+
+
+@compiled
+def _directions(code, parameters, uv, d):
+    for i in range(len(uv)):
+        d[i, 0], d[i, 1], d[i, 2] = ray_of(code, uv[i, 0], uv[i, 1], parameters)
+
+
+@compiled
+def _by_uv(code, parameters, d, by_uv):
+    """Pseudo-inverse of the derivative J of the projection.
+
+    Projection does not depend on the length of a ray: J d = 0, and the columns of J's inverse are perpendicular to d.
+    """
+    for i in range(len(d)):
+        _, _, _, ux, uy, uz, vx, vy, vz = view_of(code, d[i, 0], d[i, 1], d[i, 2], parameters)
+        uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+        inverse = 1 / (uu * vv - uv * uv)
+        a, b, c = vv * inverse, -uv * inverse, uu * inverse
+        by_uv[i, 0, 0], by_uv[i, 1, 0], by_uv[i, 2, 0] = a * ux + b * vx, a * uy + b * vy, a * uz + b * vz
+        by_uv[i, 0, 1], by_uv[i, 1, 1], by_uv[i, 2, 1] = b * ux + c * vx, b * uy + c * vy, b * uz + c * vz

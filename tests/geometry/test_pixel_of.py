@@ -7,14 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import DEVICES, generator, points_in_view, seeds
 
-from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, project, project_jacobian, unproject
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian, unproject
 from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
 from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
 
 
 def compiled_pixel(device: Device, p: np.ndarray) -> tuple[float, float, bool]:
-    parameters = np.array([getattr(device, key) for key in PARAMETERS])
-    return pixel_of(MODELS[device.model].code, *p, parameters)
+    return pixel_of(MODELS[device.model].code, *p, device.parameters)
 
 
 @given(seeds, st.sampled_from(sorted(DEVICES)))
@@ -32,11 +31,10 @@ def test_points_in_view_have_the_same_pixel(seed, name):
 def test_derivatives_are_those_of_tensors_in_view_and_the_rest_everywhere(seed, name):
     device, rng = DEVICES[name], generator(seed)
     intrinsics = Intrinsics.of(device, torch.float64)
-    parameters = np.array([getattr(device, key) for key in PARAMETERS])
     p = torch.cat([points_in_view((8,), rng), torch.randn(8, 3, generator=rng, dtype=torch.float64)])
     (uv, front), J = project(intrinsics, p), project_jacobian(intrinsics, p)
     for k in range(16):
-        u, v, in_front, *derivatives = view_of(MODELS[device.model].code, *p[k].numpy(), parameters)
+        u, v, in_front, *derivatives = view_of(MODELS[device.model].code, *p[k].numpy(), device.parameters)
         assert bool(in_front) is bool(front[k])
         assert [u, v] == pytest.approx(uv[k].tolist(), rel=1e-9, abs=1e-9)
         if in_front:
@@ -46,12 +44,11 @@ def test_derivatives_are_those_of_tensors_in_view_and_the_rest_everywhere(seed, 
 @given(seeds, st.sampled_from(sorted(DEVICES)))
 def test_pixels_have_the_same_rays(seed, name):
     device, rng = DEVICES[name], generator(seed)
-    parameters = np.array([getattr(device, key) for key in PARAMETERS])
     reach = 1.0 if device.k1 else 2.4  # beyond the image, Newton's method need not end anywhere
     uv = torch.rand(8, 2, generator=rng, dtype=torch.float64) * torch.tensor([reach * device.w, reach * device.h])
     rays = unproject(Intrinsics.of(device, torch.float64), uv)  # NaN where a DOE has none
     for k in range(8):
-        found = ray_of(MODELS[device.model].code, *uv[k].tolist(), parameters)
+        found = ray_of(MODELS[device.model].code, *uv[k].tolist(), device.parameters)
         assert found == pytest.approx(rays[k].tolist(), rel=1e-9, abs=1e-9, nan_ok=True)
 
 

@@ -93,6 +93,16 @@ def test_the_direction_s_basis_is_perpendicular_to_it():
         np.testing.assert_allclose(np.c_[B, t].T @ np.c_[B, t], np.eye(3), atol=1e-12)
 
 
+@given(st.integers(0, 10**6), st.floats(-14, 0.5))
+def test_an_increment_rotates_the_projector_and_the_baseline(seed, exponent):
+    rng = np.random.default_rng(seed)
+    R, t, step = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3), rng.normal(size=5) * 10.0**exponent
+    t = t / np.linalg.norm(t)
+    R_moved, t_moved = moved(R, t, step)
+    np.testing.assert_allclose(R_moved, Rotation.from_rotvec(step[:3]).as_matrix() @ R, atol=1e-14)
+    np.testing.assert_allclose(t_moved, Rotation.from_rotvec(direction_basis(t) @ step[3:]).apply(t), atol=1e-14)
+
+
 # ------------------------------------------------------------------ uncertainty
 
 

@@ -56,6 +56,18 @@ def test_of_the_four_poses_of_an_essential_matrix_the_one_in_front_is_kept():
     assert not in_front(R, -t, rays).any()
 
 
+@given(st.integers(0, 10**6))
+def test_a_pair_is_in_front_where_both_depths_are_positive(seed):
+    rng = np.random.default_rng(seed)
+    R, t = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+    d = rng.normal(size=(2, 40, 3))
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+    rays = RayPairs(d[0], d[1], np.zeros((40, 3, 2)), np.arange(40))
+    for n, (a, b) in enumerate(zip(*d, strict=True)):
+        depths = np.linalg.lstsq(np.stack([a, -R @ b], 1), t, rcond=None)[0]
+        assert in_front(R, t, rays)[n] == (depths > 0).all()
+
+
 def test_five_equal_pairs_have_no_solution_or_useless_ones():
     rays = rays_of(view(count=5))
     same = rays.chosen(np.zeros(5, dtype=np.int64))

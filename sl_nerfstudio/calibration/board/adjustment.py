@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.calibration.board.residuals import Sightings, linearised, residuals
-from sl_nerfstudio.calibration.board.rig import BoardRig, FreeIntrinsics, numbers, with_numbers
+from sl_nerfstudio.calibration.board.rig import BoardRig, FreeIntrinsics, with_numbers
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.geometry.se3 import exp_se3
 
@@ -183,7 +183,7 @@ def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Flo
     devices, place = [], 0
     for device, one in zip(rig.devices, free, strict=True):
         columns = one.columns()
-        devices.append(with_numbers(device, numbers(device) + columns @ shared[place : place + columns.shape[1]]))
+        devices.append(with_numbers(device, device.parameters + columns @ shared[place : place + columns.shape[1]]))
         place += columns.shape[1]
     T_projector_camera = rig.T_projector_camera
     if len(free) == 2:

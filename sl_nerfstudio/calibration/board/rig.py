@@ -63,11 +63,6 @@ class BoardRig:
         return replace(self, T_camera_board=self.T_camera_board[list(views)])
 
 
-def numbers(device: Device) -> Float64[ndarray, "8"]:
-    """The PARAMETERS of a device."""
-    return np.array([getattr(device, key) for key in PARAMETERS])
-
-
 def with_numbers(device: Device, values: Float64[ndarray, "8"]) -> Device:
     """A device with other PARAMETERS."""
     return replace(device, **dict(zip(PARAMETERS, map(float, values), strict=True)))

@@ -14,7 +14,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.calibration.board.adjustment import Adjusted, Free, covariance
-from sl_nerfstudio.calibration.board.rig import numbers
 from sl_nerfstudio.calibration.board.selection import LeftOut, ModelScore
 from sl_nerfstudio.geometry.devices import PARAMETERS
 
@@ -39,7 +38,7 @@ def device_sigmas(adjusted: Adjusted, left_out: LeftOut, models: Sequence[ModelS
     formal = formal_sigmas(adjusted.free, adjusted.information)
     out = []
     for k, one in enumerate(formal):
-        fits = np.array([numbers(fit.rig.devices[k]) for fit in left_out.rigs])
+        fits = np.array([fit.rig.devices[k].parameters for fit in left_out.rigs])
         n = len(fits)
         jackknife = np.sqrt((n - 1) / n * ((fits - fits.mean(0)) ** 2).sum(0))
         sigma = np.hypot(np.maximum(one, jackknife), _by_model([score for score in models if score.device == k]))
@@ -52,7 +51,7 @@ def _by_model(scores: Sequence[ModelScore]) -> Float64[ndarray, "8"]:
     chosen = next(score for score in scores if score.chosen)
     fitted = chosen.model.columns().any(1)
     moves = [
-        np.abs(numbers(score.fitted) - numbers(chosen.fitted)) * fitted
+        np.abs(score.fitted.parameters - chosen.fitted.parameters) * fitted
         for score in scores
         if score.costs.mean() <= chosen.costs.mean()
     ]

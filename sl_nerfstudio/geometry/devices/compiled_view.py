@@ -11,6 +11,7 @@ from sl_nerfstudio.geometry.devices.distortion import (
     distortion_jacobian,
 )
 
+_CONVERGED = 1e-12  # last step of Newton's method, normalised coordinates
 _distort, _distortion_jacobian = compiled(distort), compiled(distortion_jacobian)
 _pinhole_in_front, _doe_in_front = compiled(pinhole.in_front), compiled(doe.in_front)
 
@@ -66,7 +67,10 @@ def ray_of(code, u, v, parameters):
             det = a * d - b * b
             if abs(det) < LEAST_DETERMINANT:
                 det = LEAST_DETERMINANT
-            x, y = x - (d * ex - b * ey) / det, y - (a * ey - b * ex) / det
+            dx, dy = (d * ex - b * ey) / det, (a * ey - b * ex) / det
+            x, y = x - dx, y - dy
+            if abs(dx) + abs(dy) < _CONVERGED:  # the next step would be about the square of it
+                break
     if code == 0:
         q = 1 / (x * x + y * y + 1) ** 0.5
         return x * q, -y * q, -q

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
+from numpy import ndarray
 from torch import Tensor
 
 DeviceKind = Literal["OPENCV", "DOE"]
@@ -28,6 +30,11 @@ class Device:
     p1: float = 0.0
     p2: float = 0.0
     model: DeviceKind = "OPENCV"
+
+    @property
+    def parameters(self) -> Float64[ndarray, "8"]:
+        """PARAMETERS, for compiled loops."""
+        return np.array([getattr(self, key) for key in PARAMETERS], dtype=np.float64)
 
     def scaled(self, factor: float) -> "Device":
         """The same device with its image resized by `factor` (no half-pixel shift, because centres are at .5)."""

@@ -13,7 +13,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs
 from sl_nerfstudio.relative_pose.sampson import moved, sampson_jacobian
-from sl_nerfstudio.relative_pose.unknown_projector.matches import Matches, Poses, residuals
+from sl_nerfstudio.relative_pose.unknown_projector.matches import Matches, Poses
 from sl_nerfstudio.relative_pose.unknown_projector.parameters import device_with, values_of
 from sl_nerfstudio.relative_pose.unknown_projector.settings import JointFitSettings
 
@@ -97,13 +97,13 @@ class JointProblem:
         return self._matches.rays(device_with(self._projector, values))
 
     def _noise(self, state: _State, rays: RayPairs) -> float:
-        r = residuals(state.poses, rays, self._matches.frame)
+        r = self._matches.residuals(state.poses, rays)
         return max(MAD_TO_SIGMA * float(np.nanmedian(np.abs(r))), self._s.noise_floor_px)
 
     def _cost(self, state: _State, width: float, rays: RayPairs | None = None) -> float:
         """In units of the squared noise, with the prior."""
         rays = self._rays(state.values) if rays is None else rays
-        r = np.nan_to_num(residuals(state.poses, rays, self._matches.frame), nan=np.inf)
+        r = np.nan_to_num(self._matches.residuals(state.poses, rays), nan=np.inf)
         data = self._s.kernel_sigmas**2 * float(geman_mcclure_cost((r / width).clip(-1e6, 1e6) ** 2).sum())
         return data + float(self._departure(state.values) @ self._departure(state.values))
 
@@ -127,7 +127,7 @@ class JointProblem:
         h, columns = self._s.difference_step, []
         for k in self._free:
             ahead, behind = (
-                residuals(state.poses, self._rays(state.values + sign * h * np.eye(5)[k]), self._matches.frame)
+                self._matches.residuals(state.poses, self._rays(state.values + sign * h * np.eye(5)[k]))
                 for sign in (1, -1)
             )
             columns.append((ahead - behind) / (2 * h))
@@ -141,7 +141,7 @@ class JointProblem:
         weight = np.zeros(len(J_free))
         for k in range(frames):
             part = self._matches.of_frame(k)
-            r, J = sampson_jacobian(state.poses.R[k], state.poses.t[k], rays.chosen(np.arange(part.start, part.stop)))
+            r, J = sampson_jacobian(state.poses.R[k], state.poses.t[k], rays.chosen(part))
             good = np.isfinite(r) & np.isfinite(J).all(-1) & np.isfinite(J_free[part]).all(-1)
             r, J, J_p = (np.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, J, J_free[part]))
             w = np.where(good, geman_mcclure_weight((r / width) ** 2), 0.0)

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project_jacobian
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
-from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, directions
+from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, directions, directions_by_uv
+from sl_nerfstudio.relative_pose.sampson import sampson_of_frames
 from sl_nerfstudio.relative_pose.settings import PatternBlocks
 
 UnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
@@ -66,10 +66,11 @@ class Matches:
 
     def rays(self, projector: Device) -> RayPairs:
         """The rays with a projector; those that have none are NaN."""
-        d = directions(projector, self.uv_projector)
-        J = project_jacobian(Intrinsics.of(projector, torch.float64), torch.from_numpy(np.nan_to_num(d, nan=-1.0)))
-        by_uv = J.transpose(-1, -2) @ torch.linalg.inv(J @ J.transpose(-1, -2))
-        return RayPairs(self.d_camera, d, by_uv.numpy(), self.block)
+        return RayPairs(self.d_camera, *directions_by_uv(projector, self.uv_projector), self.block)
+
+    def residuals(self, poses: "Poses", rays: RayPairs) -> Float64[ndarray, "n"]:
+        """Distances of the coordinates from their epipolar curves, in projector pixels, as in `sampson`."""
+        return sampson_of_frames(poses.R, poses.t, rays, self.frame)
 
 
 @dataclass(frozen=True)
@@ -87,12 +88,3 @@ class Poses:
     def chosen(self, keep: Sequence[int] | Int64[ndarray, "m"]) -> "Poses":
         """Of some frames."""
         return replace(self, R=self.R[keep], t=self.t[keep])
-
-
-def residuals(poses: Poses, rays: RayPairs, frame: Int64[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """Distances of the coordinates from their epipolar curves, in projector pixels, as in `sampson`."""
-    n = np.cross(poses.t[frame], rays.d_camera)
-    m = np.einsum("ni,nij->nj", n, poses.R[frame])
-    a = (m * rays.d_projector).sum(-1)
-    h = np.einsum("ni,nik->nk", m, rays.d_projector_by_uv)
-    return a / np.sqrt((h * h).sum(-1)).clip(1e-300)

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.robust import geman_mcclure_cost
 from sl_nerfstudio.relative_pose.unknown_projector.joint_fit import JointFit, JointProblem, Prior
-from sl_nerfstudio.relative_pose.unknown_projector.matches import Matches, residuals
+from sl_nerfstudio.relative_pose.unknown_projector.matches import Matches
 from sl_nerfstudio.relative_pose.unknown_projector.parameters import K1, LOG_ASPECT, values_of
 from sl_nerfstudio.relative_pose.unknown_projector.settings import UnknownProjectorSettings
 
@@ -63,7 +63,7 @@ def _left_out(
     for k in range(settings.folds):
         kept, left = matches.chosen(fold != k), matches.chosen(fold == k)
         found = JointProblem(kept, first.projector, free, prior, fit).fit(first.poses)
-        r = residuals(found.poses, left.rays(found.projector), left.frame)
+        r = left.residuals(found.poses, left.rays(found.projector))
         out[fold == k] = geman_mcclure_cost((np.nan_to_num(r, nan=1e6) / width).clip(-1e6, 1e6) ** 2)
     return out
 

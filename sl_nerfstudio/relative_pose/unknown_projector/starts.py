@@ -17,7 +17,7 @@ from sl_nerfstudio.relative_pose.unknown_projector.fundamental import (
     pose_of_fundamental,
 )
 from sl_nerfstudio.relative_pose.unknown_projector.joint_fit import JointFit, JointProblem, Prior
-from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches, Matches, Poses, UnitPose, residuals
+from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches, Matches, Poses, UnitPose
 from sl_nerfstudio.relative_pose.unknown_projector.parameters import CX, CY, LOG_FOCAL, device_with
 from sl_nerfstudio.relative_pose.unknown_projector.settings import UnknownProjectorSettings
 
@@ -74,7 +74,7 @@ def _ranking(fits: Sequence[JointFit], matches: Matches, settings: UnknownProjec
     width = settings.fit.kernel_sigmas * min(fit.noise_px for fit in fits)
 
     def cost(fit: JointFit) -> float:
-        r = residuals(fit.poses, matches.rays(fit.projector), matches.frame)
+        r = matches.residuals(fit.poses, matches.rays(fit.projector))
         return float(geman_mcclure_cost((np.nan_to_num(r, nan=1e6) / width).clip(-1e6, 1e6) ** 2).mean())
 
     return cost

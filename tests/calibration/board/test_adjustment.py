@@ -14,7 +14,6 @@ from sl_nerfstudio.calibration.board.rig import (
     BoardRig,
     BoardView,
     FreeIntrinsics,
-    numbers,
     with_numbers,
 )
 from sl_nerfstudio.calibration.board.start import camera_start, projector_start
@@ -58,7 +57,7 @@ def test_exact_corners_give_the_exact_devices_and_poses(camera, projector, free)
     found = solved(scene, free, model)
     for got, true in zip(found.rig.devices, scene.truth.devices, strict=True):
         assert (got.w, got.h, got.model) == (true.w, true.h, true.model)
-        np.testing.assert_allclose(numbers(got), numbers(true), rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(got.parameters, true.parameters, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(found.rig.T_camera_board, scene.truth.T_camera_board, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(found.rig.T_projector_camera, scene.truth.T_projector_camera, rtol=1e-6, atol=1e-6)
 
@@ -67,7 +66,7 @@ def test_the_unit_of_the_board_changes_lengths_alone():
     scene = make_scene(2, count=4, noise=0.1)
     mm, m = (solved(scene, (TERMS[1], TERMS[1]), points=POINTS * unit) for unit in (1.0, 1e-3))
     for one, other in zip(mm.rig.devices, m.rig.devices, strict=True):
-        np.testing.assert_allclose(numbers(other), numbers(one), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(m.rig.T_camera_board[:, :3, 3] * 1e3, mm.rig.T_camera_board[:, :3, 3], rtol=1e-5)
     np.testing.assert_allclose(
         m.rig.T_projector_camera[:3, 3] * 1e3, mm.rig.T_projector_camera[:3, 3], rtol=1e-4, atol=0.01
@@ -104,7 +103,7 @@ def moved(rig: BoardRig, free, x):
     devices, place = [], 0
     for device, one in zip(rig.devices, free, strict=True):
         columns = one.columns()
-        devices.append(with_numbers(device, numbers(device) + columns @ x[place : place + columns.shape[1]]))
+        devices.append(with_numbers(device, device.parameters + columns @ x[place : place + columns.shape[1]]))
         place += columns.shape[1]
     T = exp_se3(torch.from_numpy(x[place : place + 6])).numpy() @ rig.T_projector_camera
     boards = exp_se3(torch.from_numpy(x[place + 6 :].reshape(-1, 6))).numpy() @ rig.T_camera_board
