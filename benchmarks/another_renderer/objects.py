@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 from numpy import ndarray
 
+from benchmarks.another_renderer.more_objects import car, hand, knight, pan, shell, shoe
 from benchmarks.another_renderer.shapes import (
     ball,
     block,
@@ -281,5 +282,6 @@ OBJECTS: dict[str, Callable[[], trimesh.Trimesh]] = {
     for make in (
         knot, bracket, blob, sticks, mug, box, nut, gear,
         foot, jaw, bust, blade, housing, bottle, vertebra, relief, cloth, wire, pair, steps,
+        shoe, knight, car, hand, shell, pan,
     )
 }  # fmt: skip

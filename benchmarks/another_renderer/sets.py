@@ -1,7 +1,7 @@
 """The sets.
 
 Those of the first list may be looked at while something is changed; the second is for the end; in the third people
-walk otherwise.
+walk otherwise; the fourth has objects that came when everything had been chosen.
 """
 
 from benchmarks.another_renderer.captures import CaptureSet, Walk
@@ -66,7 +66,17 @@ OTHERWISE = (
     _set("cloth", "none", "photo", 59, shuffled=True, walk=Walk("rolled", roll=3.14)),
     _set("sticks", "none", "photo", 60, frames=40, walk=Walk("two-rounds", turn_deg=720.0)),
 )
-LISTS = {"known": KNOWN, "unseen": UNSEEN, "otherwise": OTHERWISE}
+LATER = (
+    _set("hand", "table", "photo", 71),
+    _set("car", "table", "rough", 72, shuffled=True),
+    _set("shoe", "room", "photo", 73),
+    _set("knight", "none", "rough", 74, shuffled=True),
+    _set("shell", "table", "photo", 75, frames=20, walk=Walk("two-rounds", turn_deg=720.0)),
+    _set("pan", "none", "photo", 76),
+    _set("pan", "table", "rough", 77),
+    _set("hand", "none", "rough", 78, frames=16, walk=Walk("half-turn", turn_deg=180.0)),
+)
+LISTS = {"known": KNOWN, "unseen": UNSEEN, "otherwise": OTHERWISE, "later": LATER}
 
 
 def chosen_sets(parts: tuple[str, ...], which: str) -> list[CaptureSet]:
