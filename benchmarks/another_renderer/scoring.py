@@ -138,9 +138,10 @@ def _error(
     T_camera, T_projector = _poses(row)
     sigma = row.get("sl_pose_sigma", document.get("sl_pose_sigma", {}))
     S, C = alignments
-    turn = angle_deg(true.T_camera[:3, :3].T @ S.pose(T_camera)[:3, :3])
+    by_points_ = S.pose(T_camera)
+    turn = angle_deg(true.T_camera[:3, :3].T @ by_points_[:3, :3])
     other = angle_deg(true.T_camera[:3, :3].T @ C.pose(T_camera)[:3, :3])
-    motion = S.pose(T_camera) @ np.linalg.inv(true.T_camera)
+    motion = by_points_ @ np.linalg.inv(true.T_camera)
     moved = float(np.linalg.norm(motion[:3, :3] @ middle + motion[:3, 3] - middle))
     relative, wanted = (np.linalg.inv(a) @ b for a, b in ((T_camera, T_projector), (true.T_camera, true.T_projector)))
 

@@ -4,14 +4,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.compiled import compiled
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
-from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
+from sl_nerfstudio.geometry.devices.models import for_loops, pixel_of
 
 _OUTSIDE = -1e6  # where nothing is seen
 _STEPS = 4  # of Gauss-Newton, to the nearest place on a line
@@ -35,7 +34,7 @@ class EpipolarLines:
         """Those of two devices; NaN where a pixel has no ray."""
         shape, R = (camera.h, camera.w), np.ascontiguousarray(T_camera_projector[:3, :3])
         rays = np.empty((*shape, 3))
-        _turned_rays(*_for_loops(camera), R, rays)
+        _turned_rays(*for_loops(camera), R, rays)
         return EpipolarLines(rays, -R.T @ T_camera_projector[:3, 3], projector, np.zeros((*shape, 2), dtype=np.float32))
 
     def part(self, box: tuple[slice, slice]) -> "EpipolarLines":
@@ -80,12 +79,7 @@ class EpipolarLines:
     @cached_property
     def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
         """For compiled loops: model code and parameters of the projector, rays, centre, offsets."""
-        return *_for_loops(self.projector), self.ray, self.centre, self.offset
-
-
-def _for_loops(device: Device) -> tuple[int, ndarray]:
-    intrinsics = Intrinsics.of(device, torch.float64)
-    return MODELS[intrinsics.model].code, intrinsics.params.numpy()
+        return *for_loops(self.projector), self.ray, self.centre, self.offset
 
 
 @compiled

@@ -14,6 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.compiled import compiled, compiled_sums
 from sl_nerfstudio.relative_pose.epipolar_fit import distinct
 from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, subsample
+from sl_nerfstudio.relative_pose.sampson import distance_from_curve
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings, Separation
 
 
@@ -87,13 +88,11 @@ def _score(E, d_camera, d_projector, by_uv, limit, scores):
     for k in range(len(E)):
         M, total = E[k], 0.0
         for i in range(len(d_camera)):
-            d, e, by = d_camera[i], d_projector[i], by_uv[i]
+            d = d_camera[i]
             x = d[0] * M[0, 0] + d[1] * M[1, 0] + d[2] * M[2, 0]
             y = d[0] * M[0, 1] + d[1] * M[1, 1] + d[2] * M[2, 1]
             z = d[0] * M[0, 2] + d[1] * M[1, 2] + d[2] * M[2, 2]
-            a = x * e[0] + y * e[1] + z * e[2]
-            h, g = x * by[0, 0] + y * by[1, 0] + z * by[2, 0], x * by[0, 1] + y * by[1, 1] + z * by[2, 1]
-            total += min(a * a / max(limit * (h * h + g * g), 1e-300), 1.0)
+            total += min(distance_from_curve(x, y, z, d_projector[i], by_uv[i])[0] ** 2 / limit, 1.0)
         scores[k] = total / len(d_camera)
 
 

@@ -10,7 +10,7 @@ from numpy import ndarray
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
-from sl_nerfstudio.geometry.devices.models import MODELS
+from sl_nerfstudio.geometry.devices.models import for_loops
 from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
 from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, PatternBlocks
 
@@ -75,7 +75,7 @@ def ray_pairs(
 def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """Unit directions of pixels in the device's axes; NaN where there is none."""
     d = np.empty((len(uv), 3))
-    _directions(MODELS[device.model].code, device.parameters, np.ascontiguousarray(uv, dtype=np.float64), d)
+    _directions(*for_loops(device), np.ascontiguousarray(uv, dtype=np.float64), d)
     return d
 
 
@@ -84,7 +84,7 @@ def directions_by_uv(
 ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3 2"]]:
     """Unit directions of pixels, and their derivatives by the pixels; NaN where there is none."""
     d, by_uv = directions(device, uv), np.empty((len(uv), 3, 2))
-    _by_uv(MODELS[device.model].code, device.parameters, d, by_uv)
+    _by_uv(*for_loops(device), d, by_uv)
     return d, by_uv
 
 

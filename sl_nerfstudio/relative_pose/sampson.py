@@ -95,10 +95,9 @@ def _turned(x, y, z, u, v, w):
 def _move(R, t, step, R_moved, t_moved):
     B = np.empty((3, 2))
     _basis(t, B)
+    u, v, w = step[0], step[1], step[2]
     for k in range(3):
-        R_moved[0, k], R_moved[1, k], R_moved[2, k] = _turned(
-            step[0], step[1], step[2], R[0, k], R[1, k], R[2, k]
-        )  # fmt: skip
+        R_moved[0, k], R_moved[1, k], R_moved[2, k] = _turned(u, v, w, R[0, k], R[1, k], R[2, k])
     p, q = step[3], step[4]
     x, y, z = B[0, 0] * p + B[0, 1] * q, B[1, 0] * p + B[1, 1] * q, B[2, 0] * p + B[2, 1] * q
     x, y, z = _turned(x, y, z, t[0], t[1], t[2])
@@ -117,7 +116,7 @@ def _plane(R, t, d):
 
 
 @compiled
-def _distance(mx, my, mz, e, by):
+def distance_from_curve(mx, my, mz, e, by):
     """Residual of a projector ray `e` whose derivative is `by`; direction of its gradient, and one over its length."""
     a = mx * e[0] + my * e[1] + mz * e[2]
     h = mx * by[0, 0] + my * by[1, 0] + mz * by[2, 0]
@@ -130,7 +129,7 @@ def _distance(mx, my, mz, e, by):
 def _residuals(R, t, frame, d_camera, d_projector, by_uv, r):
     for i in range(len(r)):
         _, _, _, mx, my, mz = _plane(R[frame[i]], t[frame[i]], d_camera[i])
-        r[i] = _distance(mx, my, mz, d_projector[i], by_uv[i])[0]
+        r[i] = distance_from_curve(mx, my, mz, d_projector[i], by_uv[i])[0]
 
 
 @compiled
@@ -138,7 +137,7 @@ def _derivatives(R, t, A, d_camera, d_projector, by_uv, r, J):
     for i in range(len(r)):
         d, e, by = d_camera[i], d_projector[i], by_uv[i]
         nx, ny, nz, mx, my, mz = _plane(R, t, d)
-        s, h, k, inverse = _distance(mx, my, mz, e, by)
+        s, h, k, inverse = distance_from_curve(mx, my, mz, e, by)
         r[i] = s
         u = (e[0] - s * (by[0, 0] * h + by[0, 1] * k)) * inverse
         v = (e[1] - s * (by[1, 0] * h + by[1, 1] * k)) * inverse

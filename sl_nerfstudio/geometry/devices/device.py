@@ -66,7 +66,7 @@ class Intrinsics:
         models: list[DeviceKind] = sorted({d.model for d in devices})
         if len(models) != 1:
             raise ValueError(f"devices of one batch must share a model, got {models}")
-        params = torch.tensor([[getattr(d, k) for k in PARAMETERS] for d in devices], dtype=dtype)
+        params = torch.tensor([d.parameters.tolist() for d in devices], dtype=dtype)
         return Intrinsics(params, models[0], bool((params[:, 4:] != 0).any()))
 
     def __getitem__(self, index: Int[Tensor, "*n"] | int | slice) -> "Intrinsics":

@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from jaxtyping import Float64
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.compiled import compiled
 from sl_nerfstudio.geometry.devices import doe, pinhole
-from sl_nerfstudio.geometry.devices.device import DeviceKind
+from sl_nerfstudio.geometry.devices.device import Device, DeviceKind
 from sl_nerfstudio.geometry.devices.distortion import distort
 
 
@@ -25,6 +27,12 @@ MODELS: dict[DeviceKind, DeviceModel] = {
     "OPENCV": DeviceModel(0, pinhole.normalised_anywhere, pinhole.jacobian, pinhole.direction),
     "DOE": DeviceModel(1, doe.normalised_anywhere, doe.jacobian, doe.direction),
 }
+
+
+def for_loops(device: Device) -> tuple[int, Float64[ndarray, "8"]]:
+    """What compiled loops take for a device: the code of its model, and its PARAMETERS."""
+    return MODELS[device.model].code, device.parameters
+
 
 _pinhole, _pinhole_in_front = compiled(pinhole.normalised), compiled(pinhole.in_front)
 _doe, _doe_in_front = compiled(doe.normalised), compiled(doe.in_front)
