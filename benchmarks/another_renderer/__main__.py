@@ -32,9 +32,9 @@ class Config:
 
     sets: tuple[str, ...] = ()
     """parts of the names of sets; default: all of the list"""
-    which: Literal["known", "unseen", "otherwise", "later"] = "known"
-    """which list: the first; the second, at which nobody looks before a change is finished; other ways of walking; or
-    objects that came later"""
+    which: Literal["known", "unseen", "otherwise", "later", "equipment"] = "known"
+    """which list: the first; the second, at which nobody looks before a change is finished; other ways of walking;
+    objects that came later; or other cameras, projectors and matter"""
     keep: Path = Path("outputs/another_renderer")
     """folder of captures and scans"""
     output: Path | None = None

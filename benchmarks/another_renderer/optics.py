@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 
 def dots(a: ndarray, b: ndarray) -> ndarray:
@@ -45,6 +46,16 @@ class Lens:
             n = distorted / (1 + self.k1 * r2 + self.k2 * r2**2)
         d = np.concatenate([n[..., :1], -n[..., 1:], -np.ones_like(n[..., :1])], -1)
         return d / np.sqrt(dots(d, d))[..., None]
+
+    def turned_to_middle(self) -> ndarray:
+        """Rotation (4, 4) in device axes, after which the middle of the image looks where its axis did."""
+        right, down = (self.w / 2 - self.cx) / self.f, (self.h / 2 - self.cy) / self.f
+        if max(abs(right), abs(down)) < 0.1:  # as exact as people aim
+            return np.eye(4)
+        middle, axis = np.array([right, -down, -1.0]), np.array([0.0, 0.0, -1.0])
+        T = np.eye(4)
+        T[:3, :3] = Rotation.align_vectors(axis[None], middle[None])[0].as_matrix()
+        return T
 
 
 def looking(eye: ndarray, at: ndarray, roll: float) -> ndarray:

@@ -31,6 +31,9 @@ class Look:
     projector_blur: float = 0.5  # sigma in focus, pattern pixels
     projector_defocus: float = 1.0  # sigma added at one and a half times the distance in focus
     contrast: float = 0.97  # of the projector: 1 - black / white
+    translucent: float = 0.0  # share of the light that comes out of the object elsewhere than where it went in
+    scatter_px: float = 3.0  # how far from there, camera pixels (sigma)
+    bounces: bool = False  # light that surfaces send to each other once
     sensor: Sensor = field(default_factory=Sensor)
 
 
@@ -98,16 +101,46 @@ def photograph(
     rng: np.random.Generator,
 ) -> tuple[ndarray, Truth]:
     """Values (h, w, 3) from 0 to 255, four rays a pixel, and what the pixels' centres see."""
-    light = np.zeros((camera.h, camera.w, 3), dtype=np.float32)
+    look, shape = projection.look, (camera.h, camera.w)
+    light, sent = np.zeros((*shape, 3), dtype=np.float32), np.zeros(shape, dtype=np.float32)
     for dx in (0.25, 0.75):
         for dy in (0.25, 0.75):
-            rays = _directions(camera, view.T_camera, rng.uniform(-0.2, 0.2, (camera.h, camera.w, 2)) + [dx, dy])
-            light += _seen(scene, projection, paints, view, rays).reshape(light.shape) / 4
-    rays = _directions(camera, view.T_camera, np.full((camera.h, camera.w, 2), 0.5))
+            rays = _directions(camera, view.T_camera, rng.uniform(-0.2, 0.2, (*shape, 2)) + [dx, dy])
+            seen, on_object = _seen(scene, projection, paints, view, rays)
+            light += seen.reshape(light.shape) / 4
+            sent += on_object.reshape(shape) / 4
+    rays = _directions(camera, view.T_camera, np.full((*shape, 2), 0.5))
     hits = scene.hits(view.T_camera[:3, 3], rays)
+    if look.translucent:
+        light += look.translucent * _albedo(paints, hits).reshape(light.shape) * _scattered(sent, hits, look)[..., None]
+    if look.bounces:
+        got = _bounced(scene, projection, paints, view, hits, rng).reshape(light.shape)
+        light += _albedo(paints, hits).reshape(light.shape) * cv2.GaussianBlur(got, (0, 0), 3.0)
     truth = _truth(scene, camera, projection.lens, view, hits)
-    depth = hits.depth.reshape(camera.h, camera.w)
-    return exposed(light, depth, view.focus_camera, projection.look.sensor, rng), truth
+    return exposed(light, hits.depth.reshape(shape), view.focus_camera, look.sensor, rng), truth
+
+
+def _scattered(sent: ndarray, hits: Hits, look: Look) -> ndarray:
+    """What light (h, w) on the object gains and loses inside it."""
+    there = (hits.is_object & np.isfinite(hits.depth)).reshape(sent.shape).astype(np.float32)
+    blurred = cv2.GaussianBlur(sent, (0, 0), look.scatter_px)
+    return there * (blurred / np.maximum(cv2.GaussianBlur(there, (0, 0), look.scatter_px), 0.05) - sent)
+
+
+def _bounced(
+    scene: Scene, projection: Projection, paints: tuple[Paint, Paint], view: View, hits: Hits, rng: np.random.Generator
+) -> ndarray:
+    """Light (n, 3) of the projector that pixels' centres get from other surfaces, by six directions each."""
+    met = np.nonzero(np.isfinite(hits.depth))[0]
+    p, n = hits.p_world[met], hits.normal[met]
+    got = np.zeros((len(hits.depth), 3), dtype=np.float32)
+    for _ in range(6):
+        way = _unit(n + _unit(rng.normal(size=n.shape)))  # as often as its cosine is large
+        other = scene.hits(p + EPSILON * n, way)
+        there = np.nonzero(np.isfinite(other.depth))[0]
+        sent = _sent(scene, projection, view, other.p_world[there], other.normal[there])
+        got[met[there]] += _albedo(paints, other)[there] * sent[:, None] / 6
+    return got
 
 
 def _directions(camera: Lens, T_camera: ndarray, within: ndarray) -> ndarray:
@@ -117,29 +150,49 @@ def _directions(camera: Lens, T_camera: ndarray, within: ndarray) -> ndarray:
     return camera.directions(uv) @ T_camera[:3, :3].T
 
 
-def _seen(scene: Scene, projection: Projection, paints: tuple[Paint, Paint], view: View, rays: ndarray) -> ndarray:
-    """Light (n, 3) that comes along rays (n, 3) into the camera."""
+def _seen(
+    scene: Scene, projection: Projection, paints: tuple[Paint, Paint], view: View, rays: ndarray
+) -> tuple[ndarray, ndarray]:
+    """Light (n, 3) that comes along rays (n, 3) into the camera, and the projector's light (n,) on the object there."""
     look, eye = projection.look, view.T_projector[:3, 3]
     hits = scene.hits(view.T_camera[:3, 3], rays)
     met = np.nonzero(np.isfinite(hits.depth))[0]
     p, n = hits.p_world[met], hits.normal[met]
-    to_eye = eye - p
-    distance = np.sqrt(dots(to_eye, to_eye))
-    to_eye /= distance[:, None]
-    cosine = np.maximum(dots(n, to_eye), 0)
-    sent = projection.light(projection.lens.pixels(into_device(view.T_projector, p)), distance, view.focus_projector)
-    reached = np.nonzero((cosine > 0) & (sent > 0))[0]
-    lit = np.zeros(len(p))
-    lit[reached] = sent[reached] * scene.sees(p[reached] + EPSILON * n[reached], eye)
-    falloff = (view.focus_projector / distance) ** 2
+    sent = _sent(scene, projection, view, p, n)
     room = look.room_light * (0.7 + 0.3 * n[:, 2] + 0.25 * np.maximum(n @ np.array([0.5, -0.6, 0.62]), 0))
-    albedo = np.where(hits.is_object[met, None], paints[0].albedo(p), paints[1].albedo(p))
-    half = to_eye - rays[met]
+    half = _unit(eye - p) - rays[met]
     half /= np.sqrt(dots(half, half))[:, None]
+    cosine = np.maximum(dots(n, _unit(eye - p)), 1e-6)
     shine = look.gloss * np.maximum(dots(n, half), 0) ** 40
-    colour = albedo * (cosine * falloff * lit + room)[:, None] + (shine * falloff * lit)[:, None]
-    result = np.zeros((len(rays), 3))
-    result[met] = colour
+    result, on_object = np.zeros((len(rays), 3)), np.zeros(len(rays), dtype=np.float32)
+    result[met] = _albedo(paints, hits)[met] * (sent + room)[:, None] + (shine * sent / cosine)[:, None]
+    on_object[met] = np.where(hits.is_object[met], sent, 0)
+    return result, on_object
+
+
+def _sent(scene: Scene, projection: Projection, view: View, p: ndarray, n: ndarray) -> ndarray:
+    """The projector's light (m,) on surfaces at points (m, 3) with normals (m, 3)."""
+    eye = view.T_projector[:3, 3]
+    distance = np.linalg.norm(eye - p, axis=1)
+    cosine = np.maximum(dots(n, _unit(eye - p)), 0)
+    light = projection.light(projection.lens.pixels(into_device(view.T_projector, p)), distance, view.focus_projector)
+    reached = np.nonzero((cosine > 0) & (light > 0))[0]
+    lit = np.zeros(len(p))
+    lit[reached] = light[reached] * scene.sees(p[reached] + EPSILON * n[reached], eye)
+    return cosine * (view.focus_projector / distance) ** 2 * lit
+
+
+def _unit(v: ndarray) -> ndarray:
+    return v / np.sqrt(dots(v, v))[:, None]
+
+
+def _albedo(paints: tuple[Paint, Paint], hits: Hits) -> ndarray:
+    """(n, 3); 0 where nothing was met."""
+    met = np.isfinite(hits.depth)
+    result = np.zeros((len(met), 3))
+    result[met] = np.where(
+        hits.is_object[met, None], paints[0].albedo(hits.p_world[met]), paints[1].albedo(hits.p_world[met])
+    )
     return result
 
 

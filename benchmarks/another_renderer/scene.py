@@ -40,7 +40,7 @@ class Scene:
             self._faces.append(faces)
 
     def hits(self, origin: ndarray, directions: ndarray) -> Hits:
-        """First hits of rays (n, 3) from one point."""
+        """First hits of rays (n, 3) from one point, or from one each."""
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1).astype(np.float32)
         found = {key: value.numpy() for key, value in self._caster.cast_rays(o3d.core.Tensor(rays), nthreads=1).items()}
         depth, which, face, uv = found["t_hit"], found["geometry_ids"], found["primitive_ids"], found["primitive_uvs"]

@@ -21,6 +21,11 @@ class Sensor:
     exposure_stops: float = 0.0  # frames differ by up to this, either way
     gamma: float = 2.2
     quality: int = 95  # of JPEG
+    vignetting: float = 0.0  # light lost in the corners, share
+    denoising_px: float = 0.0  # sigma of a filter that keeps edges
+    sharpening: float = 0.0  # share of what a blur of 1.2 pixels takes away that is added
+    tone: float = 0.0  # how far the tones are drawn to an S, as in the pictures of telephones; at most 1
+    thinned_colour: bool = False  # colour at half the resolution in JPEG
 
 
 def blurred_by_depth(light: ndarray, depth: ndarray, focus: float, sensor: Sensor) -> ndarray:
@@ -54,13 +59,30 @@ def exposed(light: ndarray, depth: ndarray, focus: float, sensor: Sensor, rng: n
     image = smeared(image, sensor.motion_px * rng.uniform(0, 1), rng.uniform(0, np.pi))
     stops = sensor.exposure_stops * rng.uniform(-1, 1) - 0.15
     image = image / max(float(np.quantile(image, 0.99)), 1e-6) * 2**stops
+    image = image * _vignette(image.shape, sensor.vignetting)
     electrons = rng.normal(image, np.sqrt(np.maximum(image, 0) / sensor.electrons + sensor.read_noise**2))
-    return (255 * np.clip(electrons, 0, 1) ** (1 / sensor.gamma) + 0.5).astype(np.uint8)
+    return (255 * processed(np.clip(electrons, 0, 1) ** (1 / sensor.gamma), sensor) + 0.5).astype(np.uint8)
 
 
-def jpeg(values: ndarray, quality: int, colour: bool) -> bytes:
+def processed(values: ndarray, sensor: Sensor) -> ndarray:
+    """Values from 0 to 1 (h, w, 3) as the camera's own software leaves them."""
+    if sensor.denoising_px:
+        values = cv2.bilateralFilter(values.astype(np.float32), -1, 0.05, sensor.denoising_px)
+    if sensor.sharpening:
+        values = values + sensor.sharpening * (values - cv2.GaussianBlur(values, (0, 0), 1.2))
+    values = np.clip(values, 0, 1)
+    return values + sensor.tone * (values**2 * (3 - 2 * values) - values)
+
+
+def _vignette(shape: tuple[int, ...], share: float) -> ndarray:
+    """(h, w, 1) of an image of `shape`, 1 in its middle."""
+    y, x = (np.linspace(-1, 1, n) for n in shape[:2])
+    return (1 - share * ((x[None, :] ** 2 + y[:, None] ** 2) / 2))[..., None]
+
+
+def jpeg(values: ndarray, sensor: Sensor, colour: bool) -> bytes:
     """An image file of (h, w, 3), grey unless `colour`."""
     image = Image.fromarray(values if colour else values[..., 1])
     stored = io.BytesIO()
-    image.save(stored, "JPEG", quality=quality, subsampling=0)
+    image.save(stored, "JPEG", quality=sensor.quality, subsampling=2 if sensor.thinned_colour else 0)
     return stored.getvalue()

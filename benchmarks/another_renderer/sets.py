@@ -1,10 +1,11 @@
 """The sets.
 
 Those of the first list may be looked at while something is changed; the second is for the end; in the third people
-walk otherwise; the fourth has objects that came when everything had been chosen.
+walk otherwise; the fourth has objects that came when everything had been chosen; the fifth has other cameras and
+projectors, pictures that a telephone has worked on, other matter, and partial views.
 """
 
-from benchmarks.another_renderer.captures import CaptureSet, Walk
+from benchmarks.another_renderer.captures import CaptureSet, Equipment, Walk
 from benchmarks.another_renderer.photograph import Look
 from benchmarks.another_renderer.sensor import Sensor
 
@@ -20,14 +21,33 @@ LOOKS = {
         sensor=Sensor(blur_px=0.8, defocus_px=1.5, motion_px=2.0, electrons=2500, read_noise=0.008,
                       exposure_stops=0.7, quality=80),
     ),
+    "phone": Look(
+        room_light=0.2, texture=0.4, colour=True, gloss=0.08, projector_blur=0.8, projector_defocus=1.2, contrast=0.93,
+        sensor=Sensor(blur_px=0.7, defocus_px=0.8, motion_px=1.0, electrons=2500, read_noise=0.006, exposure_stops=0.4,
+                      quality=85, vignetting=0.35, denoising_px=1.5, sharpening=0.9, tone=0.6, thinned_colour=True),
+    ),
+    "wax": Look(
+        room_light=0.1, texture=0.25, gloss=0.15, projector_blur=0.8, contrast=0.95, translucent=0.45, scatter_px=4.0,
+        sensor=Sensor(blur_px=0.6, electrons=6000, read_noise=0.004, quality=92),
+    ),
+    "bounce": Look(
+        room_light=0.1, texture=0.3, gloss=0.06, projector_blur=0.8, contrast=0.95, bounces=True,
+        sensor=Sensor(blur_px=0.6, defocus_px=0.8, electrons=6000, read_noise=0.004, exposure_stops=0.4, quality=90),
+    ),
 }  # fmt: skip
+LANDSCAPE = Equipment("landscape", aspect=16 / 9, distortion=(-0.16, -0.12))
+PORTRAIT = Equipment("portrait", aspect=3 / 4)
+SHIFTED = Equipment("lens-shift", lens_shift=0.55, projector_distortion=-0.06)
 
 
 def _set(
     thing: str, around: str, look: str, seed: int, missed: tuple[int, ...] = (), shuffled: bool = False,
-    frames: int = 24, resolution: int = 600, walk: Walk | None = None,
+    frames: int = 24, resolution: int = 600, walk: Walk | None = None, equipment: Equipment | None = None,
 ) -> CaptureSet:  # fmt: skip
-    return CaptureSet(thing, around, look, seed, LOOKS[look], frames, missed, shuffled, resolution, walk or Walk())
+    devices = equipment or Equipment()
+    return CaptureSet(
+        thing, around, look, seed, LOOKS[look], frames, missed, shuffled, resolution, walk or Walk(), devices
+    )
 
 
 KNOWN = (
@@ -76,7 +96,19 @@ LATER = (
     _set("pan", "table", "rough", 77),
     _set("hand", "none", "rough", 78, frames=16, walk=Walk("half-turn", turn_deg=180.0)),
 )
-LISTS = {"known": KNOWN, "unseen": UNSEEN, "otherwise": OTHERWISE, "later": LATER}
+EQUIPMENT = (
+    _set("jaw", "table", "photo", 81, walk=Walk("farther", nearer=1.2), equipment=LANDSCAPE),
+    _set("shoe", "room", "phone", 82, equipment=PORTRAIT),
+    _set("car", "table", "photo", 83, equipment=SHIFTED),
+    _set("bust", "none", "photo", 84, frames=36, walk=Walk("close", turn_deg=720.0, nearer=0.5, aim=0.12)),
+    _set("hand", "table", "rough", 85, walk=Walk("near-and-far", distances=(0.65, 1.6))),
+    _set("vertebra", "none", "wax", 86),
+    _set("bracket", "room", "bounce", 87),
+    _set(
+        "foot", "room", "phone", 88, shuffled=True, walk=Walk("near-and-far", distances=(0.75, 1.4)), equipment=SHIFTED
+    ),
+)
+LISTS = {"known": KNOWN, "unseen": UNSEEN, "otherwise": OTHERWISE, "later": LATER, "equipment": EQUIPMENT}
 
 
 def chosen_sets(parts: tuple[str, ...], which: str) -> list[CaptureSet]:

@@ -20,12 +20,13 @@ def captures(tmp_path):
     """Truth of eight frames: points of a ball of 50 mm, without images."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=50)
     rng = np.random.default_rng(2)
-    camera, projector = lenses(60, np.zeros((92, 92)), rng)
+    one = CaptureSet("ball", "none", "clean", 3, frames=8, resolution=60)
+    camera, projector = lenses(one, np.zeros((92, 92)), rng)
     (tmp_path / "truth").mkdir()
     ball.export(tmp_path / "truth" / "object.ply")
     devices = {"camera": camera.document(), "projector": projector.document()}
     (tmp_path / "intrinsics.json").write_text(json.dumps(devices))
-    views = walk(CaptureSet("ball", "none", "clean", 3, frames=8), ball, rng)
+    views = walk(one, ball, rng)
     for k, view in enumerate(views):
         row, column = np.indices((60, 60))
         rays = camera.directions(np.stack([column, row], -1) + 0.5) @ view.T_camera[:3, :3].T
