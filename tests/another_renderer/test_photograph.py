@@ -11,9 +11,9 @@ import trimesh
 from benchmarks.another_renderer import objects
 from benchmarks.another_renderer.objects import OBJECTS
 from benchmarks.another_renderer.optics import Lens, into_device, looking, triangulated
-from benchmarks.another_renderer.photograph import Look, Projection, View, photograph
-from benchmarks.another_renderer.scene import Paint, Scene
-from benchmarks.another_renderer.sensor import Sensor
+from benchmarks.another_renderer.photograph import Look, Projection, View, _bounced, _scattered, photograph
+from benchmarks.another_renderer.scene import Hits, Paint, Scene
+from benchmarks.another_renderer.sensor import Sensor, exposed, processed
 from benchmarks.another_renderer.shapes import ball, block, joined, meshed, without
 
 CAMERA = Lens(96, 80, 150.0, 47.0, 41.0, -0.05, 0.02)
@@ -95,6 +95,60 @@ def test_what_the_projector_does_not_reach_is_dark(taken):
     assert truth.object_seen[row, column]
     assert np.isnan(truth.p_world[row, column]).all()
     assert values[row - 1 : row + 2, column - 1 : column + 2].max() < 40
+
+
+def test_a_wall_lights_the_floor_by_its_form_factor():
+    """E = albedo (1 - d / sqrt(d^2 + h^2)) / 2 at distance d from a lit wall of height h that is very wide."""
+    floor, wall = trimesh.creation.box((400, 4000, 2)), trimesh.creation.box((2, 4000, 100))
+    floor.apply_translation((200, 0, -1))
+    wall.apply_translation((-1, 0, 50))
+    lens = Lens(100, 100, 180.0, 50.0, 50.0)  # sees 5000 mm from afar
+    projection = Projection(np.ones((100, 100)), lens, Look(bounces=True, contrast=1.0))
+    paint = Paint(np.zeros((14, 3)), np.full(14, np.pi / 2), 0.0, np.full((2, 3), 0.6), False)
+    looks_along_x = looking(np.array([9000.0, 0, 40]), np.array([0.0, 0, 40]), 0.0)
+    far = View(looks_along_x, looks_along_x, 9000.0, 9000.0)
+    distance = np.array([10.0, 40.0, 120.0])
+    p = np.stack([np.repeat(distance, 4000), np.zeros(12000), np.zeros(12000)], 1)
+    hits = Hits(np.ones(12000), p, np.tile([0.0, 0, 1], (12000, 1)), np.ones(12000, dtype=bool))
+    got = _bounced(Scene(floor, [wall]), projection, (paint, paint), far, hits, np.random.default_rng(0))
+    factor = (1 - distance / np.hypot(distance, 100)) / 2
+    assert got.reshape(3, 4000, 3).mean((1, 2)) == pytest.approx(0.6 * factor, rel=0.04)
+
+
+def test_light_inside_an_object_is_neither_made_nor_lost():
+    """An evenly lit surface looks as before; a bright spot is darker, and what it lost is around it."""
+    there = np.zeros((80, 80), dtype=bool)
+    there[10:70, 10:70] = True
+    hits = Hits(np.ones(6400), np.zeros((6400, 3)), np.zeros((6400, 3)), there.ravel())
+    look = Look(translucent=0.5, scatter_px=3.0)
+    assert _scattered(there.astype(np.float32), hits, look) == pytest.approx(0, abs=1e-4)
+    spot = np.zeros((80, 80), dtype=np.float32)
+    spot[40, 40] = 1
+    change = _scattered(spot, hits, look)
+    assert change[40, 40] == pytest.approx(1 / (2 * np.pi * 9) - 1, rel=0.01)
+    assert change.sum() == pytest.approx(0, abs=1e-3)
+
+
+def test_a_shifted_lens_looks_at_the_same_place():
+    lens = Lens(920, 920, 1300.0, 460.0, 966.0, k1=0.0)
+    T = looking(np.array([0.0, -300, 100]), np.zeros(3), 0.3)
+    middle = lens.pixels(into_device(T @ lens.turned_to_middle(), np.zeros(3)))
+    assert middle == pytest.approx([460, 460], abs=1e-6)
+    assert Lens(920, 920, 1300.0, 470.0, 450.0).turned_to_middle() == pytest.approx(np.eye(4))
+
+
+def test_what_a_telephone_does_to_values():
+    step = np.repeat(np.repeat(np.array([[0.2] * 20 + [0.8] * 20]), 9, 0)[..., None], 3, 2)
+    assert processed(step, Sensor()) == pytest.approx(step)
+    assert processed(np.full((4, 4, 3), 0.25), Sensor(tone=1.0)) == pytest.approx(0.25**2 * 2.5)
+    sharp = processed(step, Sensor(sharpening=0.9))[4, :, 0]
+    assert sharp[:15] == pytest.approx(0.2, abs=1e-6)
+    assert sharp.min() < 0.1
+    assert sharp.max() > 0.9
+    even, depth = np.ones((41, 41, 3), dtype=np.float32), np.full((41, 41), 10.0)
+    sensor = Sensor(vignetting=0.4, electrons=1e12, read_noise=0.0, gamma=1.0)
+    image = exposed(even, depth, 10.0, sensor, np.random.default_rng(0)).astype(float)
+    assert image[0, 0] / image[20, 20] == pytest.approx(0.6, abs=0.01)
 
 
 def test_solids_are_what_they_say():
