@@ -5,6 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Bool
+from numpy import ndarray
+
 from sl_nerfstudio.calibration.stated_sigma import StatedSigma
 from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
 from sl_nerfstudio.decoding.decoder import Decoder
@@ -117,9 +120,14 @@ class FrameWorker:
         """The maps of a frame, matched if it was, whichever worker stored them. Raises UserError if there are none."""
         return self._selected(result.name, self._stored(result, result.matched or result.key))
 
+    def seen(self, result: FrameStageResult) -> Bool[ndarray, "h w"]:
+        """Where the camera saw the pattern of a frame, whatever the user's mask selects."""
+        return self._stored(result, result.matched or result.key).mask
+
     def _calibrated(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
         job, camera = self._job, self._job.camera_of(result.frame)
         selected = self._selected(result.name, decoded)
+        seen = decoded.mask  # also where the user's mask selects nothing
         try:
             pose = self._pose(result, selected)
             devices = camera, job.projector
@@ -128,11 +136,11 @@ class FrameWorker:
             )
             result = replace(result, matched="")
             if found is not None:
-                selected = self._selected(result.name, found[1])
+                selected, seen = self._selected(result.name, found[1]), found[1].mask
                 share = float(selected.mask.mean())
                 result = replace(result, matched=found[0], decode_rate=selected.rate, mask_share=share)
                 pose = self._pose_near(pose, result, selected)
-            cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light)
+            cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light, seen=seen)
         except FileError as error:
             return replace(result, cloud=None, stage="reading", reason=str(error))
         except DecodingError as error:  # nothing that was matched is inside the user's mask

@@ -134,7 +134,7 @@ def _fitness_of(
         maps = graph.maps[k], graph.maps[j]
         found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
         agreeing += found.agreeing[0]
-        judged += found.judged[0]
+        judged += found.judged[0] + found.absent[0]
     return agreeing / judged if judged else 0.0
 
 

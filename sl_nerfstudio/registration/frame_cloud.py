@@ -30,6 +30,7 @@ class FrameCloud:
     sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
     pose_errors: Float64[ndarray, "n 5"]  # along the camera ray, by one sigma of each principal error of the pose
     light: Float32[ndarray, "h w"] | None = None  # of the projector that each pixel returns; None: not measured
+    seen: Bool[ndarray, "h w"] | None = None  # where the camera saw the pattern, decoded or not; None: not known
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     @property
@@ -61,10 +62,12 @@ def frame_cloud(
     pose: RelativePose,
     settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
     light: Float32[ndarray, "h w"] | None = None,
+    seen: Bool[ndarray, "h w"] | None = None,
 ) -> FrameCloud:
     """Triangulate one frame, with each pose that explains it. `coords` are those from which `pose` was found.
 
-    `light` is how much of the projector's light each pixel returns, NaN where that is unknown.
+    `light` is how much of the projector's light each pixel returns, NaN where that is unknown;
+    `seen` is where the camera saw the pattern.
 
     Raises RelativePoseError where hardly any point agrees with the pose.
     """
@@ -98,8 +101,9 @@ def frame_cloud(
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
         pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
         light=light,
+        seen=seen,
         alternatives=tuple(
-            frame_cloud(name, coords, camera, projector, other, settings, light)
+            frame_cloud(name, coords, camera, projector, other, settings, light, seen)
             for other in pose.alternatives
             if other.inliers.sum() >= settings.fewest_points
         ),

@@ -40,7 +40,9 @@ def with_relative_pose(
         noise_px=old.noise_px[old.inliers],
         alternatives=(),
     )
-    return frame_cloud(cloud.name, cloud.coords, cloud.camera, cloud.projector, pose, light=cloud.light)
+    return frame_cloud(
+        cloud.name, cloud.coords, cloud.camera, cloud.projector, pose, light=cloud.light, seen=cloud.seen
+    )
 
 
 @one_library_thread()

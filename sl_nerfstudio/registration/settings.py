@@ -15,6 +15,16 @@ class FrameCloudSettings:
 
 
 @dataclass(frozen=True)
+class EmptyPlaceSettings:
+    """Where a frame saw nothing."""
+
+    margin: float = 0.02
+    """distance within which nothing of the pattern may be seen, as a share of the image's longer side"""
+    projector_side: int = 100
+    """places along the longer side of the pattern at which it is known how far its light went"""
+
+
+@dataclass(frozen=True)
 class SurfaceMapSettings:
     """Averaging of a frame's points on a lattice of camera pixels."""
 
@@ -44,6 +54,8 @@ class SurfaceMapSettings:
     """quantile of the depths in the middle at which the object is expected: a table may be behind it"""
     nearness: float = 0.1
     """share of that depth by which the object's centre lies behind its surface at most"""
+    empty: EmptyPlaceSettings = field(default_factory=EmptyPlaceSettings)
+    """where a frame saw nothing"""
     tone: ToneSettings = field(default_factory=ToneSettings)
     """what of the brightness belongs to the surface"""
 
@@ -56,6 +68,8 @@ class AgreementSettings:
     """radii behind a surface: points that are farther back are hidden by it, nearer ones contradict it"""
     least_facing_cosine: float = 0.3
     """cosine between the normals of two places that may be the same"""
+    least_lit_cosine: float = 0.35
+    """cosine between a surface's normal and its rays to camera and projector above which it would be seen and lit"""
     behind: float = 0.5
     """what a point a little behind the surface counts as, where a point in front of it counts as 1"""
     search_penalty: float = 1.0

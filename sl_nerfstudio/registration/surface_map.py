@@ -10,6 +10,7 @@ from sl_nerfstudio.compiled import compiled_range
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.devices.models import MODELS
 from sl_nerfstudio.geometry.plane_fit import solve_plane
+from sl_nerfstudio.registration.empty_places import EmptyPlaces, find_empty_places
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, reliable_points
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, SurfaceMapSettings
 from sl_nerfstudio.registration.tone.surface_tone import surface_tone
@@ -33,6 +34,7 @@ class SurfaceMap:
     plane: Float64[ndarray, "h w 5"]  # see tangent_planes
     valid: Bool[ndarray, "h w"]
     tone: Float32[ndarray, "h w"]  # see surface_tone; NaN where unknown
+    nothing: EmptyPlaces
     weight: Float64[ndarray, "m"]  # of each valid place when places are drawn: large where few look its way
     centroid: Float64[ndarray, "3"]
     radius: float  # RMS distance of the points from the centroid
@@ -134,6 +136,7 @@ def build_surface_map(
         tangent_planes(np.nan_to_num(point), np.nan_to_num(normal), sigma),
         valid,
         _tone(cloud, keep, index, point, normal, valid, settings),
+        find_empty_places(cloud, camera, settings.empty),
         _orientation_weights(normal[valid], settings.orientations),
         centroid,
         radius,

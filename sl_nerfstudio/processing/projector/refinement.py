@@ -122,7 +122,7 @@ def with_projector(clouds: Sequence[FrameCloud], consistent: ConsistentFrames, p
     for k, cloud in enumerate(clouds):
         T = poses.T_camera_projector[k] if consistent.registration.registered[k] else cloud.pose.T_camera_projector
         pose = relative_pose_near(T, *correspondences_of(cloud.coords), cloud.camera, projector)
-        moved = frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose, light=cloud.light)
+        moved = frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose, light=cloud.light, seen=cloud.seen)
         out.append(kept.kept(moved))
     return out
 

@@ -41,20 +41,22 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
     common = estimate_relative_pose(uv_camera, uv_projector, job.camera, job.projector, job.seed)
     clouds = LargeClouds()
     return [
-        with_kept_cloud(_with_pose(job, result, decoded[result.name], common), clouds)
+        with_kept_cloud(_with_pose(worker, job, result, decoded[result.name], common), clouds)
         if result.name in decoded
         else result
         for result in track(results, "calibrating with one pose", len(results))
     ]
 
 
-def _with_pose(job: FrameJob, result: FrameStageResult, decoded: Decoded, common: RelativePose) -> FrameStageResult:
+def _with_pose(
+    worker: FrameWorker, job: FrameJob, result: FrameStageResult, decoded: Decoded, common: RelativePose
+) -> FrameStageResult:
     T, coords = common.T_camera_projector, decoded.coords
     own = relative_pose_near(T, *correspondences_of(coords), job.camera, job.projector, job.seed)
     pose = replace(own, T_camera_projector=T, covariance=common.covariance, degeneracies=common.degeneracies)
     try:
         cloud: FrameCloud | None = frame_cloud(
-            result.name, coords, job.camera, job.projector, pose, light=decoded.light
+            result.name, coords, job.camera, job.projector, pose, light=decoded.light, seen=worker.seen(result)
         )
     except RelativePoseError as error:
         return replace(result, cloud=None, stage="calibrating", reason=f"{result.frame.images[0]}: {error}")

@@ -18,9 +18,9 @@ _kernel_cost = compiled(geman_mcclure_cost)
 @compiled_range
 def agreement_sums(
     first, last, points, sigma, scale, R, t, reverse, plane, valid, code, camera, c, tolerances, least_facing, cutoff,
-    H, g, counts
+    empty, light, least_lit, H, g, counts
 ):  # fmt: skip
-    """Adds to H, g and counts (agreeing, in front, behind, squares, cost); `reverse`: points are the target's.
+    """Adds to H, g and counts (agreeing, in front, behind, squares, cost, absent); `reverse`: points are the target's.
 
     `points` are (6, n): points and normals. For every similarity, they are compared with the other frame's surface.
     """
@@ -35,6 +35,7 @@ def agreement_sums(
         for i in range(3):
             shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
         _map(points, M, 1 / s if reverse else s, shift, code, camera, h, w, mapped, place)
+        counts[k, 5] += _absent(mapped, place, empty.reshape(h * w), light, least_lit)
         count = _on_surface(place, flat_valid, some)
         scales = (1.0, s, s) if reverse else (s, 1.0, 1.0)  # of sigma, of the surface's sigma and of distances
         count = _compare(
@@ -82,6 +83,33 @@ def _on_surface(place, valid, some):
         n = some[m]
         some[count] = n
         count += valid[int(place[n])]
+    return count
+
+
+@compiled
+def _absent(mapped, place, empty, light, least_cosine):
+    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces.for_loops`."""
+    code, projector, T, reach = light
+    h, w = reach.shape
+    count = 0
+    for n in range(len(place)):
+        if place[n] < 0 or not empty[int(place[n])]:
+            continue
+        x, y, z, a, b, c = mapped[0, n], mapped[1, n], mapped[2, n], mapped[3, n], mapped[4, n], mapped[5, n]
+        if -(a * x + b * y + c * z) < least_cosine * np.sqrt(x * x + y * y + z * z):
+            continue
+        X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        A = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
+        B = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
+        C = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+        distance = np.sqrt(X * X + Y * Y + Z * Z)
+        if least_cosine * distance > -(A * X + B * Y + C * Z):
+            continue
+        column, row, in_front = pixel_of(code, X, Y, Z, projector)
+        if in_front and column >= 0 and row >= 0 and column < w and row < h:
+            count += distance < reach[int(row), int(column)]
     return count
 
 

@@ -65,12 +65,13 @@ class Agreement:
     in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
     behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
     squares: Float64[ndarray, "k"]  # mean squared distance of those that agree, in units of its variance
+    absent: Float64[ndarray, "k"]  # fraction that would be seen and lit where the other camera saw nothing
     cost: Float64[ndarray, "k"]  # mean robust cost of the points that could be judged: 0 exact, 1 far beyond the kernel
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
-        """Of the points that could be judged, the fraction that agree."""
-        return self.agreeing / self.judged.clip(1e-9)
+        """Of the points that could be judged, or should be seen and are not, the fraction that agree."""
+        return self.agreeing / (self.judged + self.absent).clip(1e-9)
 
     @property
     def judged(self) -> Float64[ndarray, "k"]:
@@ -79,7 +80,7 @@ class Agreement:
 
     def contradicting(self, behind: float) -> Float64[ndarray, "k"]:
         """Fraction that contradicts, of which points behind count as `behind`."""
-        return self.in_front + behind * self.behind
+        return self.in_front + self.absent + behind * self.behind
 
     def score(self, penalty: float, behind: float) -> Float64[ndarray, "k"]:
         """Points that agree less `penalty` times those that contradict, of which points behind count as `behind`."""
@@ -99,7 +100,7 @@ def agreement(
     `tolerance` is the distance within which points agree, `width` that of the robust kernel.
     """
     k, radius = len(hypotheses), target.map.radius
-    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 5))
+    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 6))
     tolerances = np.array([tolerance.radii * radius, width.radii * radius, settings.hidden_depth * radius,
                            tolerance.sigmas, width.sigmas])  # fmt: skip
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
@@ -108,12 +109,12 @@ def agreement(
         agreement_sums(
             len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid, m.model_code,
             m.parameters, target.map.centroid, tolerances, settings.least_facing_cosine, settings.kernel_cutoff,
-            H, g, counts[reverse],
+            m.nothing.empty, m.nothing.light, settings.least_lit_cosine, H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
     squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
     cost = counts[..., 4].sum(0) / np.maximum(counts[..., :3].sum((0, 2)), 1)
-    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares, cost)
+    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares, shares[:, 5], cost)
 
 
 def agreement_at(

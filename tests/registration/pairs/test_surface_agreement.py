@@ -13,18 +13,21 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.rays import pixel_centres
 from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.registration.empty_places import EmptyPlaces
 from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
 from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement, agreement_at
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
 from sl_nerfstudio.registration.surface_map import SurfaceMap, View, build_surface_map, tangent_planes
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
+from tests.relative_pose.two_views import pose_of
 
 SIZE = 100
 RIG = rig_of(18, SIZE)
 TRUE = similarities_of(RIG.T_world_camera.numpy(), RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy())
 LIMITS = REGISTRATION_DEFAULTS.pair.agreement
 NEAR = Tolerance(0.04, 0.0)
+PROJECTOR = Device(30, 24, 26.0, 27.0, 15.5, 11.0, k1=0.05)
 CAMERAS = {
     "pinhole": Device(40, 30, 50.0, 52.0, 19.0, 16.0),
     "lens": Device(40, 30, 50.0, 52.0, 19.0, 16.0, k1=-0.3, k2=0.1, p1=5e-3, p2=-8e-3),
@@ -62,13 +65,15 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     even = np.ones(int(valid.sum()))
     tone = np.full(valid.shape, np.nan, dtype=np.float32)
     plane = tangent_planes(point, normal, sigma)
-    return SurfaceMap(camera, point, plane, valid, tone, even, centroid, radius, (View(centroid, radius),))
+    T = np.linalg.inv(pose_of((0.6, 0.1, 0.2), (0.0, 0.0, -3.0), 20.0))
+    nothing = EmptyPlaces(~valid & (rng.random(valid.shape) < 0.7), PROJECTOR, T, rng.uniform(2.5, 3.5, (24, 30)))
+    return SurfaceMap(camera, point, plane, valid, tone, nothing, even, centroid, radius, (View(centroid, radius),))
 
 
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
     """H, g and the shares and mean square of one similarity, point by point as the module's text says."""
     radius = target.map.radius
-    H, g, shares, squares, costs = np.zeros((7, 7)), np.zeros(7), [], [], []
+    H, g, shares, squares, costs, absent = np.zeros((7, 7)), np.zeros(7), [], [], [], []
     for mover, seen, reverse in ((source, target, False), (target, source, True)):
         own = S.inverse() if reverse else S
         p, n = own.points(mover.points), mover.normals @ own.R.T
@@ -77,6 +82,7 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, 
         height, width_px = seen.map.valid.shape
         inside = front.numpy() & (column >= 0) & (row >= 0) & (column < width_px) & (row < height)
         inside &= (n * p).sum(-1) <= 0
+        absent.append(plain_absent(seen.map.nothing, p[inside], n[inside], row[inside], column[inside]) / len(p))
         inside[inside] &= seen.map.valid[row[inside], column[inside]]
         P, N = seen.map.point[row[inside], column[inside]], seen.map.normal[row[inside], column[inside]]
         r = (N * (p[inside] - P)).sum(-1) * (S.scale if reverse else 1)
@@ -98,7 +104,20 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, 
         J = np.concatenate([m, np.cross(x, m), (x * m).sum(-1, keepdims=True)], 1)
         H += (J * w[:, None]).T @ J
         g += J.T @ (w * r[used])
-    return H, g, np.mean(shares, 0), float(np.mean(squares)), float(np.mean(costs))
+    return H, g, np.mean(shares, 0), float(np.mean(squares)), float(np.mean(costs)), float(np.mean(absent))
+
+
+def plain_absent(nothing: EmptyPlaces, p: ndarray, n: ndarray, row: ndarray, column: ndarray) -> int:
+    """How many of the points at empty places would be seen, and reached by the projector's light."""
+    R, t = nothing.T_projector_camera[:3, :3], nothing.T_projector_camera[:3, 3]
+    q, m = p @ R.T + t, n @ R.T
+    towards = [-(a * b).sum(1) / np.linalg.norm(a, axis=1) for a, b in ((p, n), (q, m))]
+    uv, front = project(Intrinsics.of(nothing.projector, torch.float64), torch.from_numpy(q))
+    x, y = np.floor(uv.numpy()).astype(int).T
+    h, w = nothing.reach.shape
+    lit = front.numpy() & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+    lit[lit] &= np.linalg.norm(q[lit], axis=1) < nothing.reach[y[lit], x[lit]]
+    return int((nothing.empty[row, column] & lit & (np.min(towards, 0) >= LIMITS.least_lit_cosine)).sum())
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
@@ -119,16 +138,17 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
     tolerance, width = Tolerance(0.03, 3.0), Tolerance(0.05, 4.0)  # each decides at some points
     found = agreement(*sides, stacked(*similarities), tolerance, width, limits)
     for k, S in enumerate(similarities):
-        H, g, shares, squares, cost = plain_sums(*sides, S, tolerance, width, 0.5)
-        assert shares.min() > 0.02  # every case is present
+        H, g, shares, squares, cost, absent = plain_sums(*sides, S, tolerance, width, 0.5)
+        assert min(shares.min(), absent) > 0.01  # every case is present
         np.testing.assert_allclose(found.H[k], H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
         np.testing.assert_allclose(found.g[k], g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
         np.testing.assert_allclose([found.agreeing[k], found.in_front[k], found.behind[k]], shares, rtol=1e-12)
         assert found.squares[k] == pytest.approx(squares, rel=1e-9)
         assert found.cost[k] == pytest.approx(cost, rel=1e-9)
         assert found.judged[k] == pytest.approx(shares.sum())
-        assert found.fitness[k] == pytest.approx(shares[0] / shares.sum())
-        assert found.score(3.0, 0.25)[k] == pytest.approx(shares[0] - 3 * (shares[1] + 0.25 * shares[2]))
+        assert found.absent[k] == pytest.approx(absent)
+        assert found.fitness[k] == pytest.approx(shares[0] / (shares.sum() + absent))
+        assert found.score(3.0, 0.25)[k] == pytest.approx(shares[0] - 3 * (shares[1] + absent + 0.25 * shares[2]))
 
 
 # ------------------------------------------------------------------ on surfaces
