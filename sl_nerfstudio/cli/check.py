@@ -44,12 +44,12 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     if result.faults:
         raise ScanError(result.faults, str(folder))
     from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
-    from sl_nerfstudio.verdict.shared_surface import decoded_shares_of_scan
+    from sl_nerfstudio.verdict.shared_surface import shared_surface_of_scan
 
     scan, said = result.scan, ""
     if scan is not None:
         cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
-        said = agreement(result, cross, decoded_shares_of_scan(scan))
+        said = agreement(result, cross, shared_surface_of_scan(scan).decoded)
     sys.stdout.write(summary(result) + said)
 
 

@@ -40,7 +40,8 @@ from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration, without_undecided
-from sl_nerfstudio.verdict.shared_surface import decoded_shares
+from sl_nerfstudio.verdict.missing_surface import missing_shares
+from sl_nerfstudio.verdict.shared_surface import SurfaceShares, shared_surface
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]
@@ -119,8 +120,8 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     registration = consistent.registration
     adjusted = within_stated_doubt(consistent.adjusted, job.stated)
     poses = find_scan_poses(clouds, registration, adjusted, inputs.known, given)
-    shared = _shared_decoded(job, results, registration, adjusted.poses)
-    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, shared, found, wrong)
+    shares = _surface_shares(job, results, registration, adjusted.poses)
+    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, shares, found, wrong)
     result = replace(result, captured=notes)
     if config.object_only:
         parts = find_object_only(job, results, registration, poses)
@@ -146,19 +147,17 @@ def _register(
     return choice.chosen, without_undecided(registration, choice.undecided)
 
 
-def _shared_decoded(
+def _surface_shares(
     job: FrameJob, results: Sequence[FrameStageResult], registration: Registration, poses: DevicePoses
-) -> list[float | None]:
-    """Of the surface that other frames show, how much each registered frame decoded, where it sees the pattern."""
+) -> list[SurfaceShares]:
+    """What each registered frame decoded, and should have seen, of the surface that others show."""
     index, worker = np.flatnonzero(registration.registered), FrameWorker(job)
     frames, clouds = [result for result in results if result.cloud is not None], clouds_of(results)
-    return decoded_shares(
-        [job.camera_of(frames[k].frame) for k in index],
-        job.projector,
-        poses[index],
-        (clouds[k].coords for k in index),
-        (worker.load(frames[k]).mask for k in index),
-    )
+    cameras, chosen = [job.camera_of(frames[k].frame) for k in index], poses[index]
+    coords, masks = (clouds[k].coords for k in index), (worker.load(frames[k]).mask for k in index)
+    shared = shared_surface(cameras, job.projector, chosen, coords, masks)
+    missing = missing_shares(cameras, job.projector, chosen, shared.points, (clouds[k].seen for k in index))
+    return [SurfaceShares(*both) for both in zip(shared.decoded, missing, strict=True)]
 
 
 def _require_clouds(

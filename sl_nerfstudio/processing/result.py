@@ -23,6 +23,7 @@ class FrameRecord:
     decode_rate: float | None = None  # of the visible pattern
     mask_share: float | None = None
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
+    missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's projector
     relative_sigma_rotation_deg: float | None = None  # of the projector against the camera, from this frame alone

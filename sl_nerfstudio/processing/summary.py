@@ -22,6 +22,7 @@ from sl_nerfstudio.registration.result import Registration, UncertainRotation
 from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
 from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
 from sl_nerfstudio.verdict.judge import judge_scan
+from sl_nerfstudio.verdict.shared_surface import SurfaceShares
 
 _ALONE = "too few other frames could be used"
 
@@ -53,17 +54,17 @@ def summarise(
     registration: Registration | None,
     poses: ScanPoses | None,
     cross: CrossFrameAgreement | None = None,
-    shared_decoded: Sequence[float | None] = (),
+    shares: Sequence[SurfaceShares] = (),
     found: FoundProjector | None = None,
     contradicted: str = "",
 ) -> ProcessResult:
     """The result of a run; without `poses` no frame is in a scan.
 
-    `cross` and `shared_decoded` (how much each decoded of what others show) are of the registered frames.
+    `cross` and `shares` (of what others show) are of the registered frames.
     `found`: the projector, if it was found from the frames. `contradicted`: which intrinsics the epipolar geometry
     contradicts; what the joint adjustment finds is said where this is empty.
     """
-    frames = _with_others([_record(result, registration, poses) for result in results], cross, shared_decoded)
+    frames = _with_others([_record(result, registration, poses) for result in results], cross, shares)
     edges = () if registration is None else registration.edges
     records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
     adjusted = None if poses is None else poses.adjusted
@@ -106,20 +107,20 @@ def summarise(
 
 
 def _with_others(
-    frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None, shared_decoded: Sequence[float | None]
+    frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None, shares: Sequence[SurfaceShares]
 ) -> tuple[FrameRecord, ...]:
     """The records with what the other frames say about each."""
     if cross is None:
         return tuple(frames)
-    found = iter(zip(cross.frames, shared_decoded or [None] * len(cross.frames), strict=True))
+    found = iter(zip(cross.frames, shares or [SurfaceShares(None, None)] * len(cross.frames), strict=True))
     return tuple(_agreeing(f, *next(found)) if f.in_scan else f for f in frames)
 
 
-def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shared_decoded: float | None) -> FrameRecord:
+def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shares: SurfaceShares) -> FrameRecord:
     figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
                "cross_excess": found.excess}  # fmt: skip
     known = {key: value for key, value in figures.items() if np.isfinite(value)}
-    return replace(frame, seen_share=found.seen, shared_decoded=shared_decoded, **known)
+    return replace(frame, seen_share=found.seen, shared_decoded=shares.decoded, missing_share=shares.missing, **known)
 
 
 def _facts(frame: FrameRecord) -> FrameFacts:
@@ -132,6 +133,7 @@ def _facts(frame: FrameRecord) -> FrameFacts:
         frame.sigma_rotation_deg,
         frame.decode_rate,
         frame.shared_decoded,
+        frame.missing_share,
         frame.own_share,
         bool(frame.degeneracies),
     )

@@ -55,7 +55,7 @@ def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device, margin: float) ->
     row, column = np.nonzero(pattern_seen)
     seen[_cell(row + 0.5, factor, camera.h), _cell(column + 0.5, factor, camera.w)] = True
     around = np.pad(seen, 1, constant_values=True)  # what is beside the image is not known
-    return distance_transform_edt(~around)[1:-1, 1:-1] > margin * max(camera.w, camera.h)
+    return np.asarray(distance_transform_edt(~around))[1:-1, 1:-1] > margin * max(camera.w, camera.h)
 
 
 def _reach(

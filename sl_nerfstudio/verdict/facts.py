@@ -16,6 +16,7 @@ class FrameFacts:
     sigma_rotation_deg: float | None = None  # of the camera in the scan, 1 sigma per axis
     decoded_share: float | None = None  # of the visible pattern
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
+    missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
     degenerate: bool = False  # the pose of its projector is determined weakly by the frame itself
 

@@ -31,6 +31,7 @@ def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     if facts.cross is not None:
         yield from cross_reasons([f.name for f in facts.in_scan], facts.cross, settings)
     yield from _decoding(facts, settings)
+    yield from _missing(facts, settings)
     degenerate = [f.name for f in facts.in_scan if f.degenerate]
     if len(degenerate) > settings.most_frames * len(facts.in_scan):
         yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
@@ -231,6 +232,21 @@ def _decoding(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
             others = f"; also little in {listed([n for _, n in weak if n != name])}" if len(weak) > 1 else ""
             band = _share_band(len(weak), len(facts.in_scan), settings)
             yield Reason(band, f"{name}: only {share:.0%} {words} (at least {least:.0%}){others}")
+
+
+def _missing(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Frames that saw nothing where others show a surface."""
+    most = settings.most_missing
+    found = [(f.missing_share, f.name) for f in facts.in_scan if f.missing_share is not None and f.missing_share > most]
+    if found:
+        worst_share = max(found)[0]
+        band = _share_band(len(found), len(facts.in_scan), settings)
+        yield Reason(
+            "poor" if worst_share > settings.largest_missing else band,
+            f"{listed([name for _, name in found])}: saw nothing of the pattern where other frames show a surface in "
+            f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {most:.0%}): something "
+            "cast a shadow, or frames are at the wrong place",
+        )
 
 
 def _share_band(count: int, total: int, settings: VerdictSettings) -> Band:

@@ -51,6 +51,23 @@ class CrossFrameSettings:
 
 
 @dataclass(frozen=True)
+class MissingSurfaceSettings:
+    """When a frame should have seen a surface."""
+
+    margin: float = 0.02
+    """Distance from all that a frame saw of the pattern, as a share of the image's longer side, beyond which it saw
+    nothing; as far inside the image and the pattern must a point lie."""
+    least_cosine: float = 0.35
+    """Cosine between a surface's normal and its rays to both devices above which it would be lit and seen."""
+    cells: int = 60
+    """Places along the longer side of an image at which it is known what lies nearest to the device."""
+    thickness: float = 0.08
+    """Distance behind what is nearest from which points count as hidden, as a share of the surface's radius."""
+    fewest_judged: int = 30
+    """Points below which nothing is said of a frame."""
+
+
+@dataclass(frozen=True)
 class VerdictSettings:
     """What makes a scan good, acceptable or poor. A single frame beyond a limit keeps it from being good."""
 
@@ -59,6 +76,10 @@ class VerdictSettings:
     least_decoded: float = 0.5
     """Share of the surface that other frames show which must be decoded in every frame; of the visible pattern, where
     others show too little."""
+    most_missing: float = 0.05
+    """Share of the surface that others show, and that a frame should have seen, of which it may have seen nothing."""
+    largest_missing: float = 0.12
+    """The same share beyond which the frame, or those that show the surface, must be at the wrong place."""
     least_own_share: float = 0.5
     """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
     pose could explain the majority."""

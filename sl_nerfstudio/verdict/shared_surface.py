@@ -5,10 +5,11 @@ decoded. That says nothing against the frame. What the others decoded does: it i
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
@@ -24,9 +25,34 @@ from sl_nerfstudio.threads import one_library_thread
 from sl_nerfstudio.verdict.settings import CrossFrameSettings
 
 
-def decoded_shares_of_scan(scan: Scan, settings: CrossFrameSettings | None = None) -> list[float | None]:
-    """The same as `decoded_shares`, with the files of a scan and its own poses."""
-    return decoded_shares(
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points of all frames, spread over what each decoded."""
+
+    p_world: Float64[ndarray, "n 3"]
+    normal: Float64[ndarray, "n 3"]
+    source: Int64[ndarray, "n"]  # the frame that shows it
+
+
+@dataclass(frozen=True)
+class SurfaceShares:
+    """What one frame has of the surface that others show; None where too little is known."""
+
+    decoded: float | None  # see `shared_surface`
+    missing: float | None  # see `missing_surface.missing_shares`
+
+
+@dataclass(frozen=True)
+class SharedSurface:
+    """What the frames of a scan show of each other's surface."""
+
+    points: SurfacePoints
+    decoded: tuple[float | None, ...]  # see `shared_surface`
+
+
+def shared_surface_of_scan(scan: Scan, settings: CrossFrameSettings | None = None) -> SharedSurface:
+    """The same as `shared_surface`, with the files of a scan and its own poses."""
+    return shared_surface(
         [f.camera for f in scan.frames],
         scan.projector,
         scan.poses,
@@ -37,32 +63,35 @@ def decoded_shares_of_scan(scan: Scan, settings: CrossFrameSettings | None = Non
 
 
 @one_library_thread()
-def decoded_shares(
+def shared_surface(
     cameras: Sequence[Device],
     projector: Device,
     poses: DevicePoses,
     coords: Iterable[Float32[ndarray, "_h _w 2"]],
     masks: Iterable[Bool[ndarray, "_h _w"]],
     settings: CrossFrameSettings | None = None,
-) -> list[float | None]:
+) -> SharedSurface:
     """Of the points of other frames that lie where a frame sees the pattern, the share that it decoded.
 
     `masks`: where each frame sees the pattern. None for a frame on which too few points lie.
     """
     s = settings or CrossFrameSettings()
     maps = CoordinateMaps.of(torch.from_numpy(image) for image in coords)
-    rig = Rig.of(cameras, projector, poses, Similarity.identity())
-    anchors = place_anchors(rig, maps, s.pixels_of_each(rig.frames), torch.Generator().manual_seed(0))
-    T = rig.T_world_camera[anchors.frame]
-    p_world = transform(T, anchors.depth[:, None] * anchors.d_camera).numpy()
-    normal, source = rotate(T, anchors.normal).numpy(), anchors.frame.numpy()
+    points = _points(Rig.of(cameras, projector, poses, Similarity.identity()), maps, s)
     shares: list[float | None] = []
     for k, mask in enumerate(masks):
-        uv, inside = world_pixels(cameras[k], poses.T_world_camera[k], p_world)
-        sight = poses.T_world_camera[k, :3, 3] - p_world
-        facing = (sight * normal).sum(1) > s.least_cosine * np.linalg.norm(sight, axis=1)
-        column, row = uv[inside & facing & (source != k)].astype(np.int64).T
+        uv, inside = world_pixels(cameras[k], poses.T_world_camera[k], points.p_world)
+        sight = poses.T_world_camera[k, :3, 3] - points.p_world
+        facing = (sight * points.normal).sum(1) > s.least_cosine * np.linalg.norm(sight, axis=1)
+        column, row = uv[inside & facing & (points.source != k)].astype(np.int64).T
         decoded = maps.image(k).isfinite().all(-1).numpy()
         found = decoded[row, column][(mask | decoded)[row, column]]
         shares.append(float(found.mean()) if len(found) >= s.fewest_judged else None)
-    return shares
+    return SharedSurface(points, tuple(shares))
+
+
+def _points(rig: Rig, maps: CoordinateMaps, settings: CrossFrameSettings) -> SurfacePoints:
+    anchors = place_anchors(rig, maps, settings.pixels_of_each(rig.frames), torch.Generator().manual_seed(0))
+    T = rig.T_world_camera[anchors.frame]
+    p_world = transform(T, anchors.depth[:, None] * anchors.d_camera).numpy()
+    return SurfacePoints(p_world, rotate(T, anchors.normal).numpy(), anchors.frame.numpy())

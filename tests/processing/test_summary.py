@@ -15,6 +15,7 @@ from sl_nerfstudio.processing.summary import left_out, summarise
 from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation
+from sl_nerfstudio.verdict.shared_surface import SurfaceShares
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 
@@ -58,7 +59,7 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
         figures = vars(frame)
         assert figures["fitness"] > 0.9
         assert figures["relative_sigma_rotation_deg"] < 0.01 and figures["relative_sigma_direction_deg"] < 0.01
-        assert 0 < figures["sigma_rotation_deg"] < 0.1 and frame.component == 0 and not frame.undecided
+        assert 0 < figures["sigma_rotation_deg"] < 0.12 and frame.component == 0 and not frame.undecided
         assert figures["own_share"] > 0.95
     assert result.joint_px is not None
     before, after = result.joint_px
@@ -67,10 +68,14 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
     assert set(result.versions) == {"sl_nerfstudio", "numpy", "torch"}
 
 
+SHARES = [SurfaceShares(0.9, 0.0), SurfaceShares(0.8, 0.01), SurfaceShares(None, None), SurfaceShares(0.7, 0.02)]
+
+
 def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results, registration, poses):
     cross = compare_registered(clouds_of(results), registration, poses.adjusted)
-    result = summarise(config, "ramps", results, registration, poses, cross, [0.9, 0.8, None, 0.7])
+    result = summarise(config, "ramps", results, registration, poses, cross, SHARES)
     assert [frame.shared_decoded for frame in result.frames] == [0.9, 0.8, None, 0.7]
+    assert [frame.missing_share for frame in result.frames] == [0.0, 0.01, None, 0.02]
     assert (
         result.verdict.band == "good" and result.document()["verdict"] == "good" and result.document()["reasons"] == []
     )

@@ -7,7 +7,7 @@ from sl_nerfstudio.geometry.similarity import Similarity
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from sl_nerfstudio.verdict.shared_surface import decoded_shares, decoded_shares_of_scan
+from sl_nerfstudio.verdict.shared_surface import shared_surface, shared_surface_of_scan
 
 FRAMES, EMPTIED = 12, 5
 
@@ -21,7 +21,8 @@ def scan(tmp_path_factory):
 
 
 def shares(scan, coords, masks, poses=None):
-    return decoded_shares([f.camera for f in scan.frames], scan.projector, poses or scan.poses, coords, masks)
+    cameras = [f.camera for f in scan.frames]
+    return shared_surface(cameras, scan.projector, poses or scan.poses, coords, masks).decoded
 
 
 def read(scan):
@@ -29,7 +30,7 @@ def read(scan):
 
 
 def test_where_all_is_decoded_so_is_what_the_others_show(scan):
-    assert min(decoded_shares_of_scan(scan)) > 0.97
+    assert min(shared_surface_of_scan(scan).decoded) > 0.97
 
 
 def test_what_no_frame_decoded_says_nothing_against_any(scan):

@@ -115,6 +115,8 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
         ("Decoded: share of the visible pattern, and of the surface that other frames show", "%",
          [charts.Bars("pattern", values("decode_rate", 100.0)),
           charts.Bars("surface", values("shared_decoded", 100.0))]),
+        ("Missing: of the surface that other frames show in the sight of both devices, where no pattern was seen", "%",
+         [charts.Bars("missing", values("missing_share", 100.0))]),
         ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
          [charts.Bars("epipolar", values("epipolar_px"))]),
         ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
