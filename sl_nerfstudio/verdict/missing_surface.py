@@ -45,7 +45,7 @@ def missing_shares(
         uv, visible = _in_sight(cameras[k], poses.T_world_camera[k], points, thickness, s)
         _, lit = _in_sight(projector, poses.T_world_projector[k], points, thickness, s)
         column, row = uv[visible & lit & (points.source != k)].astype(np.int64).T
-        far = distance_transform_edt(~pattern_seen) > s.margin * max(pattern_seen.shape)
+        far = np.asarray(distance_transform_edt(~pattern_seen)) > s.margin * max(pattern_seen.shape)
         shares.append(float(far[row, column].mean()) if len(row) >= s.fewest_judged else None)
     return shares
 
