@@ -22,7 +22,7 @@ from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import angle_deg
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.reinclusion import include_left_out, with_relative_pose
+from sl_nerfstudio.registration.reinclusion import include_left_out, with_edges_at_poses, with_relative_pose
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     PairsContradict,
@@ -163,7 +163,8 @@ def _with_places(
     """The registration at adjusted poses, with some frames where they were placed."""
     T, baseline = poses.T_world_camera.copy(), poses.baseline.copy()
     T[turned], baseline[turned] = placed.T_world_camera[turned], placed.baseline[turned]
-    return replace(registration, T_world_camera=T, baseline=baseline)
+    moved = replace(registration, T_world_camera=T, baseline=baseline)
+    return with_edges_at_poses(moved, [registration.names[k] for k in turned])
 
 
 def _undecidable(registration: Registration) -> set[int]:

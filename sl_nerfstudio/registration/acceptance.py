@@ -65,8 +65,8 @@ def accept_frames(
         np.where(registered, fitness, np.nan),
         tuple(
             Edge(
-                (names[e.source], names[e.target]), e.overlap, e.fitness, bool(used), is_ambiguous(e, settings.edge),
-                e.rotation_sigma_deg, e.by_tone,
+                (names[e.source], names[e.target]), e.S_target_source.R, e.overlap, e.fitness, bool(used),
+                is_ambiguous(e, settings.edge), e.rotation_sigma_deg, e.by_tone,
             )
             for e, used in zip(edges, solution.consistent, strict=True)
         ),

@@ -4,7 +4,7 @@ Before the joint adjustment every surface is bent by the errors of its own relat
 Afterwards a weak frame has to agree with surfaces that are known far better.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +12,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.assembly import Assembly, Component
 from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.result import Edge, Registration
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
 from sl_nerfstudio.registration.view_graph import ViewGraph, split_by_slip
@@ -76,11 +76,22 @@ def include_left_out(
     strict = replace(settings.assembly, misfit_factor=settings.assembly.inner_misfit_factor)
     assembly = Assembly(graph.sides, graph.pivots, firm, replace(settings, assembly=strict), used or None, slipping)
     placed: Component = {}
-    for k in left_out:
-        joint = assembly.decide(main, {k: Similarity.identity()})
+    singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
+    for block in (*_blocks(registration, left_out), *singles):
+        joint = None if block.keys() <= placed.keys() else assembly.decide(main, block)
         if joint is not None and joint.links > 1:
-            placed[k] = joint.S_first_second
+            placed |= {k: joint.S_first_second @ S for k, S in block.items()}
     return _with_frames(registration, adjusted, placed)
+
+
+def _blocks(registration: Registration, left_out: Sequence[int]) -> list[Component]:
+    """Frames that registration connected with each other but not with the rest: together they may be certain."""
+    number = {registration.names[k]: k for k in left_out}
+    blocks: list[Component] = []
+    for one in registration.separate:
+        rows = zip(one.frames, one.baseline.tolist(), one.T_world_camera, strict=True)
+        blocks.append({number[name]: Similarity(b, T[:3, :3], T[:3, 3]) for name, b, T in rows if name in number})
+    return [block for block in blocks if len(block) > 1]
 
 
 def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Component) -> Registration:
@@ -91,7 +102,7 @@ def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Comp
         T[k] = np.eye(4)
         T[k, :3, :3], T[k, :3, 3] = S.R, S.t
     names = {registration.names[k] for k in placed}
-    return replace(
+    found = replace(
         registration,
         registered=registered,
         component=component,
@@ -100,3 +111,21 @@ def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Comp
         fitness=fitness,
         exclusions=tuple(e for e in registration.exclusions if e.frame not in names),
     )
+    return with_edges_at_poses(found, names)
+
+
+def with_edges_at_poses(
+    registration: Registration, frames: Collection[str], settings: RegistrationSettings = REGISTRATION_DEFAULTS
+) -> Registration:
+    """The registration; pairs of `frames`, which stand elsewhere now, are used if they say the same rotation."""
+    T = dict(zip(registration.names, registration.T_world_camera, strict=True))
+
+    def says_the_same(edge: Edge) -> bool:
+        first, second = (T[name][:3, :3] for name in edge.frames)
+        if not np.isfinite([first, second]).all():
+            return False
+        limit_deg = settings.pair.same_rotation_deg + settings.pair.kernel_sigmas * edge.rotation_sigma_deg
+        return angle_deg(edge.R_second_first @ first.T @ second) <= limit_deg
+
+    edges = (replace(e, used=says_the_same(e)) if set(e.frames) & set(frames) else e for e in registration.edges)
+    return replace(registration, edges=tuple(edges))

@@ -13,6 +13,7 @@ class Edge:
     """Two frames that were registered with each other."""
 
     frames: tuple[str, str]
+    R_second_first: Float64[ndarray, "3 3"]  # between their cameras, as the pair says it
     overlap: float  # share of the points that agree
     fitness: float  # share of those that could be judged
     used: bool  # False: inconsistent with the other pairs

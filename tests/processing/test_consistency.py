@@ -17,10 +17,12 @@ from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, Relocal
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
+from sl_nerfstudio.registration.assembly import Assembly
 from sl_nerfstudio.registration.frame_cloud import frame_cloud
 from sl_nerfstudio.registration.reinclusion import include_left_out
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
+    Edge,
     NoCommonSurface,
     PairsContradict,
     Registration,
@@ -185,6 +187,42 @@ def test_only_frames_that_are_asked_for_are_placed(clouds):
     assert registration_gaps(one) == [1] and [e.frame for e in one.exclusions] == [NAMES[1]]
     for found in (both, one):
         np.testing.assert_allclose(found.T_world_camera[MOVED], true.T_world_camera[MOVED], atol=0.02)
+
+
+def test_frames_that_are_connected_with_each_other_are_placed_together(clouds, monkeypatch):
+    """Each by itself is not certain enough here; the axes of a group, and its unit, are its own."""
+    true = registration_of(RIG.T_world_camera.numpy())
+    start = without_groups(true, [[1, MOVED]])
+    poses = find_registered_minimum(clouds, start, QUICK).frames.poses
+    (block,) = start.separate
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), [5.0, 1.0, -2.0]
+    T = turn @ block.T_world_camera
+    T[:, :3, 3] *= 2.5
+    start = replace(start, separate=(replace(block, T_world_camera=T, baseline=2.5 * block.baseline),))
+    decide = Assembly.decide
+    monkeypatch.setattr(Assembly, "decide", lambda self, a, b: decide(self, a, b) if len(b) > 1 else None)
+    found = include_left_out(clouds, start, poses, [1, MOVED])
+    assert found.registered.all() and found.exclusions == ()
+    np.testing.assert_allclose(found.T_world_camera[[1, MOVED]], true.T_world_camera[[1, MOVED]], atol=0.03)
+    np.testing.assert_allclose(found.baseline, true.baseline, rtol=0.01)
+
+
+def test_pairs_of_a_frame_that_was_placed_are_used_if_they_say_the_same(clouds):
+    """Before, they were not: their frames stood in different components."""
+    true = registration_of(RIG.T_world_camera.numpy())
+    R = true.T_world_camera[:, :3, :3]
+    turn = Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix()
+    edges = tuple(
+        Edge((NAMES[i], NAMES[j]), wrong @ R[j].T @ R[i], 0.5, 0.9, used, False, 1.0)
+        for i, j, wrong, used in ((0, MOVED, np.eye(3), False), (MOVED, 4, turn, False), (0, 4, turn, False),
+                                  (0, 2, np.eye(3), True), (1, MOVED, np.eye(3), True))
+    )  # fmt: skip
+    start = replace(without_groups(true, [[1], [MOVED]]), edges=edges)
+    poses = find_registered_minimum(clouds, start, QUICK).frames.poses
+    found = include_left_out(clouds, start, poses, [MOVED])
+    assert registration_gaps(found) == [1]
+    assert [edge.used for edge in found.edges] == [True, False, False, True, False]
 
 
 def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_show(monkeypatch):
