@@ -240,9 +240,8 @@ def _missing(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
     found = [(f.missing_share, f.name) for f in facts.in_scan if f.missing_share is not None and f.missing_share > most]
     if found:
         worst_share = max(found)[0]
-        band = _share_band(len(found), len(facts.in_scan), settings)
         yield Reason(
-            "poor" if worst_share > settings.largest_missing else band,
+            _share_band(len(found), len(facts.in_scan), settings),
             f"{listed([name for _, name in found])}: saw nothing of the pattern where other frames show a surface in "
             f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {most:.0%}): something "
             "cast a shadow, or frames are at the wrong place",

@@ -77,9 +77,8 @@ class VerdictSettings:
     """Share of the surface that other frames show which must be decoded in every frame; of the visible pattern, where
     others show too little."""
     most_missing: float = 0.05
-    """Share of the surface that others show, and that a frame should have seen, of which it may have seen nothing."""
-    largest_missing: float = 0.12
-    """The same share beyond which the frame, or those that show the surface, must be at the wrong place."""
+    """Share of the surface that others show, and that a frame should have seen, of which it may have seen nothing; in a
+    single frame, something may have cast a shadow."""
     least_own_share: float = 0.5
     """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
     pose could explain the majority."""
