@@ -41,7 +41,7 @@ def box(tmp_path_factory):
     return rendered(str(file), FRAMES)
 
 
-@pytest.mark.parametrize("scene", ["frog", "chair", "vase"])
+@pytest.mark.parametrize("scene", ["chair", "vase"])
 def test_right_frames_miss_nothing_of_each_other(scene):
     found = rendered(scene, FRAMES)
     maps = [build_surface_map(cloud) for cloud in seen_by(found.clouds)]

@@ -36,7 +36,7 @@ def missing(scan, poses=None, seen=None):
     return missing_shares(cameras, scan.projector, poses, points, seen or masks)
 
 
-@pytest.mark.parametrize("scene", ["chair", "vase", "dog"])
+@pytest.mark.parametrize("scene", ["chair", "vase"])
 def test_right_frames_miss_nothing(scene, tmp_path):
     """Thin legs, an inside, and shadows that parts cast on each other."""
     found = missing(scan_of(scene, tmp_path))
