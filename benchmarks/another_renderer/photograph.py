@@ -160,9 +160,9 @@ def _seen(
     p, n = hits.p_world[met], hits.normal[met]
     sent = _sent(scene, projection, view, p, n)
     room = look.room_light * (0.7 + 0.3 * n[:, 2] + 0.25 * np.maximum(n @ np.array([0.5, -0.6, 0.62]), 0))
-    half = _unit(eye - p) - rays[met]
-    half /= np.sqrt(dots(half, half))[:, None]
-    cosine = np.maximum(dots(n, _unit(eye - p)), 1e-6)
+    to_eye = _unit(eye - p)
+    half = _unit(to_eye - rays[met])
+    cosine = np.maximum(dots(n, to_eye), 1e-6)
     shine = look.gloss * np.maximum(dots(n, half), 0) ** 40
     result, on_object = np.zeros((len(rays), 3)), np.zeros(len(rays), dtype=np.float32)
     result[met] = _albedo(paints, hits)[met] * (sent + room)[:, None] + (shine * sent / cosine)[:, None]
@@ -174,7 +174,7 @@ def _sent(scene: Scene, projection: Projection, view: View, p: ndarray, n: ndarr
     """The projector's light (m,) on surfaces at points (m, 3) with normals (m, 3)."""
     eye = view.T_projector[:3, 3]
     distance = np.linalg.norm(eye - p, axis=1)
-    cosine = np.maximum(dots(n, _unit(eye - p)), 0)
+    cosine = np.maximum(dots(n, eye - p) / distance, 0)
     light = projection.light(projection.lens.pixels(into_device(view.T_projector, p)), distance, view.focus_projector)
     reached = np.nonzero((cosine > 0) & (light > 0))[0]
     lit = np.zeros(len(p))

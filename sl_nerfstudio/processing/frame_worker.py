@@ -118,11 +118,12 @@ class FrameWorker:
 
     def load(self, result: FrameStageResult) -> Decoded:
         """The maps of a frame, matched if it was, whichever worker stored them. Raises UserError if there are none."""
-        return self._selected(result.name, self._stored(result, result.matched or result.key))
+        return self.load_with_seen(result)[0]
 
-    def seen(self, result: FrameStageResult) -> Bool[ndarray, "h w"]:
-        """Where the camera saw the pattern of a frame, whatever the user's mask selects."""
-        return self._stored(result, result.matched or result.key).mask
+    def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
+        """The same, and where the camera saw the pattern, whatever the user's mask selects."""
+        stored = self._stored(result, result.matched or result.key)
+        return self._selected(result.name, stored), stored.mask
 
     def _calibrated(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
         job, camera = self._job, self._job.camera_of(result.frame)

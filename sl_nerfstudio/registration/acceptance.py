@@ -126,7 +126,7 @@ def _fitness_of(
     S, settings = solution.S_world_camera[k], graph.settings.pair
     if S is None or not connected[k]:
         return 0.0
-    agreeing = judged = 0.0
+    agreeing = expected = 0.0
     for j in np.flatnonzero(connected).tolist():
         other = solution.S_world_camera[j]
         if j == k or other is None or not graph.see_same_side(S, other):
@@ -134,8 +134,8 @@ def _fitness_of(
         maps = graph.maps[k], graph.maps[j]
         found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
         agreeing += found.agreeing[0]
-        judged += found.judged[0] + found.absent[0]
-    return agreeing / judged if judged else 0.0
+        expected += found.expected[0]
+    return agreeing / expected if expected else 0.0
 
 
 def _in_first_camera(

@@ -5,14 +5,16 @@ wherever one lies on the other; but where the larger one ends, the frame of the 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
-from scipy.ndimage import distance_transform_edt, minimum_filter
+from scipy.ndimage import distance_transform_edt
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.devices.models import for_loops
+from sl_nerfstudio.geometry.nearest_distances import nearest_distances
 from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.settings import EmptyPlaceSettings
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
@@ -27,7 +29,7 @@ class EmptyPlaces:
     T_projector_camera: Float64[ndarray, "4 4"]
     reach: Float64[ndarray, "a b"]  # how far from the projector a surface would be lit: up to what was seen; see below
 
-    @property
+    @cached_property
     def light(self) -> tuple[int, Float64[ndarray, "8"], Float64[ndarray, "4 4"], Float64[ndarray, "a b"]]:
         """The projector, its pose and `reach`, for compiled loops."""
         return *for_loops(self.projector), self.T_projector_camera, self.reach
@@ -63,10 +65,8 @@ def _reach(
 ) -> Float64[ndarray, "a b"]:
     uv = correspondences_of(cloud.coords)[1]
     distance = np.linalg.norm(cloud.points @ T_projector_camera[:3, :3].T + T_projector_camera[:3, 3], axis=1)
-    nearest = np.full((projector.h, projector.w), np.inf)
     cells = _cell(uv[:, 1], factor, projector.h), _cell(uv[:, 0], factor, projector.w)
-    np.minimum.at(nearest, cells, distance)
-    reach = minimum_filter(nearest, 3)
+    reach = nearest_distances(cells, distance, (projector.h, projector.w))
     reach[[0, -1]] = reach[:, [0, -1]] = 0.0
     return reach
 

@@ -33,6 +33,10 @@ class FrameCloud:
     seen: Bool[ndarray, "h w"] | None = None  # where the camera saw the pattern, decoded or not; None: not known
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
+    def with_pose(self, projector: Device, pose: RelativePose) -> "FrameCloud":
+        """The same coordinates with another projector, or another pose of it. Raises as `frame_cloud` does."""
+        return frame_cloud(self.name, self.coords, self.camera, projector, pose, light=self.light, seen=self.seen)
+
     @property
     def sigma(self) -> Float64[ndarray, "n"]:
         """One standard deviation along the camera ray, without that of the unknown length of the baseline."""

@@ -14,7 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
 from sl_nerfstudio.registration.assembly import Assembly, Component
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Edge, Registration
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
 from sl_nerfstudio.registration.surface_map import build_surface_map
@@ -40,9 +40,7 @@ def with_relative_pose(
         noise_px=old.noise_px[old.inliers],
         alternatives=(),
     )
-    return frame_cloud(
-        cloud.name, cloud.coords, cloud.camera, cloud.projector, pose, light=cloud.light, seen=cloud.seen
-    )
+    return cloud.with_pose(cloud.projector, pose)
 
 
 @one_library_thread()

@@ -10,10 +10,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
-from scipy.ndimage import distance_transform_edt, minimum_filter
+from scipy.ndimage import distance_transform_edt
 
 from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.nearest_distances import nearest_distances
 from sl_nerfstudio.geometry.rays import world_pixels
 from sl_nerfstudio.threads import one_library_thread
 from sl_nerfstudio.verdict.settings import MissingSurfaceSettings
@@ -56,15 +57,13 @@ def _in_sight(
 ) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, "n"]]:  # fmt: skip
     """Pixels of all points, and which of them face the device and are not hidden from it by others."""
     uv, inside = world_pixels(device, T_world_device, points.p_world)
-    sight = T_world_device[:3, 3] - points.p_world
-    distance = np.linalg.norm(sight, axis=1)
+    distance, cosine = points.sights(T_world_device[:3, 3])
     border = settings.margin * max(device.w, device.h)
     inner = inside & (uv > border).all(1) & (uv < np.array([device.w, device.h]) - border).all(1)
-    facing = (sight * points.normal).sum(1) > settings.least_cosine * distance
     factor = settings.cells / max(device.w, device.h)
-    nearest = np.full((int(device.h * factor) + 1, int(device.w * factor) + 1), np.inf)
     column, row = (uv[inside] * factor).astype(np.int64).T
-    np.minimum.at(nearest, (row, column), distance[inside])
+    shape = int(device.h * factor) + 1, int(device.w * factor) + 1
+    nearest = nearest_distances((row, column), distance[inside], shape)
     open_to = np.zeros(len(uv), dtype=bool)
-    open_to[inside] = distance[inside] < minimum_filter(nearest, 3)[row, column] + thickness
-    return uv, inner & facing & open_to
+    open_to[inside] = distance[inside] < nearest[row, column] + thickness
+    return uv, inner & (cosine > settings.least_cosine) & open_to

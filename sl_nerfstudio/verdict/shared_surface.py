@@ -33,6 +33,12 @@ class SurfacePoints:
     normal: Float64[ndarray, "n 3"]
     source: Int64[ndarray, "n"]  # the frame that shows it
 
+    def sights(self, centre: Float64[ndarray, "3"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
+        """Distances from a device at `centre`, and the cosines between the normals and the way there."""
+        sight = centre - self.p_world
+        distance = np.linalg.norm(sight, axis=1)
+        return distance, (sight * self.normal).sum(1) / distance
+
 
 @dataclass(frozen=True)
 class SurfaceShares:
@@ -81,9 +87,8 @@ def shared_surface(
     shares: list[float | None] = []
     for k, mask in enumerate(masks):
         uv, inside = world_pixels(cameras[k], poses.T_world_camera[k], points.p_world)
-        sight = poses.T_world_camera[k, :3, 3] - points.p_world
-        facing = (sight * points.normal).sum(1) > s.least_cosine * np.linalg.norm(sight, axis=1)
-        column, row = uv[inside & facing & (points.source != k)].astype(np.int64).T
+        _, cosine = points.sights(poses.T_world_camera[k, :3, 3])
+        column, row = uv[inside & (cosine > s.least_cosine) & (points.source != k)].astype(np.int64).T
         decoded = maps.image(k).isfinite().all(-1).numpy()
         found = decoded[row, column][(mask | decoded)[row, column]]
         shares.append(float(found.mean()) if len(found) >= s.fewest_judged else None)

@@ -17,7 +17,7 @@ from sl_nerfstudio.processing.config import Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
 from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
 from sl_nerfstudio.processing.projector.found import FoundProjector
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.relative_pose.estimation import relative_pose_near
 from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
@@ -122,8 +122,7 @@ def with_projector(clouds: Sequence[FrameCloud], consistent: ConsistentFrames, p
     for k, cloud in enumerate(clouds):
         T = poses.T_camera_projector[k] if consistent.registration.registered[k] else cloud.pose.T_camera_projector
         pose = relative_pose_near(T, *correspondences_of(cloud.coords), cloud.camera, projector)
-        moved = frame_cloud(cloud.name, cloud.coords, cloud.camera, projector, pose, light=cloud.light, seen=cloud.seen)
-        out.append(kept.kept(moved))
+        out.append(kept.kept(cloud.with_pose(projector, pose)))
     return out
 
 

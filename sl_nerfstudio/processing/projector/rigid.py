@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoded import Decoded
 from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, with_kept_cloud
@@ -28,10 +30,10 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
     Frames that have none alone, because they show a plane, say, get it as well. Raises UserError if no pose fits.
     """
     worker = FrameWorker(job)
-    decoded = {result.name: worker.load(result) for result in results if result.key}
+    decoded = {result.name: worker.load_with_seen(result) for result in results if result.key}
     rng = np.random.default_rng(job.seed)
     parts = []
-    for one in decoded.values():
+    for one, _ in decoded.values():
         uv_camera, uv_projector = correspondences_of(one.coords)
         keep = subsample(np.arange(len(uv_camera)), _MOST_PER_FRAME, rng)
         parts.append((uv_camera[keep], uv_projector[keep]))
@@ -41,7 +43,7 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
     common = estimate_relative_pose(uv_camera, uv_projector, job.camera, job.projector, job.seed)
     clouds = LargeClouds()
     return [
-        with_kept_cloud(_with_pose(worker, job, result, decoded[result.name], common), clouds)
+        with_kept_cloud(_with_pose(job, result, *decoded[result.name], common), clouds)
         if result.name in decoded
         else result
         for result in track(results, "calibrating with one pose", len(results))
@@ -49,14 +51,14 @@ def with_one_pose(job: FrameJob, results: Sequence[FrameStageResult]) -> list[Fr
 
 
 def _with_pose(
-    worker: FrameWorker, job: FrameJob, result: FrameStageResult, decoded: Decoded, common: RelativePose
+    job: FrameJob, result: FrameStageResult, decoded: Decoded, seen: Bool[ndarray, "h w"], common: RelativePose
 ) -> FrameStageResult:
     T, coords = common.T_camera_projector, decoded.coords
     own = relative_pose_near(T, *correspondences_of(coords), job.camera, job.projector, job.seed)
     pose = replace(own, T_camera_projector=T, covariance=common.covariance, degeneracies=common.degeneracies)
     try:
         cloud: FrameCloud | None = frame_cloud(
-            result.name, coords, job.camera, job.projector, pose, light=decoded.light, seen=worker.seen(result)
+            result.name, coords, job.camera, job.projector, pose, light=decoded.light, seen=seen
         )
     except RelativePoseError as error:
         return replace(result, cloud=None, stage="calibrating", reason=f"{result.frame.images[0]}: {error}")

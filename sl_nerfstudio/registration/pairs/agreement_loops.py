@@ -88,7 +88,7 @@ def _on_surface(place, valid, some):
 
 @compiled
 def _absent(mapped, place, empty, light, least_cosine):
-    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces.for_loops`."""
+    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
     code, projector, T, reach = light
     h, w = reach.shape
     count = 0

@@ -71,12 +71,17 @@ class Agreement:
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
         """Of the points that could be judged, or should be seen and are not, the fraction that agree."""
-        return self.agreeing / (self.judged + self.absent).clip(1e-9)
+        return self.agreeing / self.expected.clip(1e-9)
 
     @property
     def judged(self) -> Float64[ndarray, "k"]:
         """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
         return self.agreeing + self.in_front + self.behind
+
+    @property
+    def expected(self) -> Float64[ndarray, "k"]:
+        """Fraction of the points that the other camera should have seen: what could be judged, and absent ones."""
+        return self.judged + self.absent
 
     def contradicting(self, behind: float) -> Float64[ndarray, "k"]:
         """Fraction that contradicts, of which points behind count as `behind`."""
