@@ -24,16 +24,20 @@ import torch
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.scans import made_once
-from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
-from sl_nerfstudio.bundle_adjustment.cross_validation import cross_validate
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, gauge_projection, restore
-from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust, cross_validate
+from sl_nerfstudio.bundle_adjustment.parameters import baseline_scale, gauge_projection, restore
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.cores import cores
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.geometry.se3 import inverse, log_se3
-from sl_nerfstudio.model.pose_refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
+from sl_nerfstudio.evaluation.reference import compare_poses
+from sl_nerfstudio.geometry.lie import inverse, log_se3
+from sl_nerfstudio.model.pose_refinement import (
+    PriorConfig,
+    maps_and_held_out,
+    pose_prior,
+    scene_rig,
+)
+from sl_nerfstudio.parallel import cores
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
 

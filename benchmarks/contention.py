@@ -19,7 +19,7 @@ from pathlib import Path
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.whole_runs import run
-from sl_nerfstudio.cores import cores
+from sl_nerfstudio.parallel import cores
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,18 @@ from numpy import ndarray
 
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import disturb_image
-from sl_nerfstudio.synthesis.setup import Setup, Stream, make_setup, random_stream
-from sl_nerfstudio.synthesis.synthesise import GAIN
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import (
+    GAIN,
+    Setup,
+    Stream,
+    make_setup,
+    random_stream,
+)
 
 
 @dataclass(frozen=True)

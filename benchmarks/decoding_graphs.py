@@ -13,9 +13,8 @@ import tyro
 from benchmarks.baselines.window_matching import match_windows
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.decoding.grid.gcn import turned_pattern
-from sl_nerfstudio.decoding.grid.graph import neighbourhoods
-from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
+from sl_nerfstudio.decoding.grid_detection import NodeRecogniser
+from sl_nerfstudio.decoding.grid_graph import neighbourhoods, turned_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, DamagedGraph, damage_graph
 

@@ -24,13 +24,11 @@ import tyro
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.pattern.boards import Chessboard
 from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.synthesis.boards.captures import write_photographs
-from sl_nerfstudio.synthesis.boards.photographs import BoardPhotographer
-from sl_nerfstudio.synthesis.boards.poses import make_board_scene
+from sl_nerfstudio.storage import NewFolder
+from sl_nerfstudio.synthesis.boards import BoardPhotographer, make_board_scene, write_photographs
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import DevicePair
 from sl_nerfstudio.synthesis.synthesise import synthesise

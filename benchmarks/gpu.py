@@ -30,14 +30,14 @@ from benchmarks.common.machine import describe
 from benchmarks.common.scans import made_once
 from benchmarks.common.training import Training, model_of, settings
 from sl_nerfstudio.errors import first_line
-from sl_nerfstudio.evaluation.evaluate import score_alignments
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.inputs import read_ground_truth, read_reference
+from sl_nerfstudio.evaluation.evaluate import read_reference, score_alignments
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.meshing.extract import extract_mesh
-from sl_nerfstudio.meshing.trim import trim_to_observed
+from sl_nerfstudio.meshing.visibility import trim_to_observed
+from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.scan.write import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.threads import one_library_thread
 
 METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
 _GROUPS = 10  # of timed steps; their median counts

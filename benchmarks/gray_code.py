@@ -17,10 +17,14 @@ import tyro
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.rays import pixel_centres
-from sl_nerfstudio.geometry.similarity import fit_similarity
-from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import fit_similarity
+from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.scan import Frame, Scan, read_scan
 
 

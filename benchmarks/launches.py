@@ -23,7 +23,7 @@ from benchmarks.common.scans import made_once
 from benchmarks.common.training import Training, data_of, model_of, settings
 from benchmarks.pretended.gpu import PretendedGpu
 from benchmarks.pretended.recorder import PretendedRecorder
-from sl_nerfstudio.model.training.step_graph import WARM_UP
+from sl_nerfstudio.model.loop import WARM_UP
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 Backend = Literal["torch", "warp"]

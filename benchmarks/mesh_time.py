@@ -111,7 +111,7 @@ def main() -> None:
     config = tyro.cli(Config)
     name, field, device = "torus", torus, torch.device("cpu")
     if config.load_config is not None:
-        from sl_nerfstudio.runs.trained_run import load_run
+        from sl_nerfstudio.runs.run import load_run
 
         model = load_run(config.load_config).model
         name, field, device = "trained field", model.sdf, model.device

@@ -23,13 +23,12 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from benchmarks.common.machine import write_rows
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.render import visible_centres
-from sl_nerfstudio.synthesis.setup import make_setup
-from sl_nerfstudio.synthesis.synthesise import synthesise
+from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 WRONG_PX = 2.0
 _NO_TRUTH = 1e3  # error of a coordinate where no light falls

@@ -21,7 +21,7 @@ from benchmarks.common.machine import write_rows
 from benchmarks.common.parts import Part, measured
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.writing import ScanWriter
+from sl_nerfstudio.scan.write import ScanWriter
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 

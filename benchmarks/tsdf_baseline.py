@@ -19,13 +19,11 @@ from benchmarks.baselines.tsdf import fuse
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.evaluate import score_alignments
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.metrics import SurfaceScore
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.evaluation.reference import mesh_reference
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
+from sl_nerfstudio.evaluation.evaluate import SurfaceScore, score_alignments
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 
 PoseKind = Literal["initial", "registered", "refined", "true"]

@@ -17,17 +17,15 @@ import numpy as np
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.whole_runs import run
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS
-from sl_nerfstudio.evaluation.evaluate import score_alignments
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.inputs import EvaluationInputs, read_inputs
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS
+from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, read_inputs, score_alignments
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import MeshReference
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.length_uncertainty import length_sigma
-from sl_nerfstudio.meshing.ply import read_quality
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
-from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.meshing.files import read_quality
+from sl_nerfstudio.meshing.mesh import VertexQuality
+from sl_nerfstudio.meshing.uncertainty import length_sigma, vertex_uncertainty
 
 SCENES = ("cone-and-cylinder", "head", "frog", "dog", "vase", "medal")
 _SAMPLES = 20_000

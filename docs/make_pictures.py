@@ -24,10 +24,10 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.report.pictures import ColourScale, OrthographicView, render
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.report.charts import ColourScale, OrthographicView, render
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_ground_truth, read_scan
 
 ROOT = Path(__file__).parents[1]
@@ -41,11 +41,10 @@ def draw_capture(captures: Path) -> None:
     """The preview after four frames, at the fifth."""
     import cv2
 
-    from sl_nerfstudio.capture.free_hand import picture_of
-    from sl_nerfstudio.capture.grid_view import GridReader
-    from sl_nerfstudio.capture.picture import compose, draw_map
-    from sl_nerfstudio.capture.selection import Selection
-    from sl_nerfstudio.cli.capture_words import view_lines
+    from sl_nerfstudio.capture.camera import compose, draw_map
+    from sl_nerfstudio.capture.capture import picture_of
+    from sl_nerfstudio.capture.selection import GridReader, Selection
+    from sl_nerfstudio.cli.capture import view_lines
     from sl_nerfstudio.pattern.files import read_layout
     from sl_nerfstudio.pattern.grid import GridPattern
     from sl_nerfstudio.scan.images import read_image

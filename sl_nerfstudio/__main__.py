@@ -107,7 +107,7 @@ def devices() -> str:
     """What torch can compute on."""
     import torch
 
-    from sl_nerfstudio.cores import cores
+    from sl_nerfstudio.parallel import cores
 
     used = f"{torch.get_num_threads()} threads; {cores()} of {os.cpu_count()} cores may be used"
     if not torch.cuda.is_available():
@@ -122,7 +122,7 @@ def backends() -> str:
     """Evaluates a small field with every backend on every device. Raises Missing if their values differ."""
     import torch
 
-    from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
+    from sl_nerfstudio.field.field import FieldConfig, SDFField
 
     small = FieldConfig(levels=2, max_resolution=32, log2_table_size=10, hidden=32, backend="torch")
     torch.manual_seed(0)

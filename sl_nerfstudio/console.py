@@ -2,9 +2,19 @@
 
 import os
 import shlex
+import sys
 import textwrap
-from collections.abc import Sequence
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 WIDTH = 80
 _NAME = 12  # columns of the name before a text
@@ -88,3 +98,186 @@ def short_path(path: Path) -> Path:
 def next_steps(commands: Sequence[str]) -> str:
     """The commands to continue with, each from `command`."""
     return "\n".join(["next:", *commands])
+
+
+# Progress of work that a person waits for: a bar on a terminal, and phases that say what they found.
+
+T = TypeVar("T")
+
+SHOW_AFTER_SECONDS = 2.0
+PLAIN_SECONDS = 9.0  # between two lines of progress where there is no terminal: ten with what lies between phases
+_RECENT_SECONDS = 30.0  # over which the speed is measured
+_shown = False  # one bar at a time: nested bars would overwrite the same line
+_phase: "Phase | None" = None  # the one that runs: loops inside it are its progress
+
+
+@dataclass
+class Phase:
+    """A part of a long command. While it runs it shows how far it is; at its end, one line says what it found."""
+
+    name: str
+    started: float = field(default_factory=time.monotonic)
+    done: int = 0
+    total: int | None = None
+    note: str = ""
+    result: str = ""
+    _recent: deque[tuple[float, int]] = field(default_factory=deque)
+
+    def update(self, done: int, total: int | None, note: str = "") -> None:
+        """How much of the work is done; the time left follows from the speed of the last half minute."""
+        now = time.monotonic()
+        if total != self.total or done < self.done:
+            self._recent.clear()
+        self.done, self.total, self.note = done, total, note
+        self._recent.append((now, done))
+        while now - self._recent[0][0] > _RECENT_SECONDS:
+            self._recent.popleft()
+
+    def say(self, result: str) -> None:
+        """What was found: printed when the phase ends."""
+        self.result = "\n".join(filter(None, [self.result, result]))
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Estimate; None before there is a speed."""
+        if self.total is None or len(self._recent) < 2:
+            return None
+        (start, before), (now, done) = self._recent[0], self._recent[-1]
+        return (self.total - done) * (now - start) / (done - before) if done > before else None
+
+    def state(self) -> str:
+        """How far the phase is, in words."""
+        count = f"{self.done} of {self.total}" if self.total else ""
+        left = self.seconds_left
+        return ", ".join(filter(None, [count, self.note, "" if left is None else f"{duration(left)} left"]))
+
+
+@contextmanager
+def phase(name: str) -> Iterator[Phase]:
+    """Show a part of a command while it runs: a bar on a terminal, else a line every nine seconds.
+
+    When it ends without an error, `say` and how long it took are printed on standard output. Loops of `track` inside
+    it are shown as its progress.
+    """
+    global _phase
+    found, before = Phase(name), _phase
+    _phase = found
+    try:
+        with _live(found) if sys.stderr.isatty() else _plain(found):
+            yield found
+    finally:
+        _phase = before
+    took = time.monotonic() - found.started
+    text = found.result or "done"
+    print(paragraph(name, text + (f" ({duration(took)})" if "\n" not in text and took >= 1 else "")), flush=True)
+
+
+@contextmanager
+def _plain(found: Phase) -> Iterator[None]:
+    """Print a line every nine seconds until the block ends."""
+    ended = threading.Event()
+
+    def lines() -> None:
+        while not ended.wait(PLAIN_SECONDS):
+            text = found.state() or f"{duration(time.monotonic() - found.started)} so far"
+            print(paragraph(found.name, text), file=sys.stderr, flush=True)
+
+    yield from _beside(lines, ended)
+
+
+@contextmanager
+def _live(found: Phase) -> Iterator[None]:
+    """Show a bar in the last line of the terminal until the block ends."""
+    ended = threading.Event()
+    with _bar() as bar:
+        task = bar.add_task(found.name, total=None, state="")
+
+        def redraw() -> None:
+            while not ended.wait(0.25):
+                bar.update(task, total=found.total, completed=found.done, state=found.state(), refresh=True)
+
+        yield from _beside(redraw, ended)
+
+
+def _beside(work: Callable[[], None], ended: threading.Event) -> Iterator[None]:
+    """Run `work` in a thread of its own until the block ends."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _bar() -> "Progress":
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    console.width = min(console.width, WIDTH)
+    columns = (TextColumn("{task.description:<11}"), BarColumn(20), TextColumn("{task.fields[state]}"))
+    return Progress(*columns, console=console, transient=True, auto_refresh=False)
+
+
+def track(iterable: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
+    """Yield the items of `iterable`, with a bar on stderr once the work has taken two seconds.
+
+    Shows nothing if stderr is not a terminal, for short work, and inside another tracked loop; inside a `phase` it is
+    shown as the progress of that. `total` is the number of items, by default `len(iterable)` if that exists.
+    """
+    global _shown
+    if total is None and hasattr(iterable, "__len__"):
+        total = len(iterable)  # type: ignore[arg-type]
+    if _phase is not None:
+        yield from _in_phase(iterable, _phase, description, total)
+        return
+    if not sys.stderr.isatty():
+        yield from iterable
+        return
+    iterator = iter(iterable)
+    start = time.monotonic()
+    done = 0
+    for item in iterator:
+        yield item
+        done += 1
+        if not _shown and time.monotonic() - start > SHOW_AFTER_SECONDS:
+            _shown = True
+            break
+    else:
+        return
+    try:
+        yield from _with_bar(iterator, description, total, done)
+    finally:
+        _shown = False
+
+
+def _in_phase(iterable: Iterable[T], shown: Phase, description: str, total: int | None) -> Iterator[T]:
+    for done, item in enumerate(iterable):
+        shown.update(done, total, description.lower())
+        yield item
+
+
+def _with_bar(iterator: Iterator[T], description: str, total: int | None, done: int) -> Iterator[T]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(description, total=total, completed=done)
+        for item in iterator:
+            yield item
+            progress.advance(task)

@@ -7,8 +7,8 @@ from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, Mac
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
-from sl_nerfstudio.late_compiler import end_imports
-from sl_nerfstudio.model.config import SLModelConfig, paper_model
+from sl_nerfstudio.late_imports import end_imports
+from sl_nerfstudio.model.model import SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.settings import RECOMMENDED_STEPS

@@ -48,9 +48,9 @@ def threads_of_this_test_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
     It may be a fixture of a whole file, which comes before this one: so each test begins anew.
     """
-    from sl_nerfstudio import threads
+    from sl_nerfstudio import parallel
 
-    monkeypatch.setattr(threads, "_ours", None)
+    monkeypatch.setattr(parallel, "_ours", None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.console import WIDTH, command, duration, fitted, next_steps, paragraph, short_path
+from sl_nerfstudio.console import (
+    WIDTH,
+    command,
+    duration,
+    fitted,
+    next_steps,
+    paragraph,
+    short_path,
+)
 
 PLAIN = st.text(st.characters(exclude_characters="\n\\", exclude_categories=["Cs"]), max_size=30)
 WORDS = st.lists(st.one_of(st.sampled_from(["--data", "--poses", "-v"]), PLAIN), max_size=12)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sl_nerfstudio import cores as module
-from sl_nerfstudio.cores import cores, quota
+from sl_nerfstudio import parallel as module
+from sl_nerfstudio.parallel import cores, quota
 
 
 def write(root: Path, files: dict[str, str]) -> None:

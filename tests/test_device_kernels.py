@@ -9,7 +9,7 @@ import pytest
 import torch
 import warp
 
-from sl_nerfstudio.device_kernels import obstacle
+from sl_nerfstudio.field.device_kernels import obstacle
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sl_nerfstudio"
@@ -35,7 +35,7 @@ def test_only_kernels_and_what_launches_them_import_warp() -> None:
         for node in ast.parse(path.read_text()).body:  # imports in functions are done when they are needed
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             names += [name.name for name in node.names] if isinstance(node, ast.Import) else []
-            launching = {module_of(user) for user in USERS} | {"sl_nerfstudio.device_kernels"}
+            launching = {module_of(user) for user in USERS} | {"sl_nerfstudio.field.device_kernels"}
             assert not [name for name in names if name.split(".")[0] == "warp" or name in launching], path
             assert not [name for name in names if ".warp_kernels" in name], path
 

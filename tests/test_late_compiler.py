@@ -6,11 +6,16 @@ import sys
 import pytest
 import torch
 
-from sl_nerfstudio.late_compiler import begin_imports, compiler_on_demand, end_imports, shapes_without_symbols
+from sl_nerfstudio.late_imports import (
+    begin_imports,
+    compiler_on_demand,
+    end_imports,
+    shapes_without_symbols,
+)
 
 CODE = """
 import sys
-from sl_nerfstudio.runs.trained_run import load_run
+from sl_nerfstudio.runs.run import load_run
 from pathlib import Path
 try:
     load_run(Path("nothing.yml"))

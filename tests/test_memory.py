@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.memory import keep_freed_memory, read_at_random, read_in_order
+from sl_nerfstudio.parallel import keep_freed_memory, read_at_random, read_in_order
 
 MIB = 1 << 20
 

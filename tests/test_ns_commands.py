@@ -31,8 +31,8 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     from nerfstudio.utils.eval_utils import eval_setup
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 
-import sl_nerfstudio.threads as sl_threads
-from sl_nerfstudio.geometry.similarity import Similarity
+import sl_nerfstudio.parallel as sl_threads
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
 

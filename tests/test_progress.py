@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from sl_nerfstudio import progress
-from sl_nerfstudio.progress import Phase, phase, track
+from sl_nerfstudio import console
+from sl_nerfstudio.console import Phase, phase, track
 
 
 class Terminal(io.StringIO):
@@ -21,12 +21,12 @@ def use_terminal(monkeypatch: pytest.MonkeyPatch, show_after: float = -1.0) -> T
     stream = Terminal()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", show_after)
+    monkeypatch.setattr(console, "SHOW_AFTER_SECONDS", show_after)
     return stream
 
 
 def test_quiet_without_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(progress, "SHOW_AFTER_SECONDS", -1.0)
+    monkeypatch.setattr(console, "SHOW_AFTER_SECONDS", -1.0)
     assert list(track(range(5), "Working")) == [0, 1, 2, 3, 4]
     assert capsys.readouterr() == ("", "")
 
@@ -57,7 +57,7 @@ def test_one_bar_at_a_time_and_errors_pass_through(monkeypatch: pytest.MonkeyPat
 
     with pytest.raises(ZeroDivisionError):
         list(track(failing(), "Failing", total=4))
-    assert progress._shown is False
+    assert console._shown is False
 
 
 def test_leaving_a_loop_early_releases_the_bar(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +65,7 @@ def test_leaving_a_loop_early_releases_the_bar(monkeypatch: pytest.MonkeyPatch) 
     for item in track(range(10), "Working"):
         if item == 4:
             break
-    assert progress._shown is False
+    assert console._shown is False
 
 
 def wait_for(said: str, stream: Terminal) -> None:
@@ -79,7 +79,7 @@ def test_a_phase_prints_lines_where_there_is_no_terminal(
 ) -> None:
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
-    monkeypatch.setattr(progress, "PLAIN_SECONDS", 0.01)
+    monkeypatch.setattr(console, "PLAIN_SECONDS", 0.01)
     with phase("train") as shown:
         shown.update(3, 100, "coordinates to 0.5 px")
         wait_for("3 of 100", log)
@@ -107,7 +107,7 @@ def test_a_phase_that_fails_says_nothing(capsys: pytest.CaptureFixture[str]) -> 
         shown.say("no faults")
         raise ZeroDivisionError
     assert capsys.readouterr() == ("", "")
-    assert progress._phase is None
+    assert console._phase is None
 
 
 def test_the_time_left_follows_from_the_latest_speed(monkeypatch: pytest.MonkeyPatch) -> None:

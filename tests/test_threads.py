@@ -14,11 +14,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import sl_nerfstudio.threads as sl_threads
-from sl_nerfstudio import side_by_side
-from sl_nerfstudio.compiled import compiled_range
-from sl_nerfstudio.side_by_side import tracked
-from sl_nerfstudio.threads import (
+import sl_nerfstudio.parallel as sl_threads
+from sl_nerfstudio.parallel import (
+    compiled_range,
     one_library_thread,
     one_torch_thread,
     parallel,
@@ -26,6 +24,7 @@ from sl_nerfstudio.threads import (
     split,
     threads,
     torch_on_one_thread,
+    tracked,
 )
 
 
@@ -165,7 +164,7 @@ def test_tracked_results_are_in_order_and_their_progress_reaches_the_end(
             yield batch
             seen.append((words, len(batch)))
 
-    monkeypatch.setattr(side_by_side, "track", track)
+    monkeypatch.setattr(sl_threads, "track", track)
     with torch_threads(used):
         assert tracked([partial(pow, k, 2) for k in range(count)], "squares") == [k * k for k in range(count)]
     assert sum(n for _, n in seen) == count and {words for words, _ in seen} <= {"squares"}

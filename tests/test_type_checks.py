@@ -13,8 +13,7 @@ from jaxtyping import Float, Int, TypeCheckError
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.geometry.se3 import hat
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity, hat
 from tests.kinds import NotComparable, kinds_for
 from tests.type_checks import EVERY, checked
 

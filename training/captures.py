@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.grid.channels import network_channels
+from sl_nerfstudio.decoding.grid_phases import network_channels
 from training.appearance import illuminate, random_difficulty
 from training.camera import photograph
 from training.noise_fields import log_uniform

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.edges.channels import EdgeView, edge_view, moved_coords
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.decoding.grid.turned import from_pattern
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.decoding.grid_edges import EdgeView, edge_view, moved_coords
+from sl_nerfstudio.decoding.grid_phases import from_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.appearance import illuminate, random_difficulty
 from training.camera import photograph

@@ -9,9 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn import functional as F
 
-from sl_nerfstudio.decoding.grid.edges.continuation import slopes, steps
-from sl_nerfstudio.decoding.grid.edges.network import EdgeNetwork, EdgeOutput
-from sl_nerfstudio.decoding.grid.unet import MULTIPLE
+from sl_nerfstudio.decoding.grid_edges import EdgeNetwork, EdgeOutput, slopes, steps
+from sl_nerfstudio.decoding.grid_phases import MULTIPLE
 from training.edge_captures import WRONG, EdgeCapture
 
 _FAR = 9.0  # periods: where the pattern is not, or farther off

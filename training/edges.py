@@ -20,9 +20,7 @@ from numpy import ndarray
 from safetensors.torch import load_file
 from torch import Tensor
 
-from sl_nerfstudio.decoding.grid.edges.channels import EdgeView
-from sl_nerfstudio.decoding.grid.edges.continuation import slopes
-from sl_nerfstudio.decoding.grid.edges.network import EdgeNetwork
+from sl_nerfstudio.decoding.grid_edges import EdgeNetwork, EdgeView, slopes
 from training.edge_captures import WRONG, EdgeCapture, edge_capture, load_capture, painted_capture, save_capture
 from training.edge_errors import continuation_errors, held_out, losses
 from training.mirrored import Crop, mirrored

@@ -11,8 +11,13 @@ import numpy as np
 import torch
 import tyro
 
-from sl_nerfstudio.decoding.grid.gcn import GraphNetwork, TurnedPattern, one_hot, turned_pattern
-from sl_nerfstudio.decoding.grid.graph import neighbourhoods
+from sl_nerfstudio.decoding.grid_graph import (
+    GraphNetwork,
+    TurnedPattern,
+    neighbourhoods,
+    one_hot,
+    turned_pattern,
+)
 from training.graphs import DamagedGraph, damage_graph, random_codes, random_damage
 from training.records import cosine_rate, log_row, save_weights
 from training.steps import descend

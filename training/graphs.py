@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int8, Int32
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.decoding.grid.graph import STEPS, GridGraph
+from sl_nerfstudio.decoding.grid_graph import STEPS, GridGraph
 from sl_nerfstudio.pattern.codes import SYMBOLS, rotate_codes
 
 

@@ -17,16 +17,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.matching.confidence import FEATURES, Logistic
-from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
-from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from sl_nerfstudio.matching.resolution import pixels_a_period
-from sl_nerfstudio.matching.settings import MATCHING_DEFAULTS
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.matching.lines import MATCHING_DEFAULTS, EpipolarLines, pixels_a_period
+from sl_nerfstudio.matching.matcher import FEATURES, DecodedImage, LineMatcher, Logistic
+from sl_nerfstudio.parallel import only_one_library_thread
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
-from sl_nerfstudio.threads import only_one_library_thread
 from training.rendered_captures import Rendered, rendered_captures
 
 _SAMPLES = 4000  # pixels of each capture

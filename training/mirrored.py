@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-# Places among the channels of `sl_nerfstudio.decoding.grid.edges.channels`.
+# Places among the channels of `sl_nerfstudio.decoding.grid_edges`.
 _SINE_X, _SINE_Y = 9, 11
 _MOVE_X, _MOVE_Y = 12, 13
 _OF_X, _OF_Y = [8, 9, 12], [10, 11, 13]

@@ -13,9 +13,8 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import as_grey
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import disturb_image
-from sl_nerfstudio.synthesis.setup import make_setup
-from sl_nerfstudio.synthesis.synthesise import GAIN
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import GAIN, make_setup
 from training.noise_fields import log_uniform
 from training.objects import random_object
 from training.patterns import seeded_grid

@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional as F
 
-from sl_nerfstudio.decoding.grid.unet import NetworkOutput, UNet
+from sl_nerfstudio.decoding.grid_phases import NetworkOutput, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
 from training.records import cosine_rate, log_row, save_weights

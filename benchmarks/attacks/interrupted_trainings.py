@@ -40,7 +40,7 @@ _MOMENTS: dict[str, tuple[str, str, int]] = {
     "an evaluation": ("sl_nerfstudio.model.model", "ray_outputs", 0),
     "a later evaluation": ("sl_nerfstudio.model.model", "ray_outputs", 2),
     "a checkpoint": ("torch", "save", 1),
-    "replacing a checkpoint": ("sl_nerfstudio.model.training.loop", "checkpoints_in", 1),
+    "replacing a checkpoint": ("sl_nerfstudio.model.loop", "checkpoints_in", 1),
     "step 7": ("sl_nerfstudio.model.model", "random_points", 7),
     "the last step": ("sl_nerfstudio.model.model", "random_points", STEPS - 1),
     "the last checkpoint": ("torch", "save", 3),

@@ -15,8 +15,8 @@ from benchmarks.attacks.dying import dying
 from benchmarks.attacks.expect import accepted, refused
 from benchmarks.attacks.kills import contents
 from benchmarks.attacks.output_folders import PROCESS
-from sl_nerfstudio.files.lock import LOCK, locked
-from sl_nerfstudio.processing.kept.stages import surroundings
+from sl_nerfstudio.processing.cache import surroundings
+from sl_nerfstudio.storage import LOCK, locked
 
 GROUP = "Killed sl-process"
 _COMMAND = (*PROCESS, "new", "--work", "work")

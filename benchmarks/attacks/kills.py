@@ -20,7 +20,7 @@ from benchmarks.attacks.output_folders import (
     left_behind,
     listing,
 )  # fmt: skip
-from sl_nerfstudio.files.lock import locked, locked_file
+from sl_nerfstudio.storage import locked, locked_file
 
 GROUP, TWO = "Killed commands", "Two commands at once"
 

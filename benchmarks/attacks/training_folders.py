@@ -126,7 +126,7 @@ def _replaced(command: tuple[str, ...], flag: str, value: str) -> tuple[str, ...
 def _two_at_once() -> list[Case]:
     def held(*command: str) -> Callable[[Path], str]:
         def attack(folder: Path) -> str:
-            from sl_nerfstudio.model.training.run_folder import RunFolder
+            from sl_nerfstudio.model.run_files import RunFolder
 
             target = folder / (RUN if "run" in command else FIRST)
             taken = RunFolder(target)

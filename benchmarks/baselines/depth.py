@@ -10,8 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_centres
-from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.scan import Frame, Scan
 
 _LEAST_REGION = 0.01  # of the frame's known pixels; smaller islands of depth are wrong decodings

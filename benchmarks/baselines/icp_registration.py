@@ -12,8 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.baselines.tsdf import backprojected, depth_maps, object_size
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.progress import track
+from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.scan import Scan
 
 _SIZE = 100.0

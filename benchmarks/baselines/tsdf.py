@@ -9,9 +9,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.baselines.depth import DepthMap, triangulated_depth
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.progress import track
 from sl_nerfstudio.scan import Scan
 
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right

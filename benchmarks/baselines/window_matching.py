@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.grid.gcn import TurnedPattern
-from sl_nerfstudio.decoding.grid.graph import OFFSETS
+from sl_nerfstudio.decoding.grid_graph import OFFSETS, TurnedPattern
 from sl_nerfstudio.pattern.codes import SYMBOLS
 
 _WINDOW = [k for k, (i, j) in enumerate(OFFSETS) if abs(i) <= 1 and abs(j) <= 1]

@@ -17,10 +17,10 @@ import tyro
 from benchmarks.calibration.real import leave_each_out
 from benchmarks.calibration.rendered import SETS, Row, calibrate_rendered
 from benchmarks.common.machine import write_rows
-from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
+from sl_nerfstudio.cli.calibrate import CalibrateConfig
 from sl_nerfstudio.cli.run import run as run_main
-from sl_nerfstudio.pattern.presets import make_grid
-from sl_nerfstudio.pattern.sequence import SequenceName
+from sl_nerfstudio.pattern.files import make_grid
+from sl_nerfstudio.pattern.layout import SequenceName
 
 RESULTS = Path("benchmarks/results")
 

@@ -3,10 +3,9 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from sl_nerfstudio.calibration.board.calibrate import BoardCalibration, calibrate
-from sl_nerfstudio.calibration.board.rig import BoardView
-from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
-from sl_nerfstudio.cli.calibrating.inputs import CalibrationInputs, read_inputs
+from sl_nerfstudio.calibration.board import BoardCalibration, calibrate
+from sl_nerfstudio.calibration.board_adjustment import BoardView
+from sl_nerfstudio.cli.calibrate import CalibrateConfig, CalibrationInputs, read_inputs
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from sl_nerfstudio.cli.calibrate import calibrate_devices
-from sl_nerfstudio.cli.calibrating.config import CalibrateConfig
-from sl_nerfstudio.synthesis.boards.captures import BOARDS, write_board_captures
+from sl_nerfstudio.cli.calibrate import CalibrateConfig, calibrate_devices
+from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 CENTRE = ("cx", "cy")

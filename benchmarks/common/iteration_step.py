@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sl_nerfstudio.field.backend import BackendName
-from sl_nerfstudio.field.row_adam import RowAdam
-from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
+from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.torch_backend import knee
 
 KAPPA = 100.0

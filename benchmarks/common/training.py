@@ -9,10 +9,10 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.methods import sl_neus, sl_neus_paper
-from sl_nerfstudio.model.config import SLModelConfig
+from sl_nerfstudio.model.loop import SLTrainer
+from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.pipeline import SLPipeline
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training.loop import SLTrainer
 
 if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel

@@ -22,10 +22,10 @@ from benchmarks.common.machine import write_rows
 from benchmarks.coverage.cases import NOISES, ExactScan, exact_scan, make_case
 from benchmarks.coverage.errors import errors_of
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_projection, restore
+from sl_nerfstudio.bundle_adjustment.parameters import gauge_projection, restore
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.geometry.se3 import inverse, log_se3
-from sl_nerfstudio.synthesis.scenes.library import BUILT_IN
+from sl_nerfstudio.geometry.lie import inverse, log_se3
+from sl_nerfstudio.synthesis.scenes import BUILT_IN
 
 TWO_STARTS = (1, "usual")  # seed and noise of the scans that are also adjusted from their true poses
 QUANTITIES = ("relative", "camera", "length")

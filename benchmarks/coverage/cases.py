@@ -9,14 +9,13 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
-from sl_nerfstudio.geometry.similarity import Similarity, centred_on
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import Cells, CoordinateNoise, disturb_coords
-from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from sl_nerfstudio.synthesis.devices import CoordinateNoise, NoisyCells, disturb_coords
+from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 
 FRAMES, RESOLUTION = 8, 240
 SHARED_PIXELS = 2.0  # standard deviation of the blur of noise that neighbouring pixels share
@@ -39,7 +38,7 @@ class ExactScan:
     sigma: tuple[float, float, float, float]  # of the starting poses: frame mm, deg; projector mm, deg
     S_scene_world: Similarity
     coords: Float[ndarray, "frames h w 2"]
-    cells: Cells
+    cells: NoisyCells
 
     @staticmethod
     def of(setup: Setup) -> "ExactScan":
@@ -92,7 +91,7 @@ def make_case(exact: ExactScan, noise: CoordinateNoise, seed: int, start: Device
 
 
 def _disturbed(
-    coords: Float[ndarray, "h w 2"], cells: Cells, noise: CoordinateNoise, rng: np.random.Generator
+    coords: Float[ndarray, "h w 2"], cells: NoisyCells, noise: CoordinateNoise, rng: np.random.Generator
 ) -> Float[ndarray, "h w 2"]:
     rough = rng.standard_normal(coords.shape)
     smooth = gaussian_filter(rough, (SHARED_PIXELS, SHARED_PIXELS, 0))

@@ -9,9 +9,14 @@ from torch import Tensor
 
 from benchmarks.coverage.cases import Case
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, gauge_projection, of_baselines, restore
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.se3 import hat, inverse, log_se3
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    baseline_scale,
+    gauge_projection,
+    of_baselines,
+    restore,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.geometry.lie import hat, inverse, log_se3
 
 _KNOWN = 0  # the frame whose baseline is known
 

@@ -12,10 +12,10 @@ from benchmarks.baselines.refined_poses import refined_poses
 from benchmarks.baselines.tsdf import fuse
 from benchmarks.common.whole_runs import run
 from benchmarks.open.scans import OpenScan
-from sl_nerfstudio.files.atomic import write_atomic
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.mesh_io import write_mesh
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import write_mesh
 from sl_nerfstudio.scan import Scan, read_scan, write_transforms
+from sl_nerfstudio.storage import write_atomic
 
 RECORD = "method.json"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import write_atomic
+from sl_nerfstudio.storage import write_atomic
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 

@@ -10,11 +10,10 @@ from benchmarks.open.results import HandedPoses, read_handed_poses
 from benchmarks.open.scans import OpenScan
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import score_alignments
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.evaluation.reference import MeshReference, mesh_reference
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import MeshReference, compare_poses, mesh_reference
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 
 F_SHARE = 0.002  # of the truth's diagonal: the distance of the F-score

@@ -16,7 +16,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.photographs.truth import TrueFrame, Truth
-from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
+from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
 from sl_nerfstudio.scan import Frame, Scan
 
 WRONG_DEG, WRONG_SHIFT = 3.0, 0.06  # rotation of a device; displacement of the object as a share of its size

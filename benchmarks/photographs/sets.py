@@ -10,12 +10,12 @@ from typing import cast
 import numpy as np
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.synthesis.appearance.ranges import AppearanceKind
+from sl_nerfstudio.storage import write_atomic
+from sl_nerfstudio.synthesis.appearance import AppearanceKind
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.scenes.library import BUILT_IN
-from sl_nerfstudio.synthesis.scenes.surroundings import Background
+from sl_nerfstudio.synthesis.render import Background
+from sl_nerfstudio.synthesis.scenes import BUILT_IN
 from sl_nerfstudio.synthesis.synthesise import synthesise
 
 PATTERN = GridPattern(w=920, h=920)

@@ -24,8 +24,8 @@ from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets
 from benchmarks.photographs.truth import read_truth
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.meshing.files import read_mesh
 
 PHANTOM = 0.01  # of the object's size: farther from the truth than that, surface is invented
 OBJECT_MM = 120.0  # lengths are stated for an object of this size

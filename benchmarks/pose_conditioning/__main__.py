@@ -23,10 +23,9 @@ from benchmarks.common.machine import write_rows
 from benchmarks.common.scans import made_once
 from benchmarks.pose_conditioning.problem import Poses, Problem
 from benchmarks.pose_conditioning.steps import AdamChoice, adam, gauss_newton, normal_matrices
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.reference import compare_poses
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
 

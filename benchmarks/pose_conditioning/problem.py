@@ -8,8 +8,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian, unproject
-from sl_nerfstudio.geometry.se3 import adjoint, exp_se3, inverse, rotate, transform
+from sl_nerfstudio.geometry.devices import (
+    Intrinsics,
+    project,
+    project_jacobian,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import (
+    adjoint,
+    exp_se3,
+    inverse,
+    rotate,
+    transform,
+)
 from sl_nerfstudio.meshing.mesh import Mesh
 
 

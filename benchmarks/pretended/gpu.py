@@ -17,7 +17,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from benchmarks.pretended.operations import indexes, launches, name_of, takes_scalars_of_the_cpu, wait_of
 from benchmarks.pretended.tensor import CUDA, DeviceTensor, on_cpu, on_gpu
-from sl_nerfstudio import device_kernels
+from sl_nerfstudio.field import device_kernels
 
 _OWN = "sl_nerfstudio"
 _FACTORIES = {"arange", "eye", "full", "linspace", "ones", "scalar_tensor", "zeros"}

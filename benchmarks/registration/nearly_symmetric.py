@@ -21,14 +21,14 @@ from numpy import ndarray
 from benchmarks.another_renderer.objects import bracket, housing, nut
 from benchmarks.another_renderer.shapes import ball, block, drum, joined, meshed, moved, prism, without
 from benchmarks.common.machine import write_rows
-from sl_nerfstudio.geometry.similarity import angle_deg
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.synthesise import make_setup
 
 FRAMES, RESOLUTION = 24, 220
 _NOISE_PX, _WRONG, _MISSING = 0.35, 0.01, 0.1

@@ -22,13 +22,12 @@ from numpy import ndarray
 
 from benchmarks.common.machine import write_rows
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import fit_similarity
-from sl_nerfstudio.processing.words import exclusion_sentence, uncertainty_sentence
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.geometry.lie import DevicePoses, fit_similarity
+from sl_nerfstudio.processing.result import exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
@@ -86,7 +85,7 @@ def relative_poses(scan: Scan, true_relative: ndarray) -> tuple[list[FrameCloud]
     """All frames, one by one."""
     from scipy.spatial.transform import Rotation
 
-    from sl_nerfstudio.relative_pose.sampson import direction_basis
+    from sl_nerfstudio.relative_pose.epipolar import direction_basis
 
     clouds, rows = [], []
     start = time.process_time()

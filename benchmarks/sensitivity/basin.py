@@ -18,11 +18,11 @@ from benchmarks.common.machine import write_rows
 from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
+from sl_nerfstudio.evaluation.reference import compare_poses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 
 LEVELS = (
     (0.0, 0.0),

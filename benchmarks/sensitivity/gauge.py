@@ -17,13 +17,18 @@ from benchmarks.accuracy import FRAMES
 from benchmarks.common.machine import write_rows
 from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, restore
-from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.parameters import agreeing_scale, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.model.pose_refinement import PriorConfig, maps_and_held_out, pose_prior, scene_rig
+from sl_nerfstudio.evaluation.reference import compare_poses
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.model.pose_refinement import (
+    PriorConfig,
+    maps_and_held_out,
+    pose_prior,
+    scene_rig,
+)
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
 

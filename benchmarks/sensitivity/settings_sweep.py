@@ -23,14 +23,16 @@ import numpy as np
 
 from benchmarks.common.machine import write_rows
 from benchmarks.registration.walks import FrameErrors, frame_errors, truth_of
-from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
+from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    RegisteredFramesSettings,
+    adjust_registered,
+)
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.settings import RegistrationSettings
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import RelativePoseSettings, correspondences_of
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
-from sl_nerfstudio.relative_pose.settings import RelativePoseSettings
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.common.machine import write_rows
 from benchmarks.separation.cases import Conditions, make_case
 from benchmarks.separation.objects import BACKGROUNDS, OBJECTS
-from sl_nerfstudio.object_separation.plane_judgement import PlaneFinding
+from sl_nerfstudio.object_separation.planes import PlaneFinding
 from sl_nerfstudio.object_separation.separate import Part, separate
 
 

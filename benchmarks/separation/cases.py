@@ -9,19 +9,22 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.separation.objects import in_the_room, surroundings
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.epipolar import epipolar_residual
-from sl_nerfstudio.object_separation.frame_points import DecodedFrame
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.triangulation import epipolar_residual
+from sl_nerfstudio.object_separation.planes import DecodedFrame
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices
-from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords
-from sl_nerfstudio.synthesis.paths import make_paths
-from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.render import visible_points
-from sl_nerfstudio.synthesis.scenes.scene import Scene
-from sl_nerfstudio.synthesis.scenes.surroundings import above_the_table
-from sl_nerfstudio.synthesis.setup import make_cells
+from sl_nerfstudio.synthesis.devices import (
+    CoordinateNoise,
+    DeviceOptions,
+    DevicePair,
+    disturb_coords,
+    make_devices,
+    make_paths,
+)
+from sl_nerfstudio.synthesis.render import RayCaster, above_the_table, visible_points
+from sl_nerfstudio.synthesis.sdf import Scene
+from sl_nerfstudio.synthesis.synthesise import make_cells
 
 _KEPT_PX = 1.5  # epipolar; sl-process drops what contradicts the pose
 

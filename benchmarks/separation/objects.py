@@ -8,9 +8,9 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from sl_nerfstudio.synthesis.scenes.library import BUILT_IN
-from sl_nerfstudio.synthesis.scenes.scene import Scene
-from sl_nerfstudio.synthesis.scenes.surroundings import Background, make_surroundings
+from sl_nerfstudio.synthesis.render import Background, make_surroundings
+from sl_nerfstudio.synthesis.scenes import BUILT_IN
+from sl_nerfstudio.synthesis.sdf import Scene
 
 
 def plaque() -> Scene:

@@ -18,21 +18,17 @@ from numpy import ndarray
 
 from benchmarks.common.machine import write_rows
 from benchmarks.unknown_projector.sets import CoordinateSet, SetOptions, make_set
-from sl_nerfstudio.calibration.stated_sigma import CERTAIN
+from sl_nerfstudio.calibration.stated import CERTAIN
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
-from sl_nerfstudio.processing.projector.estimation import sigma_of_fields
-from sl_nerfstudio.processing.projector.found import FoundProjector
-from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
-from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.relative_pose.camera_depth import camera_depth
+from sl_nerfstudio.processing.projector import FoundProjector, adjustment_settings, refine_projector, sigma_of_fields
+from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
-from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector
-from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
+from sl_nerfstudio.relative_pose.intrinsics import camera_depth
+from sl_nerfstudio.relative_pose.unknown_projector import FrameMatches, NoProjector, estimate_projector
 
 SETS = (
     SetOptions("head", 1, 16),

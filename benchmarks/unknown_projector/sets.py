@@ -7,15 +7,21 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.synthesis.devices import DeviceOptions, DevicePair, make_devices, pixels
-from sl_nerfstudio.synthesis.noise import CoordinateNoise, disturb_coords
-from sl_nerfstudio.synthesis.paths import PathKind, make_paths
-from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.render import visible_centres
-from sl_nerfstudio.synthesis.scenes.library import make_scene
-from sl_nerfstudio.synthesis.setup import make_cells
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.synthesis.devices import (
+    CoordinateNoise,
+    DeviceOptions,
+    DevicePair,
+    PathKind,
+    disturb_coords,
+    make_devices,
+    make_paths,
+    pixels,
+)
+from sl_nerfstudio.synthesis.render import RayCaster, visible_centres
+from sl_nerfstudio.synthesis.scenes import make_scene
+from sl_nerfstudio.synthesis.synthesise import make_cells
 
 PATTERN = (1280, 800)
 NOISE = CoordinateNoise(sigma=0.3, missing=0.15, wrong=0.02)

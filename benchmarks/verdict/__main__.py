@@ -18,11 +18,8 @@ import numpy as np
 
 from benchmarks.common.machine import write_rows
 from benchmarks.common.whole_runs import run
-from sl_nerfstudio.evaluation.evaluate import evaluate
-from sl_nerfstudio.evaluation.inputs import read_inputs
-from sl_nerfstudio.evaluation.judgement import judge
-from sl_nerfstudio.evaluation.lengths import typical_sigma
-from sl_nerfstudio.evaluation.training_steps import trained_steps
+from sl_nerfstudio.evaluation.evaluate import evaluate, read_inputs, typical_sigma
+from sl_nerfstudio.evaluation.judgement import judge, trained_steps
 
 SCENES = ("cone-and-cylinder", "frog", "staircase")
 FRAMES, RESOLUTION, STEPS = 10, 200, 300

@@ -17,24 +17,373 @@ squares: along directions of which residuals know little, they outweigh what is 
 slopes are those of wide windows.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from numpy import ndarray
+from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.joint_covariance.cholesky import Cholesky
-from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import is_exact, unit_columns
-from sl_nerfstudio.bundle_adjustment.joint_covariance.evidence import BlockGradients, Evidence, block_gradients
-from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import Groups
+from sl_nerfstudio.bundle_adjustment.normal_equations import (
+    DepthCouplings,
+    NormalEquations,
+    block_sums,
+    normal_equations,
+)
+from sl_nerfstudio.bundle_adjustment.observations import Kernel
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    UNKNOWNS,
+    FreeParameters,
+    PosePrior,
+    SelfCalibration,
+    baseline_scale,
+    by_frame,
+    by_kind,
+    gauge_directions,
+    prior_equations,
+    restore,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, array, pixels_of_rows
+from sl_nerfstudio.geometry.devices import project
+from sl_nerfstudio.geometry.lie import Similarity, exp_se3, exp_so3, inverse, log_se3
+from sl_nerfstudio.parallel import results, split, threads
+
+# Covariances as products `F F^T`: exact ones of small scans, and of large ones the mean of random draws.
+#
+# The covariance of 1,000 frames has 72 million different entries, and none of them is zero: frames that never see
+# the
+# same surface are held by the same others. Its factor from D random columns has as many rows as there are unknowns,
+# and
+# D columns. A sigma that follows is off by about `1 / sqrt(2 D)` of itself, 3 % here, and what follows from it
+# needs time
+# and memory by the number of frames (Hutchinson, Communications in Statistics 1990; Halko, Martinsson and Tropp,
+# SIAM
+# Review 2011).
+
+EXACT_UNKNOWNS = 1280  # of a scan, so many as 106 frames have: up to there, nothing is random
+DRAWS = 512
+_MORE = 8  # columns that are kept besides: of steps and departures, each of which is one
+
+
+def is_exact(unknowns: int) -> bool:
+    """Whether a scan with so many unknowns (of poses and intrinsics) has an exact factor."""
+    return unknowns <= EXACT_UNKNOWNS
+
+
+def unit_columns(rows: int, unknowns: int, seed: int = 0) -> Float[Tensor, "rows c"]:
+    """Columns Z for which `Z Z^T` is the identity, or on average is: for a scan with so many unknowns."""
+    if is_exact(unknowns):
+        return torch.eye(rows, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
+    signs = 2 * torch.randint(2, (rows, DRAWS), generator=generator) - 1
+    return signs.double() / DRAWS**0.5
+
+
+def stored_columns(unknowns: int) -> int:
+    """Columns of a factor as it is stored."""
+    return unknowns if is_exact(unknowns) else DRAWS + _MORE
+
+
+def as_stored(factor: Float[Tensor, "unknowns k"]) -> Float[Tensor, "unknowns c"]:
+    """A factor of the same covariance with `stored_columns`: zeros are added, or many columns become fewer.
+
+    Raises ValueError for a factor of many unknowns and more columns.
+    """
+    unknowns, k = factor.shape
+    more = stored_columns(unknowns) - k
+    if more >= 0:
+        return torch.nn.functional.pad(factor, (0, more))
+    if not is_exact(unknowns):
+        raise ValueError(f"{k} columns, at most {k + more}")
+    return torch.linalg.qr(factor.T, mode="r").R.T
+
+
+# Cholesky's factorisation of one large matrix, and products with its inverse.
+
+_FEWEST_TOGETHER = 32  # columns that a thread solves at once
+
+
+@dataclass(frozen=True)
+class Cholesky:
+    """A symmetric positive definite matrix as `U^T U`."""
+
+    upper: Float64[ndarray, "k k"]  # columns one after the other; below the diagonal is what was there before
+
+    @staticmethod
+    def in_place(H: Float[Tensor, "k k"]) -> "Cholesky":
+        """The factor overwrites the matrix: large ones are in memory once.
+
+        Raises ArithmeticError if rounding has left it not positive definite.
+        """
+        (potrf,) = get_lapack_funcs(("potrf",), (H.numpy(),))
+        factor, failed = potrf(H.numpy().T, lower=0, overwrite_a=1, clean=0)  # LAPACK stores columns; H is symmetric
+        if failed:
+            raise ArithmeticError(f"the leading minor of order {failed} is not positive")
+        return Cholesky(factor)
+
+    def root(self, x: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
+        """`U^-1 x`: with unit columns, a factor F of the inverse `F F^T`."""
+        return self._solved("trtrs", x)
+
+    def solution(self, x: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
+        """The inverse times `x`."""
+        return self._solved("potrs", x)
+
+    def _solved(self, routine: str, x: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
+        """Some columns at a time, on all threads."""
+        (solve,) = get_lapack_funcs((routine,), (self.upper,))
+        out = np.array(x.numpy(), order="F")
+
+        def columns(first: int, last: int) -> None:
+            out[:, first:last] = solve(self.upper, out[:, first:last], lower=0)[0]
+
+        results([partial(columns, *part) for part in split(out.shape[1], threads(), _FEWEST_TOGETHER)])
+        return torch.from_numpy(out)
+
+
+# Residuals at the result of an adjustment, and their gradient by blocks of images.
+
+_FRAMES_AT_ONCE = 16  # whose blocks are summed together: bounds memory
+
+
+@dataclass(frozen=True)
+class CovarianceEvidence:
+    """Residuals at the result, with their weights and derivatives (including those by the intrinsics)."""
+
+    rig: Rig
+    anchors: Anchors
+    rows: Observations
+    linear: Linearisation
+    smooth: Linearisation  # the same with derivatives of wide windows, where there are any
+    kernel: Kernel
+    image_blocks: int  # along each side of the decoded part of an image
+    least_curvature: float  # of the kernel
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks of all images."""
+        return self.rig.frames * self.image_blocks**2
+
+
+@dataclass(frozen=True)
+class BlockGradients:
+    """Gradients whose squares add up to those of all blocks of images, or on average do."""
+
+    columns: Float[Tensor, "unknowns c"]
+    blocks: int  # that hold any residual
+
+
+def block_gradients(e: CovarianceEvidence, depths: DepthCouplings, weights: tuple[Tensor, Tensor]) -> BlockGradients:
+    """Of small scans one column for each block, of large ones sums of all blocks with random signs."""
+    groups = tuple(Groups.of(array(block), e.blocks) for block in _blocks_of(e))
+    r, unknowns, blocks = e.linear.residuals, e.linear.unknowns, 0
+    own, cross = (
+        (array(w[:, None] * value), array(J), array(by_depth))
+        for w, value, J, by_depth in (
+            (weights[0], r.own, e.linear.own, e.linear.own_depth),
+            (weights[1], r.cross, e.linear.cross, e.linear.cross_depth),
+        )
+    )
+    indices = tuple(part for g in (*groups, depths.rows) for part in (g.first, g.entries))
+    frames = array(e.rows.anchor), depths.frame, depths.viewer
+    exact, found = [], torch.zeros(unknowns, DRAWS, dtype=torch.float64)
+    for part in np.array_split(np.arange(e.blocks), -(-e.rig.frames // _FRAMES_AT_ONCE)):
+        sums = np.zeros((len(part), unknowns))
+        block_sums(part, indices, frames, own, cross, depths.arrays, sums)
+        gradient = torch.from_numpy(sums)
+        blocks += int((gradient != 0).any(1).sum())
+        if is_exact(unknowns):
+            exact.append(gradient)
+        else:
+            found.addmm_(gradient.T, unit_columns(len(part), unknowns, seed=int(part[0])))
+    return BlockGradients(torch.cat(exact).T if exact else found, blocks)
+
+
+def _blocks_of(e: CovarianceEvidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
+    """The block that holds an anchor in its own image, and the block of the other image in which it is looked up."""
+    rig = e.rig
+    at = project(rig.camera[e.anchors.frame], e.anchors.d_camera)[0]
+    seen_at, _ = pixels_of_rows(rig, e.anchors, e.rows)
+    low, high = torch.zeros(rig.frames, 2).double(), torch.ones(rig.frames, 2).double()
+    for k in range(rig.frames):
+        mine = at[e.anchors.frame == k]
+        if len(mine):
+            low[k], high[k] = mine.amin(0), mine.amax(0)
+
+    def block(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
+        share = (uv - low[frame]) / (high - low).clamp_min(1e-9)[frame]
+        cell = (share * e.image_blocks).nan_to_num().clamp(0, e.image_blocks - 1).long()
+        return (frame * e.image_blocks + cell[:, 0]) * e.image_blocks + cell[:, 1]
+
+    return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
+
+
+# The covariance of all poses and of the intrinsics together, in any axes and unit.
+#
+# Increments are those of `residuals`: `T_world_camera <- exp(delta) T_world_camera`,
+# `T_camera_projector <- exp(rho) T_camera_projector`, translation before rotation. Intrinsics are shares of the
+# focal
+# length, in the order of `IntrinsicsChange.values`.
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Second moments of the errors of delta of all frames, then rho of all frames, then the intrinsics.
+
+    They are `factor @ factor.T`. Of scans with more than 106 frames the columns are random draws (`draws`).
+    """
+
+    factor: Float64[ndarray, "joint k"]
+
+    @property
+    def matrix(self) -> Float64[ndarray, "joint joint"]:
+        """The covariance itself, which takes much memory for many frames."""
+        return self.factor @ self.factor.T
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return (len(self.factor) - UNKNOWNS) // 12
+
+    def mapped(self, S_target_world: Similarity) -> "JointCovariance":
+        """For the same devices in other axes and another unit.
+
+        A motion (v, w) in the world is, in the target, the rotation R w and the translation s R v - (R w) x t; in the
+        axes of a camera only the unit changes.
+        """
+        s, R, t = S_target_world.scale, S_target_world.R, S_target_world.t
+        cross = np.cross(np.eye(3), t).T  # cross @ w = w x t
+        frame = np.block([[s * R, -cross @ R], [np.zeros((3, 3)), R]])
+        relative = np.diag([s] * 3 + [1.0] * 3)
+        half, out = 6 * self.frames, self.factor.copy()
+        for first, J in ((0, frame), (half, relative)):
+            part = self.factor[first : first + half]
+            out[first : first + half] = (J @ part.reshape(-1, 6, part.shape[1])).reshape(half, -1)
+        return JointCovariance(out)
+
+
+def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint k"]:
+    """A factor of the covariance before any residual is computed."""
+    H, _ = prior_equations(prior, start, start)
+    rows = 12 * start.frames + UNKNOWNS
+    unit = unit_columns(rows, rows)
+    upper = torch.linalg.cholesky(H).mT
+    frames = torch.linalg.solve_triangular(upper, unit[:-UNKNOWNS].reshape(start.frames, 12, -1), upper=True)
+    return torch.cat([by_kind(frames), prior.intrinsics_sigma[:, None] * unit[-UNKNOWNS:]])
+
+
+# What is uncertain once the scale is fixed by a length, or by many.
+#
+# The covariance of an adjustment says nothing about the scale, which no residual determines. A rule then fixes it:
+# some
+# logarithm of a length, `log l`, is known. An error x of poses and intrinsics becomes `x - g (c . x)`, where g is
+# the
+# growth of everything by a factor, and c the derivative of `log l`, so that `c . g = 1`. Lengths that are badly
+# known
+# relative to the known one become uncertain in this way.
+
+
+def with_known_length(
+    factor: Float[Tensor, "joint k"], rig: Rig, log_length: Float[Tensor, "unknowns"]
+) -> Float[Tensor, "joint k"]:
+    """A factor under the scale at which a length does not err; `log_length` is its derivative by the poses."""
+    growth = torch.zeros(len(factor), dtype=torch.float64)
+    growth[: len(log_length)] = gauge_directions(rig)[:, 6]
+    known = torch.zeros_like(growth)
+    known[: len(log_length)] = log_length
+    known = known / (known @ growth)
+    return factor - torch.outer(growth, known @ factor)
+
+
+def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
+    """That of the scale which agrees best with the starting poses (`gauge.agreeing_scale`)."""
+    H, _ = prior_equations(prior, rig, rig)
+    G = by_frame(gauge_directions(rig))
+    by_step = H @ G
+    information = (G.transpose(1, 2) @ by_step).sum(0)
+    return torch.linalg.solve(information, by_kind(by_step).T)[6]
+
+
+# Other poses that agree with the captures as well: where nothing holds a frame, the objective has many minima.
+#
+# On a surface that slides along itself (a vase about its axis, parallel planes) errors of the look-ups make small
+# minima wherever a frame may be, and the curvature of one of them says little about how far the others are. Whether
+# a
+# result is one of many shows when it is shaken: steps lead it back, or they do not. If they do not, searches from
+# other
+# starting poses, drawn within their stated uncertainty, show how far the minima spread. (Randomised maximum
+# likelihood:
+# Chen and Oliver, Mathematical Geosciences, 2012; the data stay as they are.)
+
+
+def shake(factor: Float[Tensor, "joint k"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:
+    """A random increment (delta, rho) of some sigmas of the poses, the intrinsics staying as they are."""
+    variance, axes = torch.linalg.eigh(_given_intrinsics(factor))
+    draw = torch.randn(len(variance), generator=generator, dtype=torch.float64)
+    return axes @ (sigmas * variance.clamp_min(0).sqrt() * draw)
+
+
+def farthest_frame(factor: Float[Tensor, "joint k"], departure: Float[Tensor, "unknowns"]) -> float:
+    """Increment of the frame that departs most, in sigma of the poses given the intrinsics (RMS over its six)."""
+    sigma = _given_intrinsics(factor).diagonal().clamp_min(0).sqrt()
+    ratio = torch.where(sigma > 0, departure / sigma, torch.zeros_like(sigma))
+    return float(ratio[: len(ratio) // 2].reshape(-1, 6).pow(2).mean(1).max().sqrt())
+
+
+def departure_of(other: Rig, rig: Rig) -> Float[Tensor, "unknowns"]:
+    """Increments (delta, rho) from `rig` to `other`, without motion and growth of the scene as a whole."""
+    there = restore(rig, other, baseline_scale(rig, other, None))
+    pairs = (
+        (there.T_world_camera, rig.T_world_camera),
+        (there.T_camera_projector, rig.T_camera_projector),
+    )
+    step = torch.cat([log_se3(theirs @ inverse(mine)).reshape(-1) for theirs, mine in pairs])
+    G = gauge_directions(rig)
+    return step - G @ torch.linalg.solve(G.T @ G, G.T @ step)
+
+
+def with_frames_of(rig: Rig, other: Rig, frames: Sequence[int]) -> Rig:
+    """The rig with some frames where another has them."""
+    chosen = list(frames)
+    camera, relative = rig.T_world_camera.clone(), rig.T_camera_projector.clone()
+    camera[chosen], relative[chosen] = other.T_world_camera[chosen], other.T_camera_projector[chosen]
+    return replace(rig, T_world_camera=camera, T_camera_projector=relative)
+
+
+def drawn_start(rig: Rig, prior: PosePrior, with_projectors: bool, generator: torch.Generator) -> Rig:
+    """Starting poses as uncertain as the stated ones, about `rig`; projectors stay in their frames, or move as well."""
+    draw = torch.randn(rig.frames, 12, generator=generator, dtype=torch.float64) * prior.sigma
+    frames = replace(rig, T_world_camera=exp_se3(draw[:, :6]) @ rig.T_world_camera)
+    if not with_projectors:
+        return frames
+    T = rig.T_camera_projector.clone()
+    T[:, :3, :3] = exp_so3(draw[:, 9:]) @ T[:, :3, :3]
+    T[:, :3, 3] += draw[:, 6:9]
+    return replace(frames, T_camera_projector=T)
+
+
+def widened(
+    factor: Float[Tensor, "joint k"], departures: Sequence[Float[Tensor, "unknowns"]]
+) -> Float[Tensor, "joint more"]:
+    """The covariance with the mean square of what other searches found, none of them better than the others."""
+    columns = [torch.nn.functional.pad(d / len(departures) ** 0.5, (0, UNKNOWNS)) for d in departures]
+    return torch.cat([factor, *(column[:, None] for column in columns)], 1)
+
+
+def _given_intrinsics(factor: Float[Tensor, "joint k"]) -> Float[Tensor, "unknowns unknowns"]:
+    """Covariance of the poses if the intrinsics are right."""
+    poses, common = factor[:-UNKNOWNS], factor[-UNKNOWNS:]
+    scale = common.norm(dim=1).clamp_min(1e-15)
+    common = common / scale[:, None]
+    inner = torch.linalg.pinv(common @ common.T, hermitian=True)
+    border = poses @ common.T
+    return poses @ poses.T - border @ inner @ border.T
+
 
 _EXACT = 1e-9  # used for an uncertainty of zero
 _PRIOR_SEED = 1  # of its random columns, where there are any: they are independent of others
@@ -49,7 +398,7 @@ class PoseCovariance:
 
 
 def pose_covariance(
-    evidence: Evidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
+    evidence: CovarianceEvidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
 ) -> PoseCovariance:
     """Second moments of the errors of poses that were found with the current intrinsics.
 
@@ -111,7 +460,7 @@ class _Moments:
 class _Linear:
     """The adjustment at its result, as a linear problem."""
 
-    evidence: Evidence
+    evidence: CovarianceEvidence
     free: FreeParameters
     equations: NormalEquations
     known: NormalEquations  # with derivatives of wide windows

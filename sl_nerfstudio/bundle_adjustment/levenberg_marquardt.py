@@ -1,19 +1,137 @@
 """One damped Gauss-Newton step on poses and depths."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.damped_solution import damped_solver
-from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters
 from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, normal_equations
-from sl_nerfstudio.bundle_adjustment.priors import PriorTerm
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, residuals_of
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
+from sl_nerfstudio.bundle_adjustment.observations import Kernel
+from sl_nerfstudio.bundle_adjustment.parameters import FreeParameters, PriorTerm
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, residuals_of
 from sl_nerfstudio.bundle_adjustment.settings import StepSettings
+
+# Solutions of the damped normal equations: by factorisation, or for many frames by conjugate gradients.
+
+Solve = Callable[[float], Float[Tensor, "count"] | None]
+"""From the damping to the free parameters' step; None if rounding left nothing positive definite."""
+
+
+def damped_solver(
+    equations: NormalEquations,
+    prior: tuple[Float[Tensor, "m 12 12"], Float[Tensor, "m 12"]],
+    free: FreeParameters,
+    settings: StepSettings,
+) -> Solve:
+    """For the normal equations and prior of the frames that move; the damping is a share of the diagonal."""
+    g = free.vector(equations.g + prior[1])
+    if len(free.frames) <= settings.factorised_frames:
+        return _Factorised(free.matrix(equations.matrix(prior[0], g.new_zeros(0))), g).solve
+    return _Iterative.of(equations, prior[0], free, g, settings).solve
+
+
+@dataclass(frozen=True)
+class _Factorised:
+    """The whole matrix."""
+
+    H: Float[Tensor, "count count"]
+    g: Float[Tensor, "count"]
+
+    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
+        """By Cholesky's factorisation."""
+        damped = self.H.clone()
+        damped.diagonal().mul_(1 + damping)
+        factor, failed = torch.linalg.cholesky_ex(damped)
+        return None if bool(failed) else torch.cholesky_solve(-self.g[:, None], factor)[:, 0]
+
+
+@dataclass(frozen=True)
+class _Iterative:
+    """Products with the matrix, and its blocks on the diagonal."""
+
+    equations: NormalEquations
+    prior: Float[Tensor, "m 12 12"]
+    free: FreeParameters
+    g: Float[Tensor, "count"]
+    own: Float[Tensor, "m k k"]  # blocks of each frame's own parameters
+    shared: Float[Tensor, "s s"]  # block of those that frames share
+    settings: StepSettings
+
+    @staticmethod
+    def of(
+        equations: NormalEquations,
+        prior: Float[Tensor, "m 12 12"],
+        free: FreeParameters,
+        g: Float[Tensor, "count"],
+        settings: StepSettings,
+    ) -> "_Iterative":
+        """With the blocks that precondition."""
+        own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
+        none = _Iterative(equations, prior, free, g, own, torch.zeros(0, 0, dtype=g.dtype), settings)
+        first = own.shape[0] * own.shape[2]
+        columns = [none.product(_unit(free.count, k, g.dtype))[first:] for k in range(first, free.count)]
+        shared = torch.stack(columns) if columns else none.shared
+        return _Iterative(equations, prior, free, g, own, shared, settings)
+
+    def product(self, x: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
+        """The matrix times `x`."""
+        step = self.free.step(x)
+        moving = self.equations.times(step)[self.free.frames]
+        return self.free.vector(moving + (self.prior @ step[self.free.frames, :, None])[..., 0])
+
+    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
+        """By conjugate gradients (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010, section 4).
+
+        They start at zero, so every iterate lowers the quadratic model; the blocks on the diagonal precondition.
+        """
+        diagonal = torch.cat([self.own.diagonal(dim1=1, dim2=2).flatten(), self.shared.diagonal()])
+        factors = [_damped_factor(block, damping) for block in (self.own, self.shared[None])]
+        if any(factor is None for factor in factors):
+            return None
+        x, r = torch.zeros_like(self.g), -self.g
+        z = _preconditioned(r, factors)
+        p, rz = z, float(r @ z)
+        enough = self.settings.iterative_tolerance**2 * rz
+        for _ in range(self.settings.iterative_steps):
+            if rz <= enough:
+                break
+            Hp = self.product(p) + damping * diagonal * p
+            curvature = float(p @ Hp)
+            if not curvature > 0:
+                break
+            x, r = x + rz / curvature * p, r - rz / curvature * Hp
+            z = _preconditioned(r, factors)
+            rz, before = float(r @ z), rz
+            p = z + rz / before * p
+        return x
+
+
+def _unit(count: int, k: int, dtype: torch.dtype) -> Float[Tensor, "count"]:
+    out = torch.zeros(count, dtype=dtype)
+    out[k] = 1
+    return out
+
+
+def _damped_factor(blocks: Float[Tensor, "m k k"], damping: float) -> Float[Tensor, "m k k"] | None:
+    damped = blocks.clone()
+    damped.diagonal(dim1=1, dim2=2).mul_(1 + damping)
+    factor, failed = torch.linalg.cholesky_ex(damped)
+    return None if bool(failed.any()) else factor
+
+
+def _preconditioned(r: Float[Tensor, "count"], factors: list[Tensor | None]) -> Float[Tensor, "count"]:
+    """Each block's solution."""
+    parts, at = [], 0
+    for factor in factors:
+        assert factor is not None
+        m, k, _ = factor.shape
+        mine = r[at : at + m * k].reshape(m, k, 1)
+        parts.append(torch.cholesky_solve(mine, factor).flatten() if m * k else mine.flatten())
+        at += m * k
+    return torch.cat(parts)
 
 
 @dataclass(frozen=True)

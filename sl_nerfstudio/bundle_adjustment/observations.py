@@ -1,5 +1,6 @@
 """Which decoded pixels take part in the bundle adjustment, and in which other frames they are looked up."""
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -8,14 +9,113 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, seed_from
-from sl_nerfstudio.bundle_adjustment.loops.groups import Groups
-from sl_nerfstudio.bundle_adjustment.loops.visibility import choose_frames, count_chosen, mark_visible
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, array
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.devices import unproject
-from sl_nerfstudio.geometry.se3 import rotate, transform
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
+    CoordinateMaps,
+    Groups,
+    mixed,
+    place_of,
+    seed_from,
+    uniform,
+    words_of,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array
+from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
+from sl_nerfstudio.geometry.devices import unproject, view_of
+from sl_nerfstudio.geometry.lie import moved, rotate, transform
+from sl_nerfstudio.geometry.numerics import (
+    MAD_TO_SIGMA,
+    geman_mcclure_cost,
+    geman_mcclure_curvature,
+    geman_mcclure_weight,
+)
 from sl_nerfstudio.geometry.triangulation import closest_approach
+from sl_nerfstudio.parallel import compiled, compiled_range
+
+# Which frames decoded something near an anchor, and which of them look it up.
+
+
+@compiled_range
+def mark_visible(first, last, devices, images, frame, p_world, normal, centres, allowed, limits, visible):
+    """visible[j, a]: whether frame j decoded something near anchor a, for frames first to last - 1.
+
+    `images` are values and their PixelIndex; `centres` those of cameras and projectors [2, frames, 3]; `allowed[i, j]`
+    whether frame j may look up anchors of frame i; `limits` the gate in pixels and the least cosine. Without a gate no
+    coordinate is read.
+    """
+    _, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
+    values, (words, first_words, widths, heights) = images
+    gate, least_cosine = limits
+    for j in range(first, last):
+        T, T_projector, camera = T_camera_world[j], T_projector_camera[j], cameras[j]
+        w, h = widths[j], heights[j]
+        for a in range(len(frame)):
+            visible[j, a] = False
+            if not allowed[frame[a], j]:
+                continue
+            p = p_world[a]
+            if not _faces(normal[a], p, centres[0, j], centres[1, j], least_cosine):
+                continue
+            x, y, z = moved(T, p[0], p[1], p[2])
+            view = view_of(camera_code, x, y, z, camera)
+            u, v, in_front = view[0], view[1], view[2]
+            if not (in_front and u >= 0 and v >= 0 and u < w and v < h):
+                continue
+            place = place_of(words, first_words[j] + int(v) * words_of(w), int(u))
+            if place < 0:
+                continue
+            x, y, z = moved(T_projector, x, y, z)
+            expected = view_of(projector_code, x, y, z, projector)
+            if gate < np.inf:
+                value = values[place]
+                visible[j, a] = expected[2] and np.hypot(value[0] - expected[0], value[1] - expected[1]) < gate
+            else:
+                visible[j, a] = expected[2]
+
+
+@compiled
+def _faces(normal, p, camera, projector, least_cosine):
+    """Whether both devices are in front of a surface, and neither sees it too obliquely."""
+    length = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
+    for k in range(2):
+        centre = camera if k == 0 else projector
+        x, y, z = centre[0] - p[0], centre[1] - p[1], centre[2] - p[2]
+        along = normal[0] * x + normal[1] * y + normal[2] * z
+        if not along > least_cosine * np.sqrt(length * (x * x + y * y + z * z)):
+            return False
+    return True
+
+
+@compiled_range
+def count_chosen(first, last, visible, most, counts):
+    """How many frames look up each anchor."""
+    for a in range(first, last):
+        total = 0
+        for j in range(visible.shape[0]):
+            total += visible[j, a]
+        counts[a] = min(total, most)
+
+
+@compiled_range
+def choose_frames(first, last, visible, starts, seed, number, frames):
+    """As many frames as `starts` leaves room for, at random among those that see an anchor, in order.
+
+    Selection sampling (Knuth, The Art of Computer Programming 2, algorithm S); `number` identifies each anchor.
+    """
+    for a in range(first, last):
+        at, end, left = starts[a], starts[a + 1], 0
+        for j in range(visible.shape[0]):
+            left += visible[j, a]
+        bits = mixed(seed, number[a])
+        for j in range(visible.shape[0]):
+            if at == end:
+                break
+            if visible[j, a]:
+                bits = mixed(bits, j)
+                if uniform(bits) * left < end - at:
+                    frames[at] = j
+                    at += 1
+                left -= 1
+
 
 _ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
 _TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
@@ -179,3 +279,161 @@ def _visible(
         array(allowed), limits, visible,
     )  # fmt: skip
     return visible
+
+
+# Medians of the residuals that involve each frame.
+
+
+@compiled_range
+def medians_by_frame(first, last, source_first, source_entries, viewer_first, viewer_entries, values, valid, out):
+    """Lower median over the valid entries of two groupings of the same values; infinite where there are none."""
+    for f in range(first, last):
+        most = source_first[f + 1] - source_first[f] + viewer_first[f + 1] - viewer_first[f]
+        mine = np.empty(most)
+        count = 0
+        for starts, entries in ((source_first, source_entries), (viewer_first, viewer_entries)):
+            for e in range(starts[f], starts[f + 1]):
+                if valid[entries[e]]:
+                    mine[count] = values[entries[e]]
+                    count += 1
+        out[f] = _smallest(mine, count, (count - 1) // 2) if count else np.inf
+
+
+@compiled
+def _smallest(values, count, k):
+    """The k-th smallest (from 0) of the first `count` values, which change places (Hoare's selection).
+
+    numpy's `partition` would do the same, but numba takes 7 s to compile it.
+    """
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return values[k]
+
+
+# The robust kernel of the bundle adjustment: wrong decodings lose their influence, slow frames keep theirs.
+#
+# Its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately for every
+# frame: when
+# most frames already fit, a frame that does not yet fit keeps a kernel wide enough to be pulled in.
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The Geman-McClure kernel, with a width for each frame; a gross error costs the same at any width."""
+
+    width: Float[Tensor, "frames"]  # projector pixels
+    frame: Int[Tensor, "anchors"]
+    pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks it up
+    noise_ratio: Float[Tensor, "rows"] | None = None  # noise of each look-up over the usual one: as much wider
+
+    @property
+    def narrowest(self) -> float:
+        """Width of the frames that fit best."""
+        return float(self.width.min())
+
+    def weights(self, r: Residuals) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
+        """Weights of own and cross residuals, for the normal equations."""
+        parts = []
+        for value, width2 in zip((r.own, r.cross), self._squares(), strict=True):
+            parts.append(self.narrowest**2 / width2 * geman_mcclure_weight((value * value).sum(-1) / width2))
+        own, cross = parts
+        return own, torch.where(r.cross_valid, cross, torch.zeros_like(cross))
+
+    def curvature(self, r: Residuals) -> float:
+        """Second derivative of the cost over what the weights make of it, all residuals together.
+
+        Weighted normal equations take weights for constants, and so overrate what residuals say by the inverse of this
+        (Huber, Robust Statistics, 1981, section 7.6).
+        """
+        own2, cross2 = self._squares()
+        parts = (r.own, own2), (r.cross[r.cross_valid], cross2[r.cross_valid])
+        squares = [((value * value).sum(-1) / width2, width2) for value, width2 in parts]
+        true = sum(float((geman_mcclure_curvature(u) / width2).sum()) for u, width2 in squares)
+        return true / sum(float((geman_mcclure_weight(u) / width2).sum()) for u, width2 in squares)
+
+    def cost(self, r: Residuals, valid: Bool[Tensor, "rows"]) -> float:
+        """The data's part of the objective, px^2; half of its gradient is that of the weighted normal equations."""
+        own2, cross2 = self._squares()
+        own = ((r.own**2).sum(-1), own2)
+        cross = ((r.cross**2).sum(-1)[valid], cross2[valid])
+        return self.narrowest**2 * sum(float(geman_mcclure_cost(r2 / w2).sum()) for r2, w2 in (own, cross))
+
+    def _squares(self) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
+        cross = self.width[self.pair].amax(0)
+        cross = cross if self.noise_ratio is None else cross * self.noise_ratio
+        return self.width[self.frame] ** 2, cross**2
+
+
+def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
+    """Median of the cross residuals that involve each frame; infinite if there are none."""
+    groups = [Groups.of(array(one), frames) for one in pair]
+    out = np.empty(frames)
+    parts = [part for group in groups for part in (group.first, group.entries)]
+    medians_by_frame(frames, *parts, array(r.cross.norm(dim=-1)), array(r.cross_valid), out)
+    return torch.from_numpy(out)
+
+
+def narrowed(
+    width: Float[Tensor, "frames"], target: Float[Tensor, "frames"], settings: KernelSettings
+) -> Float[Tensor, "frames"]:
+    """Kernel widths one gradual step closer to a narrower target: a part of a frame may fit before all of it does."""
+    gently = torch.where(width.isfinite(), width / settings.fastest, torch.zeros_like(width))
+    return torch.minimum(width, torch.maximum(target, gently))
+
+
+def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
+    """Robust 1 sigma of one residual component, from the residuals that the kernel keeps; pattern pixels."""
+    inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
+    values = r.cross[inliers].reshape(-1).abs()
+    return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)
+
+
+def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], settings: KernelSettings) -> float:
+    """Distance from the border of what was decoded from which on residuals are no larger than usual.
+
+    Classes by distance hold equally many. Only those that are nearer than most are asked, so at most half fall away.
+    """
+    if not len(distance):
+        return 0.0
+    shares = np.linspace(0, 1, settings.border_classes + 1)[: settings.border_classes // 2 + 1]
+    edges = np.quantile(array(distance), shares)
+    most = settings.most_border_noise * float(size.median().clamp_min(settings.noise_floor_px))
+    for low, high in reversed(list(pairwise(edges.tolist()))):
+        mine = (distance >= low) & (distance < high)
+        if mine.any() and float(size[mine].median()) > most:
+            return high
+    return 0.0
+
+
+def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSettings) -> Float[Tensor, "rows"]:
+    """Noise of each look-up over that of all, from the residuals of those that see their surface as obliquely.
+
+    `cosine`: between the surface's normal and the line of sight. Classes hold equally many look-ups.
+    """
+    size, known = r.cross.norm(dim=-1), r.cross_valid
+    if not known.any():
+        return torch.ones_like(size)
+    shares = np.linspace(0, 1, settings.obliqueness_classes + 1)[1:-1]
+    group = torch.bucketize(cosine, torch.from_numpy(np.quantile(array(cosine[known]), shares)))
+    usual, ratio = size[known].median(), torch.ones_like(size)
+    for k in range(settings.obliqueness_classes):
+        mine = group == k
+        if (mine & known).any():
+            ratio[mine] = size[mine & known].median() / usual.clamp_min(settings.noise_floor_px)
+    return ratio.clamp_min(settings.least_noise_ratio)

@@ -11,18 +11,21 @@ from numpy import ndarray
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, Minimum, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    PosePrior,
+    RefinePoses,
+    SelfCalibration,
+    baseline_scale,
+    constrained,
+    restore,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
-from sl_nerfstudio.geometry.similarity import Similarity, centred_on
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, motion_by_pose_errors
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on
 from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.registration.surfaces import FrameCloud, motion_by_pose_errors
 from sl_nerfstudio.scan.types import PoseSigma
 
 

@@ -15,6 +15,7 @@ the origin, which is the centre of the scene), `T_camera_projector <- exp(rho) T
 moves its projector against its camera.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -24,11 +25,185 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.loops.residuals import cross_residuals, own_residuals, positions
-from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.se3 import rotate, transform
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, WindowMemory
+from sl_nerfstudio.geometry.devices import MODELS, Device, Intrinsics, view_of
+from sl_nerfstudio.geometry.lie import (
+    DevicePoses,
+    Similarity,
+    inverse,
+    inverse_poses,
+    moved,
+    moved_poses,
+    rotate,
+    row_times_rotation,
+    transform,
+)
+from sl_nerfstudio.parallel import compiled, compiled_range
+
+# All devices of a scan as tensors in the scene frame, for solvers.
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All devices of a scan; poses in the scene frame, whose origin is the centre of the object."""
+
+    camera: Intrinsics  # batch (frames,)
+    projector: Intrinsics  # batch ()
+    T_world_camera: Float[Tensor, "frames 4 4"]
+    T_camera_projector: Float[Tensor, "frames 4 4"]
+
+    @staticmethod
+    def of(cameras: Sequence[Device], projector: Device, poses: DevicePoses, S_scene_world: Similarity) -> "Rig":
+        """Devices with the given poses in a world; the rig's "world" is the scene."""
+        scene = poses.mapped(S_scene_world)
+        camera = torch.from_numpy(scene.T_world_camera)
+        return Rig(
+            Intrinsics.of(list(cameras), torch.float64),
+            Intrinsics.of(projector, torch.float64),
+            camera,
+            inverse(camera) @ torch.from_numpy(scene.T_world_projector),
+        )
+
+    def poses(self, S_world_scene: Similarity) -> DevicePoses:
+        """Poses of all devices in a world."""
+        return DevicePoses(self.T_world_camera.numpy(), self.T_world_projector.numpy()).mapped(S_world_scene)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.T_world_camera)
+
+    @cached_property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
+        """For compiled loops: poses first, then parameters and model codes of cameras and projector.
+
+        The poses are those of the cameras, their inverses, and those of the cameras in the axes of their projectors.
+        """
+        camera, projector = self.camera, self.projector
+        T_world_camera, T_camera_projector, cameras, light = (
+            np.ascontiguousarray(part.numpy())
+            for part in (self.T_world_camera, self.T_camera_projector, camera.params, projector.params)
+        )
+        T_camera_world, T_projector_camera = np.empty_like(T_world_camera), np.empty_like(T_world_camera)
+        inverse_poses(self.frames, T_world_camera, T_camera_world)
+        inverse_poses(self.frames, T_camera_projector, T_projector_camera)
+        codes = MODELS[camera.model].code, MODELS[projector.model].code
+        return T_world_camera, T_camera_world, T_projector_camera, cameras, codes[0], light, codes[1]
+
+    @property
+    def T_world_projector(self) -> Float[Tensor, "frames 4 4"]:
+        """Projector poses in the scene frame."""
+        return self.T_world_camera @ self.T_camera_projector
+
+    @property
+    def baseline(self) -> Float[Tensor, "frames"]:
+        """Distance between camera and projector of every frame."""
+        return self.T_camera_projector[:, :3, 3].norm(dim=-1)
+
+    def moved(self, delta: Float[Tensor, "frames 6"], rho: Float[Tensor, "frames 6"]) -> "Rig":
+        """The rig after an increment of every frame as a whole, and of its projector relative to its camera."""
+        return replace(
+            self,
+            T_world_camera=_after(delta, self.T_world_camera),
+            T_camera_projector=_after(rho, self.T_camera_projector),
+        )
+
+    def scaled(self, scale: float) -> "Rig":
+        """With all lengths multiplied."""
+        camera, relative = self.T_world_camera.clone(), self.T_camera_projector.clone()
+        camera[:, :3, 3] *= scale
+        relative[:, :3, 3] *= scale
+        return replace(self, T_world_camera=camera, T_camera_projector=relative)
+
+
+def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """exp(twist) T."""
+    out = np.empty((len(T), 4, 4))
+    moved_poses(len(T), np.ascontiguousarray(T.numpy()), np.ascontiguousarray(twist.numpy()), out)
+    return torch.from_numpy(out)
+
+
+# Residuals and their derivatives; `bundle_adjustment/residuals.py` says what they are.
+#
+# `devices` are a rig's arrays (`Rig.arrays`): poses of the cameras in the world, their inverses, those of the
+# cameras in their projectors, and parameters and model codes of cameras and projector. Arrays for derivatives may
+# be
+# empty: then none are computed.
+
+
+@compiled
+def _by_increment(out, first, sign, a, b, c, x, y, z):
+    """out[first : first + 6] = sign * [b, -b x p]: a derivative by a point p, as one by an increment of its pose."""
+    out[first], out[first + 1], out[first + 2] = sign * a, sign * b, sign * c
+    out[first + 3] = -sign * (b * z - c * y)
+    out[first + 4] = -sign * (c * x - a * z)
+    out[first + 5] = -sign * (a * y - b * x)
+
+
+@compiled
+def _world_point(devices, frame, depth, ray):
+    """A point along a camera ray."""
+    return moved(devices[0][frame], depth * ray[0], depth * ray[1], depth * ray[2])
+
+
+@compiled_range
+def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, by_pose, by_depth):
+    """The anchors' own: decoded coordinates from their projector's view of them."""
+    _, _, T_projector_camera, _, _, projector, code = devices
+    derivatives = len(by_depth) > 0
+    for k in range(first, last):
+        T, ray = T_projector_camera[frame[k]], rays[k]
+        x, y, z = depths[k] * ray[0], depths[k] * ray[1], depths[k] * ray[2]
+        u, v, _, ux, uy, uz, vx, vy, vz = view_of(code, *moved(T, x, y, z), projector)
+        residual[k, 0], residual[k, 1] = u - decoded[k, 0], v - decoded[k, 1]
+        if derivatives:
+            for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
+                a, b, d = row_times_rotation(row[0], row[1], row[2], T)
+                _by_increment(by_pose[k, c], np.int64(0), -1.0, a, b, d, x, y, z)
+                by_depth[k, c] = a * ray[0] + b * ray[1] + d * ray[2]
+
+
+@compiled_range
+def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_front):
+    """Where other cameras see the anchors."""
+    _, T_camera_world, _, cameras, code, _, _ = devices
+    for k in range(first, last):
+        a, j = anchor[k], viewer[k]
+        x, y, z = _world_point(devices, frame[a], depths[a], rays[a])
+        x, y, z = moved(T_camera_world[j], x, y, z)
+        uv[k, 0], uv[k, 1], in_front[k] = view_of(code, x, y, z, cameras[j])[:3]
+
+
+@compiled_range
+def cross_residuals(
+    first, last, devices, frame, rays, depths, anchor, viewer, seen, seen_by_pixel, residual, by_pose, by_depth
+):
+    """What other frames decoded (`seen`, with its derivatives by the pixel), from their projectors' views."""
+    T_world_camera, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
+    derivatives = len(by_depth) > 0
+    for k in range(first, last):
+        n, j = anchor[k], viewer[k]
+        i, ray = frame[n], rays[n]
+        x, y, z = _world_point(devices, i, depths[n], ray)
+        xj, yj, zj = moved(T_camera_world[j], x, y, z)
+        T = T_projector_camera[j]
+        u, v, _, ux, uy, uz, vx, vy, vz = view_of(projector_code, *moved(T, xj, yj, zj), projector)
+        residual[k, 0], residual[k, 1] = u - seen[k, 0], v - seen[k, 1]
+        if derivatives:
+            _, _, _, cux, cuy, cuz, cvx, cvy, cvz = view_of(camera_code, xj, yj, zj, cameras[j])
+            R = T_world_camera[i]
+            dx = R[0, 0] * ray[0] + R[0, 1] * ray[1] + R[0, 2] * ray[2]
+            dy = R[1, 0] * ray[0] + R[1, 1] * ray[1] + R[1, 2] * ray[2]
+            dz = R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2]
+            for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
+                a, b, d = row_times_rotation(row[0], row[1], row[2], T)
+                _by_increment(by_pose[k, c], np.int64(12), -1.0, a, b, d, xj, yj, zj)
+                du, dv = seen_by_pixel[k, c, 0], seen_by_pixel[k, c, 1]
+                a, b, d = a - du * cux - dv * cvx, b - du * cuy - dv * cvy, d - du * cuz - dv * cvz
+                a, b, d = row_times_rotation(a, b, d, T_camera_world[j])
+                _by_increment(by_pose[k, c], np.int64(0), 1.0, a, b, d, x, y, z)
+                _by_increment(by_pose[k, c], np.int64(6), -1.0, a, b, d, x, y, z)
+                by_depth[k, c] = a * dx + b * dy + d * dz
 
 
 @dataclass(frozen=True)

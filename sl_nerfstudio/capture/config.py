@@ -60,6 +60,6 @@ class CaptureConfig:
     @property
     def image_size(self) -> tuple[int, int] | None:
         """(w, h) of --size. Raises UserError."""
-        from sl_nerfstudio.pattern.board_values import counts  # --help does not need it
+        from sl_nerfstudio.pattern.boards import counts  # --help does not need it
 
         return None if self.size is None else counts(self.size, "--size")

@@ -3,14 +3,136 @@
 from dataclasses import dataclass, field
 from enum import Enum
 
+import cv2
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float32, Int, UInt8
 from numpy import ndarray
+from scipy.ndimage import maximum_filter
 
-from sl_nerfstudio.capture.grid_view import GridView
+from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, GridDetector, edge_width, line_blur
+from sl_nerfstudio.decoding.grid_phases import clear_places, to_pixel_coordinates
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.scan.images import as_grey
+
+# Exposure of an image, where it matters: where the pattern is.
+
+_SATURATED = 0.995  # of full scale
+_DARK = 0.06  # of full scale: lines as dark as this are lost in the noise of most cameras
 
 
-class Verdict(Enum):
+@dataclass(frozen=True)
+class Exposure:
+    """Shares of the places that show the pattern; of the whole image where none does."""
+
+    saturated: float  # a pixel at full scale
+    dark: float  # nothing brighter than a few hundredths of full scale, not even the lines
+
+
+def measure_light(
+    grey: Float32[ndarray, "h w"], at: Float32[ndarray, "n 2"] | None = None, period: float = 8.0
+) -> Exposure:
+    """The light at pixels (x, y), in windows of a period of the pattern around them; without them, everywhere."""
+    side = max(3, round(period))
+    brightest = maximum_filter(grey, side)
+    if at is None:
+        return Exposure(float((grey >= _SATURATED).mean()), float((brightest < _DARK).mean()))
+    h, w = grey.shape
+    x, y = np.clip(at.astype(np.int64), 0, (w - 1, h - 1)).T
+    inside = _windows(grey.shape, x, y, side)
+    return Exposure(float((grey[inside] >= _SATURATED).mean()), float((brightest[y, x] < _DARK).mean()))
+
+
+def _windows(shape: tuple[int, ...], x: ndarray, y: ndarray, side: int) -> Bool[ndarray, "h w"]:
+    """Pixels within half a window of one of the places."""
+    marked = np.zeros(shape, dtype=np.uint8)
+    marked[y, x] = 1
+    return maximum_filter(marked, side) > 0
+
+
+# What a single image shows of the coded grid, fast enough for several images a second.
+#
+# The decoder's detector finds the nodes of the grid and recognises them. Coordinates between them, which cost most
+# of the
+# decoding, are not needed to judge an image.
+
+_LONGEST_SIDE = 960  # pixels of the reduced image in which the grid is looked for
+_SAME_PLACE = 0.25  # periods: a node that is farther away than this shows another place
+
+
+@dataclass(frozen=True, eq=False)
+class GridView:
+    """The nodes of the grid in one image, and how well they can be seen."""
+
+    uv: Float32[ndarray, "rows columns 2"]  # pixel (x, y) of every node of the pattern; NaN where it was not found
+    period: float  # of the grid in the image, pixels
+    blur: float | None  # sigma of the lines, periods; None where too little of the grid was found
+    light: Exposure
+    edge: float | None = None  # sigma of the sharpest edges, pixels; only where no pattern is found
+
+    @property
+    def seen(self) -> Bool[ndarray, "rows columns"]:
+        """Nodes that were found."""
+        return np.isfinite(self.uv[..., 0])
+
+    def difference(self, other: "GridView") -> float:
+        """Share of the nodes seen in either view that the other one does not show at the same place, from 0 to 1.
+
+        It is 0 for two images from the same place, and 1 where all nodes have moved or are others.
+        """
+        either = int((self.seen | other.seen).sum())
+        if either == 0:
+            return 1.0
+        step = np.linalg.norm(self.uv - other.uv, axis=-1)  # NaN where one of them was not found
+        same = int((step < _SAME_PLACE * min(self.period, other.period)).sum())
+        return 1 - same / either
+
+
+class GridReader:
+    """Reads images of one pattern."""
+
+    def __init__(self, pattern: GridPattern) -> None:
+        self.pattern = pattern
+        self._detector = GridDetector(pattern)
+
+    def read(self, image: UInt8[ndarray, "h w *c"]) -> GridView:
+        """The nodes in an image, grey or RGB; none if it does not show the pattern."""
+        step = max(1, -(-max(image.shape[:2]) // _LONGEST_SIDE))
+        size = (image.shape[1] // step, image.shape[0] // step)
+        small = image if step == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        grey = as_grey(small)
+        uv = np.full((self.pattern.rows, self.pattern.columns, 2), np.nan, dtype=np.float32)
+        found = self._detector.detect(grey)
+        if found is None or found.known < LEAST_NODES:
+            return GridView(uv, float("nan"), None, measure_light(grey), edge_width(grey))
+        known = found.assignment.known
+        scale = np.array([image.shape[1] / grey.shape[1], image.shape[0] / grey.shape[0]], dtype=np.float32)
+        at = to_pixel_coordinates(found.graph.place[known], found.rectified)
+        row, column = self._upright(found.assignment.place[known], found.assignment.turn)
+        uv[row, column] = at * scale
+        blur = line_blur(found.rectified, found.maps, clear_places(found.maps), self.pattern)
+        period = float(found.appearance.period * scale.mean())
+        return GridView(uv, period, blur, measure_light(grey, at, found.appearance.period))
+
+    def _upright(self, place: ndarray, turn: int) -> tuple[ndarray, ndarray]:
+        """Row and column in the pattern of places in the pattern turned clockwise by `turn` quarter turns."""
+        row, column = place.T
+        last_row, last_column = self.pattern.rows - 1, self.pattern.columns - 1
+        return ((row, column), (last_row - column, row), (last_row - row, last_column - column),
+                (column, last_column - row))[turn]  # fmt: skip
+
+
+class PlainReader:
+    """Measures light and sharpness of images that show no pattern, such as those of a board."""
+
+    def read(self, image: UInt8[ndarray, "h w *c"]) -> GridView:
+        """A view without nodes."""
+        grey = as_grey(image)
+        return GridView(
+            np.zeros((0, 0, 2), dtype=np.float32), float("nan"), None, measure_light(grey), edge_width(grey)
+        )
+
+
+class SelectionVerdict(Enum):
     """What is said of an image."""
 
     KEEP = "keep"
@@ -24,7 +146,7 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class SelectionLimits:
     """From when on an image is kept."""
 
     # Of the places that show the pattern.
@@ -41,7 +163,7 @@ class Limits:
     pause: float = 1.0  # seconds after the last one
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = SelectionLimits()
 
 
 @dataclass
@@ -49,35 +171,35 @@ class Selection:
     """The views that were kept, and the judgement of the next."""
 
     shape: tuple[int, int]  # rows and columns of the pattern
-    limits: Limits = DEFAULT_LIMITS
+    limits: SelectionLimits = DEFAULT_LIMITS
     kept: list[GridView] = field(default_factory=list)
     last: float = -np.inf  # seconds, when the last one was kept
 
-    def judge(self, view: GridView, seconds: float) -> Verdict:
+    def judge(self, view: GridView, seconds: float) -> SelectionVerdict:
         """Whether to keep a view, or the first reason against it."""
         limits = self.limits
         if view.uv.size == 0:
-            return Verdict.BY_KEY
+            return SelectionVerdict.BY_KEY
         if view.seen.sum() < limits.least_nodes:
             return self._without_pattern(view)
         if view.light.saturated > limits.most_saturated:
-            return Verdict.SATURATED
+            return SelectionVerdict.SATURATED
         if view.light.dark > limits.most_dark:
-            return Verdict.DARK
+            return SelectionVerdict.DARK
         if view.blur is None or view.blur > limits.most_blur:
-            return Verdict.BLURRED
+            return SelectionVerdict.BLURRED
         if min((view.difference(other) for other in self.kept), default=1.0) < limits.least_difference:
-            return Verdict.KNOWN
-        return Verdict.KEEP if seconds - self.last >= limits.pause else Verdict.WAIT
+            return SelectionVerdict.KNOWN
+        return SelectionVerdict.KEEP if seconds - self.last >= limits.pause else SelectionVerdict.WAIT
 
-    def _without_pattern(self, view: GridView) -> Verdict:
+    def _without_pattern(self, view: GridView) -> SelectionVerdict:
         """Light and blur are named as the reason only where they hide a pattern anywhere in the image."""
         if view.light.saturated > self.limits.most_white:
-            return Verdict.SATURATED
+            return SelectionVerdict.SATURATED
         if view.light.dark > self.limits.most_black:
-            return Verdict.DARK
+            return SelectionVerdict.DARK
         blurred = view.edge is not None and view.edge > self.limits.widest_edge
-        return Verdict.BLURRED if blurred else Verdict.NO_PATTERN
+        return SelectionVerdict.BLURRED if blurred else SelectionVerdict.NO_PATTERN
 
     def add(self, view: GridView, seconds: float = -np.inf) -> None:
         """Keep a view."""

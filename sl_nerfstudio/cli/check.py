@@ -1,19 +1,57 @@
 """`sl-check DIR`: every fault of a scan folder at once, or those of a training run."""
 
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sl_nerfstudio.cli.check_run import check_run_folder, is_run
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import unit_word
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.scan.check.folder import FolderCheck
-    from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
+    from sl_nerfstudio.review.agreement import CrossFrameAgreement
+    from sl_nerfstudio.runs.run import RunCheck
+    from sl_nerfstudio.scan.check import FolderCheck
+
+# The part of `sl-check` that checks a training run instead of a scan.
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder or the config.yml of a training run."""
+    if path.is_dir():
+        return (path / "config.yml").is_file() and not (path / "transforms.json").exists()
+    return path.suffix in (".yml", ".yaml")
+
+
+def check_run_folder(path: Path) -> str:
+    """What the run is and what there is of it. Raises UserError for anything that is wrong."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
+        from sl_nerfstudio.runs.run import check_run
+
+    return run_summary(check_run(path))
+
+
+def run_summary(found: "RunCheck") -> str:
+    """The main facts about a good run, in a few lines."""
+    config, step, last = found.config, found.last.step, found.config.last_step
+    state = "poses adjusted, no step yet" if step < 0 else f"step {step}"
+    if last is not None:
+        state += ", complete" if step >= last else f" of {last}: interrupted, or still in training"
+    there = "is there and unchanged" if found.has_scan else "is not there, so it was not compared"
+    return "\n".join(
+        [
+            f"{found.folder}: no faults",
+            f"  method              {config.method_name}",
+            f"  state               {state}",
+            f"  checkpoints         {found.checkpoints}, the last is {found.last.path.name}",
+            f"  scan                {found.scan} {there}",
+            "",
+        ]
+    )
 
 
 def main() -> None:
@@ -38,13 +76,13 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
         sys.stdout.write(check_run_folder(folder))
         return
     from sl_nerfstudio.errors import ScanError
-    from sl_nerfstudio.scan.check.folder import check_folder
+    from sl_nerfstudio.scan.check import check_folder
 
     result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
-    from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
-    from sl_nerfstudio.verdict.shared_surface import shared_surface_of_scan
+    from sl_nerfstudio.review.agreement import compare_scan_frames
+    from sl_nerfstudio.review.coverage import shared_surface_of_scan
 
     scan, said = result.scan, ""
     if scan is not None:
@@ -58,8 +96,7 @@ def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decode
 
     `shared_decoded`: of the surface that others show, how much each frame decoded; None where not known.
     """
-    from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
-    from sl_nerfstudio.verdict.judge import judge_scan
+    from sl_nerfstudio.review.verdict import FrameFacts, ScanFacts, judge_scan
 
     frames = tuple(
         FrameFacts(content.name, decoded_share=content.decoded, shared_decoded=shared)

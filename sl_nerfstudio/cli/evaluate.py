@@ -1,21 +1,187 @@
 """sl-eval: compare a mesh and its poses with a scan, and with the truth if it is known."""
 
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sl_nerfstudio.cli.lengths import print_lengths
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import figure, paragraph, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.evaluation.completeness.next_view import NextView
-    from sl_nerfstudio.evaluation.evaluate import Evaluation
-    from sl_nerfstudio.evaluation.inputs import EvaluationInputs
-    from sl_nerfstudio.evaluation.lengths import PointPair
+    from sl_nerfstudio.evaluation.completeness import NextView
+    from sl_nerfstudio.evaluation.evaluate import Evaluation, EvaluationInputs, Length, PointPair
+    from sl_nerfstudio.evaluation.judgement import Judgement
+    from sl_nerfstudio.scan import PoseSigma
+
+# What sl-eval prints: the verdict, three figures, the reasons and what to do next; tables on request.
+
+_MOST = 4  # reasons, and things to do, that are printed
+
+
+def summary(
+    evaluation: "Evaluation", judgement: "Judgement", sigma: "Sequence[PoseSigma | None]", report: Path | None = None
+) -> str:
+    """The verdict, the three figures that matter, why it is not better, and what to do next.
+
+    `report` is the file with everything else, if one was asked for.
+    """
+    fit, rest = evaluation.agreement, "in the report: --report FILE.html" if report is None else f"in {report}"
+    figures = [
+        ("surface", _surface(evaluation, sigma)),
+        ("captures", f"coordinates agree to {fit.coordinate_px_median:.2g} px (median), 95 % to "
+         f"{fit.coordinate_px_p95:.2g} px; worst frame: {_worst_frame(evaluation)}"),
+        ("coverage", _coverage(evaluation)),
+    ]  # fmt: skip
+    return "\n".join(
+        [
+            f"verdict: {judgement.verdict.band}",
+            *(paragraph(name, text) for name, text in figures),
+            *_listed("reasons", judgement.verdict.reasons, rest),
+            *_listed("next", judgement.next_steps, rest),
+        ]
+    )
+
+
+def _listed(name: str, lines: Sequence[str], rest: str) -> list[str]:
+    """The first few, and where the rest is."""
+    shown = [paragraph(name if k == 0 else "", line) for k, line in enumerate(lines[:_MOST])]
+    more = len(lines) - len(shown)
+    return shown + ([paragraph("", f"({more} more {rest})")] if more else [])
+
+
+def _surface(evaluation: "Evaluation", sigma: "Sequence[PoseSigma | None]") -> str:
+    """Its distance from the truth, or else how well the poses are known."""
+    from sl_nerfstudio.evaluation.judgement import ALIGNED
+
+    if evaluation.alignment in evaluation.surface:
+        score, unit = evaluation.surface[evaluation.alignment], evaluation.truth_units
+        return (
+            f"{score.accuracy.rmse:.3g} {unit} from the truth (RMS, {ALIGNED[evaluation.alignment]}); the truth is "
+            f"{score.completeness.mean:.3g} {unit} from it (mean)"
+        )
+    known = [s for s in sigma if s is not None]
+    if not known:
+        return "no truth is known, and the poses do not state their uncertainty"
+    lengths, turns = [s.camera_translation for s in known], [s.camera_rotation_deg for s in known]
+    return f"no truth is known; cameras to {_rms(lengths):.2g} {evaluation.units}, {_rms(turns):.2g}° (1 sigma)"
+
+
+def _worst_frame(evaluation: "Evaluation") -> str:
+    frames = [f for f in evaluation.agreement.frames if math.isfinite(f.coordinate_px_p95)]
+    if not frames:
+        return "none"
+    worst = max(frames, key=lambda f: f.coordinate_px_p95)
+    return f"{worst.name}, {worst.coordinate_px_p95:.2g} px, {worst.covered_share:.0%} covered"
+
+
+def _coverage(evaluation: "Evaluation") -> str:
+    found = evaluation.completeness
+    if found is None:
+        return f"{evaluation.agreement.hit_share:.1%} of the pixels with pattern"
+    o, unit = found.openings, unit_word(evaluation.units)
+    text = f"{found.observed:.1%} of what the frames decoded"
+    if not len(o):
+        return f"{text}; closed all around"
+    inner = f"{len(o) - 1} holes beside it ({figure(o.area[1:].sum())} {unit}²)" if len(o) > 1 else "no holes beside it"
+    return f"{text}; rim of the scan {figure(found.rim_area)} {unit}², {figure(o.length[0])} {unit} long; {inner}"
+
+
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))
+
+
+def print_tables(evaluation: "Evaluation") -> None:
+    """Print distances, pose errors and residuals as tables."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    units = evaluation.truth_units
+    if evaluation.surface:
+        table = Table(title=f"Distances in {units}", title_justify="left")
+        for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):
+            table.add_column(column, justify="right" if column.strip() else "left")
+        for name, score in evaluation.comparable.items():
+            a, c = score.accuracy, score.completeness
+            chamfer, scale = f"{score.chamfer:.3g}", f"{score.scale:.5f}"
+            table.add_row(name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale)
+            table.add_row("", "completeness", *(f"{v:.3g}" for v in (c.mean, c.median, c.rmse, c.p95)), "", "")
+        console.print(table)
+    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
+    if any(errors for _, errors in rows):
+        table = Table(title=f"Pose errors, RMS, in {units}", title_justify="left")
+        for column in ("", "camera", "deg", "projector", "deg", "scale"):
+            table.add_column(column, justify="right" if column else "left")
+        for name, errors in rows:
+            if errors is not None:
+                values = [
+                    v for d in (errors.camera, errors.projector) for v in (d.translation_rmse, d.rotation_rmse_deg)
+                ]
+                table.add_row(name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %")
+        console.print(table)
+    agreement = evaluation.agreement
+    table = Table(title="Agreement with the captures", title_justify="left")
+    for column in (
+        "coordinates px (median)",
+        "95 %",
+        "epipolar px (median)",
+        "pattern cosine",
+        "covered",
+        "worst hole",
+    ):
+        table.add_column(column, justify="right")
+    table.add_row(
+        f"{agreement.coordinate_px_median:.3f}",
+        f"{agreement.coordinate_px_p95:.3f}",
+        f"{agreement.epipolar_px_median:.3f}",
+        f"{agreement.pattern_cosine:.4f}",
+        f"{agreement.hit_share:.1%}",
+        f"{max(frame.largest_hole for frame in agreement.frames):.1%}",
+    )
+    console.print(table)
+
+
+# What sl-eval prints of the distances that were asked for.
+
+
+def print_lengths(lengths: "Sequence[Length]", units: str) -> None:
+    """A table, and why a distance has no uncertainty."""
+    from rich.console import Console
+    from rich.table import Table
+
+    if not lengths:
+        return
+
+    console = Console()
+    table = Table(title=f"Distances between points, in {units}", title_justify="left")
+    for column in ("", "distance", "1 sigma", "from poses", "from noise"):
+        table.add_column(column, justify="right" if column else "left")
+    for length in lengths:
+        sigmas = (length.sigma, length.sigma_shared, length.sigma_independent)
+        table.add_row(length.name, f"{length.length:.5g}", *("-" if s is None else f"{s:.2g}" for s in sigmas))
+    console.print(table)
+    reasons = dict.fromkeys(filter(None, (why_unknown(length) for length in lengths)))
+    for reason in reasons:
+        console.print(f"  {reason}", highlight=False, soft_wrap=True, markup=False)
+
+
+def why_unknown(length: "Length") -> str:
+    """Why a distance has no uncertainty; "" if it has one."""
+    if length.sigma is not None:
+        return ""
+    if length.views is not None and 0 in length.views:
+        return f"{length.name}: no frame confirms the surface at one of its ends, so the distance is not measured"
+    return (
+        "no uncertainty: it needs mesh.ply of sl-export, and --poses with the folder that the same sl-export wrote "
+        "(pose_covariance.npz, of a run that adjusted the poses)"
+    )
+
 
 _JSON_MARK, _REPORT_MARK = b'"format": 1,\n  "verdict"', b"<title>Scan report: "  # by which earlier results are known
 
@@ -55,8 +221,8 @@ class EvalConfig:
 def evaluate_scan(config: EvalConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     _check(config)
-    from sl_nerfstudio.files.results import held_results
-    from sl_nerfstudio.threads import one_library_thread
+    from sl_nerfstudio.parallel import one_library_thread
+    from sl_nerfstudio.storage import held_results
 
     marks = {path: mark for path, mark in ((config.json, _JSON_MARK), (config.report, _REPORT_MARK)) if path}
     with held_results(marks), one_library_thread():
@@ -64,16 +230,10 @@ def evaluate_scan(config: EvalConfig) -> None:
 
 
 def _evaluate(config: EvalConfig) -> None:
-    from sl_nerfstudio.cli.evaluate_words import print_tables, summary
-    from sl_nerfstudio.evaluation.evaluate import evaluate
-    from sl_nerfstudio.evaluation.inputs import read_inputs
-    from sl_nerfstudio.evaluation.judgement import judge
-    from sl_nerfstudio.evaluation.lengths import measure_lengths, typical_sigma
-    from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
-    from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
-    from sl_nerfstudio.evaluation.result_json import to_json
-    from sl_nerfstudio.evaluation.training_steps import trained_steps
-    from sl_nerfstudio.files.atomic import write_atomic
+    from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
+    from sl_nerfstudio.evaluation.judgement import judge, to_json, trained_steps
+    from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
+    from sl_nerfstudio.storage import write_atomic
 
     pairs = _pairs(config)
     inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
@@ -93,7 +253,7 @@ def _evaluate(config: EvalConfig) -> None:
         document = to_json(evaluation, judgement.verdict, capture, lengths)
         results[config.json] = json.dumps(document, indent=2, allow_nan=False) + "\n"
     if config.report:
-        from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
+        from sl_nerfstudio.evaluation.report.scan_report import ReportInput, render_report
 
         results[config.report] = render_report(
             ReportInput(evaluation, judgement, inputs, thumbnails.frames, config.mesh.name, lengths=lengths)
@@ -109,23 +269,22 @@ def _evaluate(config: EvalConfig) -> None:
 
 
 def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "NextView | None":
-    from sl_nerfstudio.evaluation.completeness.knowledge import View
-    from sl_nerfstudio.evaluation.completeness.next_view import next_view
-    from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+    from sl_nerfstudio.evaluation.completeness import SurfaceView, next_view
+    from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 
     found = evaluation.completeness
     if found is None:
         return None
     poses = zip(inputs.poses.T_world_camera, inputs.poses.T_world_projector, strict=True)
     frames = [
-        View(frame.camera, T_c, inputs.scan.projector, T_p)
+        SurfaceView(frame.camera, T_c, inputs.scan.projector, T_p)
         for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
     ]
     return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)
 
 
 def _pairs(config: EvalConfig) -> "list[PointPair]":
-    from sl_nerfstudio.evaluation.lengths import parse_pair, read_pairs
+    from sl_nerfstudio.evaluation.evaluate import parse_pair, read_pairs
 
     given = [parse_pair(text, "--distance") for text in config.distance]
     return given + ([] if config.distances is None else read_pairs(config.distances))

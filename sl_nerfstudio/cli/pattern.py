@@ -1,5 +1,7 @@
 """sl-pattern: write a pattern to project or to print, and its description."""
 
+import io
+import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -8,10 +10,205 @@ import tyro
 
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.sequence import SequenceName
+from sl_nerfstudio.pattern.layout import SequenceName
 
 if TYPE_CHECKING:
+    from numpy import ndarray
+
+    from sl_nerfstudio.pattern.boards import Board
+    from sl_nerfstudio.pattern.grid import GridPattern
     from sl_nerfstudio.pattern.layout import PatternLayout
+
+
+# The folders that sl-pattern writes, and what it says about each.
+
+_SUPERSAMPLING = 4  # of pattern.png
+_DEFAULT_COUNTS = {"chessboard": "9x6", "charuco": "11x8"}
+_DEFAULT_DICTIONARY = "5X5_1000"
+_MARKER = 0.75  # of a square
+_DIGITS = 6  # of lengths on boards: what is drawn is exactly what the text and the command say
+
+
+def write_pattern(output: Path, layout: "PatternLayout", print_width: float | None) -> str:
+    """Write a pattern that is projected into a new folder; returns what to say."""
+    import numpy as np
+
+    from sl_nerfstudio.pattern.gray_code import GrayCode
+    from sl_nerfstudio.pattern.grid import GridPattern
+    from sl_nerfstudio.storage import NewFolder
+
+    with NewFolder(output) as folder:
+        for index, image in enumerate(layout.sequence() if isinstance(layout, GrayCode) else ()):
+            folder.write(f"sequence/{index:02d}.png", _image_file(image, print_width))
+        picture = np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8)
+        folder.write("pattern.png", _image_file(picture, print_width))
+        folder.write("pattern.json", layout.encode(), last=True)
+    if isinstance(layout, GrayCode):
+        return (
+            f"wrote a Gray-code sequence of {layout.images} images to {output}: show them in the order of their names"
+        )
+    if not isinstance(layout, GridPattern):
+        raise TypeError(f"{layout.description} is not written by this command")
+    upright, rolled = layout.margins
+    return (
+        f"wrote a grid of {layout.columns} x {layout.rows} nodes to {output}: 3 x 3 windows differ in at least "
+        f"{upright} of 9 symbols, in {rolled} where the camera may roll{margin_warning(layout)}"
+    )
+
+
+def require_pattern(folder: Path, layout: "PatternLayout") -> None:
+    """Raise UserError unless the folder holds this very pattern."""
+    from sl_nerfstudio.pattern.files import read_layout
+
+    found = read_layout(folder / "pattern.json")
+    if found.encode() != layout.encode():
+        raise UserError(
+            f"{folder}: holds {found.description} of {found.w} x {found.h} pixels that is not the one of these flags\n"
+            "    cause:  it was written with other flags\n"
+            "    remedy: leave out all flags but --output, --show and --every to show what the folder holds, or choose "
+            "another output"
+        )
+
+
+def margin_warning(grid: "GridPattern") -> str:
+    """What to say about codes that are more alike than those of the presets; "" if they are not."""
+    from sl_nerfstudio.pattern.codes import FULL_MARGINS
+    from sl_nerfstudio.pattern.files import PRESETS, longer_period
+
+    if grid.margins >= FULL_MARGINS:
+        return ""
+    period = longer_period(grid.w, grid.h)
+    suits = [name for name, (w, h, _) in PRESETS.items() if (w, h) == (grid.w, grid.h)]
+    presets = f", as --preset {suits[0]} does" if suits else ""
+    return (
+        f"\nwarning: misread symbols are mistaken for other places more easily than with the presets, whose windows "
+        f"differ in {FULL_MARGINS[0]} symbols, in {FULL_MARGINS[1]} where the camera may roll\n"
+        f"    cause:  {grid.columns} x {grid.rows} nodes are too many for five symbols\n"
+        f"    remedy: give --period {period} or more{presets}"
+    )
+
+
+def write_board(
+    output: Path,
+    print_width: float | None,
+    kind: str,
+    size: str | None,
+    square: str | None,
+    marker: str | None,
+    dictionary: str | None,
+) -> str:
+    """A calibration board in true size; returns what to say. Raises UserError for boards that cannot be."""
+    from sl_nerfstudio.pattern.boards import description, encode_board, lay_out
+    from sl_nerfstudio.storage import NewFolder
+
+    board = _board(print_width, kind, size or _DEFAULT_COUNTS[kind], square, marker, dictionary)
+    with NewFolder(output) as folder:
+        try:
+            laid_out = lay_out(board)
+        except ValueError as error:
+            raise UserError(f"--print-width, --square: {error}") from error
+        page = laid_out.page
+        folder.write("board.pdf", page.pdf())
+        folder.write("board.png", page.png(laid_out.pixels_per_mm))
+        folder.write("board.json", encode_board(board), last=True)
+    paper = f"{laid_out.paper}, {'upright' if page.height > page.width else 'on its side'}"
+    if not laid_out.paper:
+        paper = f"a page of {page.width:g} x {page.height:g} mm"
+    return (
+        f"wrote a {description(board)} to {output}\n"
+        f"print board.pdf at 100 % ({paper}), and measure its ruler: if it is not 100 mm long, multiply all lengths "
+        f"below by what it is / 100 mm\nglue the print to something flat, capture it from many sides, then run\n"
+        f"    {calibrate_command(board)}"
+    )
+
+
+def calibrate_command(board: "Board") -> str:
+    """The command that calibrates with captures of the board."""
+    from sl_nerfstudio.pattern.boards import Chessboard
+
+    if isinstance(board, Chessboard):
+        flags = ["--board", "chessboard", "--corners", f"{board.columns}x{board.rows}"]
+        last = []
+    else:
+        flags = ["--board", "charuco", "--squares", f"{board.columns}x{board.rows}"]
+        last = ["--marker", f'"{board.marker:g} mm"', "--dictionary", shlex.quote(board.dictionary)]
+    lengths = ["--square", f'"{board.square:g} mm"', *last]
+    end = ["--pattern", "pattern.json", "--output", "intrinsics.json"]
+    return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, *end])
+
+
+def _board(
+    print_width: float | None, kind: str, size: str, square: str | None, marker: str | None, dictionary: str | None
+) -> "Board":
+    from sl_nerfstudio.pattern.boards import CharucoBoard, Chessboard, counts, millimetres
+
+    columns, rows = counts(size, "--corners" if kind == "chessboard" else "--squares")
+    across = columns + 1 if kind == "chessboard" else columns
+    if (print_width is None) == (square is None):
+        raise UserError(
+            f"--kind {kind}: give either --print-width, the width of all {across} squares together in millimetres, or "
+            '--square, the side of one of them with its unit ("18 mm"); --print-width 180 suits A4 paper'
+        )
+    side = print_width / max(across, 1) if print_width is not None else millimetres(square or "", "--square")
+    side = _rounded(side)
+    try:
+        if kind == "chessboard":
+            return Chessboard(columns, rows, side)
+        markers = millimetres(marker, "--marker") if marker is not None else _MARKER * side
+        return CharucoBoard(columns, rows, side, _rounded(markers), dictionary or _DEFAULT_DICTIONARY)
+    except ValueError as error:
+        raise UserError(f"--kind {kind}: {error}") from error
+
+
+def _rounded(length: float) -> float:
+    return float(f"{length:.{_DIGITS}g}")
+
+
+def _image_file(image: "ndarray", print_width: float | None) -> bytes:
+    """A PNG file that says how wide to print it."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    per_inch = None if print_width is None else image.shape[1] / print_width * 25.4
+    Image.fromarray(image).save(buffer, "PNG", **({} if per_inch is None else {"dpi": (per_inch, per_inch)}))
+    return buffer.getvalue()
+
+
+# sl-pattern --show: the pattern of a folder on a display.
+
+
+def show_folder(folder: Path, display: int, every: float | None) -> None:
+    """Show what a folder of sl-pattern holds until it is ended. Raises UserError if it cannot be shown."""
+    from sl_nerfstudio.capture.screen import Screen, pattern_picture, show_sequence, show_still
+    from sl_nerfstudio.pattern.files import read_layout
+    from sl_nerfstudio.pattern.gray_code import GrayCode
+
+    layout = read_layout(folder / "pattern.json")
+    if every is not None and not isinstance(layout, GrayCode):
+        raise UserError(f"--every {every:g}: {layout.description} is one image; leave it out")
+    with Screen(display) as screen:
+        print(_words(display, screen.size, (layout.w, layout.h)), flush=True)
+        if isinstance(layout, GrayCode):
+            names = layout.fields()["sequence"]
+            print("Space and the right key show the next image, the left key the one before", flush=True)
+            show_sequence(screen, list(layout.sequence()), every, lambda k: print(f"  {k:02d}  {names[k]}", flush=True))
+            return
+        show_still(screen, pattern_picture(folder / "pattern.json", layout))
+
+
+def _words(display: int, screen: tuple[int, int], size: tuple[int, int]) -> str:
+    from sl_nerfstudio.capture.screen import offset_on
+
+    shown = f"showing {size[0]} x {size[1]} pixels on display {display}; Escape ends"
+    if screen == size:
+        return shown
+    left, top = offset_on(screen, size)
+    return (
+        f"{shown}\nthe display has {screen[0]} x {screen[1]} pixels: the pattern lies in its middle, unscaled. Pixel "
+        f"(0, 0) of the pattern is pixel ({left}, {top}) of the display; subtract this from a principal point that was "
+        "calibrated with the whole display"
+    )
+
 
 Kind = Literal["grid", "gray-code", "chessboard", "charuco"]
 _GRID_FLAGS = ("preset", "width", "height", "period", "line_width", "gap", "seed", "print_width")
@@ -25,7 +222,7 @@ _FLAGS = {
 
 
 @dataclass(frozen=True)
-class Arguments:
+class PatternArguments:
     """Write a pattern to project, or a board to print.
 
     grid and gray-code: pattern.png and pattern.json, which sl-process needs to decode captures; for Gray code, all
@@ -92,25 +289,28 @@ def main() -> None:
 
 
 def _write() -> None:
-    arguments = tyro.cli(Arguments, prog="sl-pattern")
+    from sl_nerfstudio.pattern.boards import counts
+
+    arguments = tyro.cli(PatternArguments, prog="sl-pattern")
     _check(arguments)
     if arguments.show is not None:
         _show(arguments, arguments.show)
     elif arguments.is_board:
-        from sl_nerfstudio.cli.pattern_folder import write_board  # numpy, OpenCV
-
         a = arguments
         counts = a.corners or a.squares
         print(write_board(a.output, a.print_width, a.shown_kind, counts, a.square, a.marker, a.dictionary))
     else:
-        from sl_nerfstudio.cli.pattern_folder import write_pattern
-
         print(write_pattern(arguments.output, _layout(arguments), arguments.print_width))
 
 
-def _layout(arguments: Arguments, display: tuple[int, int] | None = None) -> "PatternLayout":
+def _layout(arguments: PatternArguments, display: tuple[int, int] | None = None) -> "PatternLayout":
     """The pattern that the flags describe; without a size, that of the display, which is otherwise the preset's."""
-    from sl_nerfstudio.pattern.presets import DEFAULT_PRESET, longer_period, make_gray_code, make_grid
+    from sl_nerfstudio.pattern.files import (
+        DEFAULT_PRESET,
+        longer_period,
+        make_gray_code,
+        make_grid,
+    )
 
     a = arguments
     w, h, period = a.width, a.height, a.period
@@ -123,11 +323,9 @@ def _layout(arguments: Arguments, display: tuple[int, int] | None = None) -> "Pa
     return make_grid(preset, w, h, period, a.line_width, a.gap, a.seed or 0)
 
 
-def _show(arguments: Arguments, display: int) -> None:
+def _show(arguments: PatternArguments, display: int) -> None:
     """Show the pattern of a folder, which is written first if it is new."""
-    from sl_nerfstudio.capture.windows import display_size, offset_on
-    from sl_nerfstudio.cli.pattern_folder import require_pattern, write_pattern
-    from sl_nerfstudio.cli.pattern_show import show_folder
+    from sl_nerfstudio.capture.screen import display_size, offset_on
 
     size = display_size(display)
     described = any(getattr(arguments, name) is not None for name in ("kind", *_FLAGS[arguments.shown_kind]))
@@ -140,7 +338,7 @@ def _show(arguments: Arguments, display: int) -> None:
     show_folder(arguments.output, display, arguments.every)
 
 
-def _check(arguments: Arguments) -> None:
+def _check(arguments: PatternArguments) -> None:
     """Raise UserError for flags that the kind of pattern has not, and for numbers that mean nothing."""
     kind = arguments.shown_kind
     fitting = ("output", "kind", *_FLAGS[kind], *(() if arguments.is_board else ("show", "every")))

@@ -21,9 +21,7 @@ def main() -> None:
 def _process() -> None:
     config = tyro.cli(ProcessConfig, prog="sl-process", config=(tyro.conf.FlagCreatePairsOff,))
     config.check()
-    from sl_nerfstudio.evaluation.report.processing_report import (
-        render_processing_report,  # slow to import: torch, open3d
-    )
+    from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
     from sl_nerfstudio.processing.process import process
 
     result = process(config, render_processing_report, log)
@@ -37,7 +35,7 @@ def log(text: str) -> None:
 
 def closing_words(result: "ProcessResult") -> str:
     """The summary at the end of the output."""
-    from sl_nerfstudio.processing.advice import first_line
+    from sl_nerfstudio.processing.result import first_line
 
     output = result.config.output
     lost = [f"  left out: {f.name}: {first_line(f.reason)}\n" for f in result.frames if not f.in_scan]

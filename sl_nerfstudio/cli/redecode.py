@@ -11,9 +11,8 @@ from sl_nerfstudio.console import command, next_steps
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.redecoding.frame import FrameFacts
     from sl_nerfstudio.redecoding.redecode import Redecoded
-    from sl_nerfstudio.runs.trained_run import TrainedRun
+    from sl_nerfstudio.runs.run import TrainedRun
 
 _MOST_NAMED = 6
 
@@ -44,7 +43,7 @@ def main() -> None:
 def redecode(arguments: RedecodeArguments) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     check(arguments)
-    from sl_nerfstudio.runs.trained_run import load_run
+    from sl_nerfstudio.runs.run import load_run
 
     print(redecode_trained(load_run(arguments.load_config, arguments.data), arguments))
 
@@ -53,7 +52,7 @@ def check(arguments: RedecodeArguments) -> None:
     """Check before anything slow: a sensible resolution, an output that is new or empty."""
     if arguments.resolution < 2:
         raise UserError(f"--resolution {arguments.resolution}: at least 2 cells are needed; 256 is usual")
-    from sl_nerfstudio.files.new_folder import NewFolder
+    from sl_nerfstudio.storage import NewFolder
 
     NewFolder(arguments.output).close(complete=False)
 

@@ -12,7 +12,7 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 
 
 @dataclass(frozen=True)
-class Arguments:
+class SynthArguments:
     """Make a synthetic scan with its truth: a camera and a projector that move around a matte object.
 
     Lengths in flags are in millimetres, fractions are between 0 and 1.
@@ -29,10 +29,10 @@ def main() -> None:
 
 
 def _synthesise() -> None:
-    arguments = tyro.cli(Arguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
+    arguments = tyro.cli(SynthArguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
     arguments.config.check()
     # slow to import: torch, open3d
-    from sl_nerfstudio.synthesis.boards.captures import BOARDS, write_board_captures
+    from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
     from sl_nerfstudio.synthesis.synthesise import synthesise
 
     if arguments.config.scene in BOARDS:

@@ -4,24 +4,173 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int, Shaped, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.pixel_samplers import PixelSamplerConfig
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.dataparser.dataparser import SLDataParser, SLDataParserConfig
-from sl_nerfstudio.dataparser.dataset import SLDataset
-from sl_nerfstudio.dataparser.pixel_sampler import SLPixelSampler
-from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
-from sl_nerfstudio.dataparser.scene_rays import SceneRays
+from sl_nerfstudio.dataparser.dataparser import (
+    PixelBatch,
+    PixelSamples,
+    SLDataParser,
+    SLDataParserConfig,
+    held_out_pixels,
+)
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.numerics import evenly_spaced
+from sl_nerfstudio.geometry.triangulation import pixel_rays
+from sl_nerfstudio.scan import Frame, Scan
+
+# Whole frames in nerfstudio's form, for evaluation, rendering and the viewer. Each is read when it is needed.
+
+
+class SLDataset(InputDataset):
+    """Frames of a scan, at the resolution of `cameras`.
+
+    Besides `image` (RGB, [0, 1]) an item holds, each as (h, w, channels): `pattern` in [0, 1], `coords` in pattern
+    pixels (NaN where not decoded), and the flags `mask`, `decoded` and `held_out`.
+    """
+
+    @property
+    def scan(self) -> Scan:
+        """The scan behind the data set."""
+        return self.metadata["sl_scan"]
+
+    def get_numpy_image(self, image_idx: int) -> UInt8[ndarray, "h w 3"]:
+        """The captured image as 8-bit RGB, from any bit depth and number of channels in the file."""
+        return (self._image(image_idx) * 255 + 0.5).astype(np.uint8)
+
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
+        """The captured image in [0, 1] with the file's full bit depth."""
+        return torch.from_numpy(self._image(image_idx))
+
+    def get_metadata(self, data: dict) -> dict[str, Tensor]:
+        """The data of the pixels other than their colour."""
+        index = data["image_idx"]
+        frame = self.scan.frames[index]
+        coords = frame.read_coords()
+        mask = np.isfinite(coords).all(-1) if frame.mask_path is None else frame.read_mask()
+        images = {
+            "coords": coords,
+            "pattern": frame.read_pattern()[..., None],
+            "mask": mask[..., None],
+            "decoded": (np.isfinite(coords).all(-1) & mask)[..., None],
+            "held_out": (held_out_pixels(index, *mask.shape) & mask)[..., None],
+        }
+        return {name: torch.from_numpy(self._resized(index, image)) for name, image in images.items()}
+
+    def _image(self, index: int) -> Float32[ndarray, "h w 3"]:
+        return self._resized(index, _rgb(self.scan.frames[index]))
+
+    def _resized(self, index: int, image: Shaped[ndarray, "h w c"]) -> Shaped[ndarray, "h2 w2 c"]:
+        """An image at the camera's resolution, by nearest pixel: coordinates must not be averaged across edges."""
+        h, w = int(self.cameras.height[index]), int(self.cameras.width[index])
+        rows, columns = _nearest(h, image.shape[0]), _nearest(w, image.shape[1])
+        return np.ascontiguousarray(image[rows[:, None], columns[None, :]])
+
+
+def _nearest(size: int, source: int) -> ndarray:
+    return ((np.arange(size) + 0.5) * source / size).astype(np.int64)
+
+
+def _rgb(frame: Frame) -> Float32[ndarray, "h w 3"]:
+    stored = frame.read_image()
+    image = stored.astype(np.float32) / np.iinfo(stored.dtype).max
+    if image.ndim == 2:
+        image = image[..., None]
+    return image.repeat(3, -1) if image.shape[-1] == 1 else image
+
+
+# Random pixels for a step of training or evaluation.
+
+_STRIDE = 1_000_003  # a prime, so that seeds of neighbouring runs do not share the batches of neighbouring steps
+
+
+class SLPixelSampler:
+    """Draws `num_rays_per_batch` pixels; nerfstudio's exporters set that number from outside.
+
+    The batch of a step depends only on the seed and the step, so that a resumed run continues like an uninterrupted
+    one. A second call for the same step (as by `ns-export pointcloud`) draws other pixels.
+    """
+
+    def __init__(self, samples: PixelSamples, num_rays_per_batch: int, held_out: bool) -> None:
+        """The seed is torch's, which nerfstudio sets from `--machine.seed` and the rank of the process."""
+        self.samples = samples
+        self.num_rays_per_batch = num_rays_per_batch
+        self.held_out = held_out
+        self.generator = torch.Generator(samples.device)
+        self._seed = torch.initial_seed() + int(held_out)
+        self._step: int | None = None
+
+    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
+        """Change the number of pixels of a batch."""
+        self.num_rays_per_batch = num_rays_per_batch
+
+    def begin(self, step: int) -> None:
+        """Seed the draws of a step, unless that was done."""
+        if step != self._step:
+            self._step = step
+            self.generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+
+    def sample(self, step: int) -> PixelBatch:
+        """Pixels for a step."""
+        self.begin(step)
+        return self.samples.at(self._draw())
+
+    def choose(self, step: int) -> Int[Tensor, "n"]:
+        """Pixels for a step: indices of the table, or on a GPU of those not held out (`PixelSamples.training`)."""
+        self.begin(step)
+        if self.samples.device.type == "cpu":
+            return self._draw()
+        return self.samples.randint(len(self.samples.training), self.num_rays_per_batch, self.generator)
+
+    def _draw(self) -> Int[Tensor, "n"]:
+        if self.samples.device.type == "cpu" or self.held_out:
+            return self.samples.draw(self.num_rays_per_batch, self.generator, self.held_out)
+        return self.samples.draw_without_waiting(self.num_rays_per_batch, self.generator)
+
+
+# Rays of camera pixels in the normalised scene.
+
+
+class SceneRays:
+    """Makes rays from one pose for each frame, on the device that holds the poses.
+
+    They equal those of nerfstudio's `Cameras.generate_rays`, without the work for camera types that cannot occur here.
+    """
+
+    def __init__(self, scan: Scan, T_scene_camera: Float[Tensor, "n 4 4"], refined: bool = False) -> None:
+        """`refined` marks the rays, so that the model does not correct them again."""
+        self._cameras = Intrinsics.of([frame.camera for frame in scan.frames]).to(T_scene_camera.device)
+        self._T_scene_camera = T_scene_camera
+        self._refined = refined
+
+    def __call__(self, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> RayBundle:
+        """Rays through pixels `uv` of the given frames."""
+        cameras = self._cameras[frame]
+        origins, directions = pixel_rays(cameras, self._T_scene_camera[frame], uv)
+        view = frame[:, None]
+        metadata = {"sl_view": view, "sl_uv": uv, "directions_norm": torch.ones_like(origins[:, :1])}
+        if self._refined:
+            metadata["sl_refined"] = torch.ones_like(view, dtype=torch.bool)
+        return RayBundle(
+            origins=origins,
+            directions=directions,
+            pixel_area=1 / cameras.params[:, :2].prod(-1, keepdim=True),
+            camera_indices=view,
+            metadata=metadata,
+        )
+
 
 Batch = dict[str, Tensor]
 _BYTES_PER_PIXEL = 24  # of the table, with the index of pixels that are not held out

@@ -1,13 +1,39 @@
 """The decoders there are, and the choice of one for a pattern."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from sl_nerfstudio.decoding.decoder import Decoder
-from sl_nerfstudio.decoding.graycode.decoder import GrayCodeDecoder
-from sl_nerfstudio.decoding.grid.decoder import NetworkDecoder
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder
+from sl_nerfstudio.decoding.gray_code import check_count, check_sizes, decode_gray_code, take_samples
+from sl_nerfstudio.decoding.gray_code_order import check_order, order_fault
+from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.scan.images import read_photograph
+
+# The decoder of Gray-code sequences.
+
+
+class GrayCodeDecoder(Decoder[GrayCode]):
+    """Decodes a folder of images: one photograph of every pattern of the sequence."""
+
+    name: ClassVar[str] = "graycode"
+    version: ClassVar[int] = 3
+    reads: ClassVar[str] = GrayCode.kind
+    sequence: ClassVar[bool] = True
+
+    def decode(self, paths: Sequence[Path]) -> Decoded:
+        """Decode the images of one sequence, in the order of projection."""
+        check_count(len(paths), self.layout)  # before reading them all
+        images = [read_photograph(path) for path in paths]
+        check_sizes(images)
+        fault = order_fault(check_order(take_samples(images), self.layout), self.layout, [path.name for path in paths])
+        if fault is not None:
+            raise fault
+        return decode_gray_code(images, self.layout)
+
 
 DECODERS: dict[str, type[Decoder[Any]]] = {
     NetworkDecoder.name: NetworkDecoder,

@@ -1,34 +1,272 @@
 """The whole evaluation of one result: its surface and poses against the truth, and its agreement with the captures."""
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from numpy import ndarray
+from scipy.spatial import KDTree
 
-from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.alignment import align_poses
-from sl_nerfstudio.evaluation.capture_agreement import (
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.console import track
+from sl_nerfstudio.errors import UserError, first_line
+from sl_nerfstudio.evaluation.agreement import (
     AgreementAccumulator,
     CaptureAgreement,
     FrameAgreement,
+    FramePixels,
     compare_captures,
 )
-from sl_nerfstudio.evaluation.completeness.completeness import Completeness, assess_completeness
-from sl_nerfstudio.evaluation.frame_pixels import FramePixels
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.metrics import SurfaceScore, default_f_distances, score_surface
-from sl_nerfstudio.evaluation.pose_errors import PoseErrors, compare_poses
-from sl_nerfstudio.evaluation.reference import Reference
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.progress import track
-from sl_nerfstudio.scan import Frame, PoseSigma, Scan
-from sl_nerfstudio.threads import one_library_thread
-from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
-from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
+from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import (
+    PointReference,
+    PoseErrors,
+    Reference,
+    align_poses,
+    compare_poses,
+    mesh_reference,
+)
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.meshing.files import read_mesh, read_quality
+from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
+from sl_nerfstudio.meshing.uncertainty import length_sigma
+from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, compare_scan_frames
+from sl_nerfstudio.review.verdict import DepartedFrame, departed_frames
+from sl_nerfstudio.runs.export import read_covariance
+from sl_nerfstudio.scan import (
+    FileError,
+    Frame,
+    PoseSigma,
+    Scan,
+    read_devices,
+    read_ground_truth,
+    read_pose_sigmas,
+    read_poses,
+    read_scan,
+    read_unplaced,
+)
+from sl_nerfstudio.scan.document import TRANSFORMS, check_file, read_document
+from sl_nerfstudio.scan.images import ARRAY_DAMAGE
+
+# Distances between a reconstructed surface and the truth.
+#
+# *Accuracy* is the distance of every part of the result from the truth: wrong or invented surface makes it worse.
+# *Completeness* is the distance of every observable part of the truth from the result: holes make it worse.
+
+
+@dataclass(frozen=True)
+class DistanceStats:
+    """Summary of distances, in the scan's unit."""
+
+    mean: float
+    median: float
+    rmse: float
+    p95: float  # 95 % of the distances are below
+
+    @staticmethod
+    def of(distance: Float[ndarray, "n"]) -> "DistanceStats":
+        """Summary of at least one distance."""
+        return DistanceStats(
+            mean=float(distance.mean()),
+            median=float(np.median(distance)),
+            rmse=float(np.sqrt((distance**2).mean())),
+            p95=float(np.percentile(distance, 95)),
+        )
+
+
+@dataclass(frozen=True)
+class SurfaceScore:
+    """How close result and truth are after one alignment; lengths in the truth's unit."""
+
+    accuracy: DistanceStats  # result -> truth
+    completeness: DistanceStats  # observed truth -> result
+    chamfer: float  # mean of the two means
+    f_score: dict[float, float]  # distance -> harmonic mean of the shares of result and truth that are closer than it
+    scale: float  # factor the result was multiplied by
+    S_truth_result: Similarity
+
+
+def score_surface(
+    result: IndexedMesh,
+    samples: Float[ndarray, "n 3"],
+    reference: Reference,
+    S_truth_result: Similarity,
+    f_distances: Sequence[float],
+) -> SurfaceScore:
+    """Distances in both directions after the result was moved by `S_truth_result`.
+
+    `samples` are area-uniform points on the result, in its own frame.
+    """
+    accuracy = reference.distance(S_truth_result.points(samples))
+    # The truth is moved into the result's frame: the same distances without building a second search tree.
+    observed = S_truth_result.inverse().points(reference.observed)
+    completeness = result.distance(observed) * S_truth_result.scale
+    return SurfaceScore(
+        accuracy=DistanceStats.of(accuracy),
+        completeness=DistanceStats.of(completeness),
+        chamfer=float(accuracy.mean() + completeness.mean()) / 2,
+        f_score={d: _f_score(accuracy, completeness, d) for d in f_distances},
+        scale=S_truth_result.scale,
+        S_truth_result=S_truth_result,
+    )
+
+
+def _f_score(accuracy: Float[ndarray, "n"], completeness: Float[ndarray, "m"], distance: float) -> float:
+    precision, recall = float((accuracy <= distance).mean()), float((completeness <= distance).mean())
+    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+
+
+def default_f_distances(size: float) -> tuple[float, ...]:
+    """Four round distances from about a thousandth to a hundredth of `size`: 0.1, 0.2, 0.5, 1 for size 110."""
+    exponent = np.floor(np.log10(size * 1e-3) + 1e-9)
+    mantissa = size * 1e-3 / 10.0**exponent
+    first = max(k for k in (1, 2, 5) if k <= mantissa * (1 + 1e-9))
+    return tuple(float(f"{k * first * 10.0**exponent:.3g}") for k in (1, 2, 5, 10))
+
+
+# The files that an evaluation reads: mesh, scan, poses, truth or reference, and what is known about the training.
+
+_FEWEST_POINTS = 100
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """A result and what it is evaluated on; lengths in the scan's unit."""
+
+    mesh: Mesh
+    scan: Scan  # with the intrinsics of the poses file, if it has any
+    poses: DevicePoses  # to evaluate
+    true_poses: DevicePoses | None
+    reference: Reference | None
+    poses_path: Path | None  # None: the scan's own poses are evaluated
+    pose_sigma: list[PoseSigma | None] = field(default_factory=list)  # one per frame, or empty
+    unplaced: list[str] = field(default_factory=list)  # frames that the poses file says do not agree with the others
+    training: dict[str, Any] | None = None  # training.json next to the poses: settings, versions, curves
+    quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
+    joint: JointCovariance | None = None  # of the evaluated poses, if it is known
+    true_units: str | None = None  # of the truth that is compared with, where its files say
+
+    @property
+    def stated_sigma(self) -> list[PoseSigma | None]:
+        """Stated uncertainty of the evaluated poses, where those are the scan's rough starting poses; else none.
+
+        Refined poses count as exact, so that their errors show.
+        """
+        return [None if self.poses_path is not None else frame.pose_sigma for frame in self.scan.frames]
+
+    @property
+    def departed(self) -> list[DepartedFrame]:
+        """Frames that ended far from their starting poses; none where those are evaluated."""
+        return [] if self.poses_path is None else departed_frames(self.scan, self.poses)
+
+
+def read_inputs(
+    mesh: Path, data: Path, poses: Path | None, reference: Path | None, samples: int, seed: int
+) -> EvaluationInputs:
+    """Read everything. `poses` is a transforms.json or its folder; `reference` replaces the mesh in ground_truth/.
+
+    `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
+    """
+    scan = read_scan(data)
+    result = read_mesh(mesh, scan.units)
+    truth = read_ground_truth(scan)
+    path = poses / TRANSFORMS if poses and poses.is_dir() else poses
+    evaluated = scan.poses if path is None else read_refined_poses(path, scan)
+    scan = scan if path is None else read_devices(path, scan)
+    return EvaluationInputs(
+        mesh=result,
+        scan=scan,
+        poses=evaluated,
+        true_poses=truth.poses,
+        true_units=truth.units if reference is None else None,
+        reference=read_reference(reference or truth.mesh_path, scan, truth.poses or evaluated, samples, seed),
+        poses_path=path,
+        pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
+        unplaced=[] if path is None else read_unplaced(path, scan),
+        training=None if path is None else _read_training(path.with_name("training.json")),
+        quality=_read_quality(mesh, result),
+        joint=None if path is None else read_covariance(path.parent, scan),
+    )
+
+
+def _read_quality(path: Path, mesh: Mesh) -> VertexQuality | None:
+    quality = read_quality(path)
+    return quality if quality is not None and len(quality.sigma) == len(mesh.vertices) else None
+
+
+def read_refined_poses(path: Path, scan: Scan) -> DevicePoses:
+    """Poses of a transforms.json made from `scan`. Raises UserError if they are those of another scan or unit."""
+    document = read_document(path)
+    units, frames = document.get("units"), document.get("frames")
+    if units != scan.units:
+        raise _of_another_scan(path, f"units: {units!r}, but the scan's are {scan.units!r}")
+    if isinstance(frames, list) and len(frames) != len(scan.frames):
+        raise _of_another_scan(path, f"holds {len(frames)} frames, the scan {len(scan.frames)}")
+    return read_poses(path, scan)
+
+
+def _of_another_scan(path: Path, problem: str) -> FileError:
+    return FileError(
+        path, problem, "the poses are those of another scan", "give poses that were refined from this scan"
+    )
+
+
+def _read_training(path: Path) -> dict[str, Any] | None:
+    return read_document(path) if path.exists() else None
+
+
+def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: int, seed: int) -> Reference | None:
+    """The true mesh or reference points; None without a path. `poses` decide what the scan could observe."""
+    if path is None:
+        return None
+    if path.suffix.lower() == ".npz":
+        points = read_points(path)
+        return PointReference(
+            points, f"{len(points):,} reference points ({path.name}); accuracy cannot fall below their spacing, and "
+            "completeness counts all of them",
+        )  # fmt: skip
+    return mesh_reference(read_mesh(path, scan.units), scan, poses, samples, seed)
+
+
+def read_points(path: Path) -> Float64[ndarray, "n 3"]:
+    """Points under the key `xyz` of an .npz file, never unpickled. Raises FileError."""
+    check_file(path)
+    try:
+        with path.open("rb") as stream:
+            archive = np.load(stream, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
+                raise ValueError("it is a plain array")
+            if "xyz" not in archive:
+                raise FileError(
+                    path,
+                    f"has no key xyz (it has {', '.join(archive.files) or 'none'})",
+                    "it is another kind of .npz file",
+                    "save the points as numpy.savez(path, xyz=points), points (n, 3)",
+                )
+            points = archive["xyz"]
+    except (*ARRAY_DAMAGE, MemoryError) as error:
+        raise FileError(
+            path, f"cannot be read ({error})", "it is damaged or not an .npz file", "save the points again"
+        ) from error
+    right = points.ndim == 2 and points.shape[1] == 3 and len(points) >= _FEWEST_POINTS
+    if not right or not np.issubdtype(points.dtype, np.number):
+        raise FileError(
+            path,
+            f"xyz: is {points.dtype} {points.shape}",
+            "it is not a list of points",
+            f"give at least {_FEWEST_POINTS} points as (n, 3) numbers",
+        )
+    if not np.isfinite(points).all():
+        bad = int((~np.isfinite(points)).any(1).sum())
+        raise FileError(path, f"xyz: {bad} points are not numbers", "failed triangulations", "leave those points out")
+    return points.astype(np.float64)
+
 
 ALIGNMENTS = ("rigid", "similarity", "none")
 
@@ -181,4 +419,148 @@ def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
         f"{distance:.4g} away from it (median; the scan's unit is {scan.units}); probably another unit, other axes or "
         "another scan\n"
         "    remedy: give the mesh that was exported from this scan, in its unit and world axes"
+    )
+
+
+# Distances between points of the surface, with their uncertainty.
+
+_OFF_SURFACE = 0.02  # of the mesh's diagonal: a point that is farther away was not meant to be on this mesh
+_TYPICAL, _LONG = 400, 0.3  # how many distances say what is typical, and the shortest one, of the mesh's diagonal
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_POINT = rf"{_NUMBER},{_NUMBER},{_NUMBER}"
+
+
+@dataclass(frozen=True)
+class PointPair:
+    """Two points in the mesh's unit and axes, and a name for the distance between them."""
+
+    name: str
+    p: tuple[float, float, float]
+    q: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Length:
+    """A distance between two points on the surface, in the scan's unit."""
+
+    name: str
+    p: tuple[float, float, float]  # on the surface, nearest to what was given
+    q: tuple[float, float, float]
+    length: float
+    sigma: float | None  # 1 sigma; None if it is not known
+    sigma_shared: float | None  # the part from poses and intrinsics
+    sigma_independent: float | None  # the part from decoding noise
+    views: tuple[int, int] | None  # frames that confirm each end; None if the mesh does not say
+
+
+def parse_pair(text: str, where: str) -> PointPair:
+    """A pair from "x,y,z x,y,z", with "name:" before it if wanted. Raises UserError; `where` is the flag or line."""
+    name, colon, rest = text.rpartition(":")
+    found = re.fullmatch(rf"\s*({_POINT})\s+({_POINT})\s*", rest)
+    if found is None or (colon and not name.strip()):
+        raise UserError(
+            f"{where}: {text.strip()!r:.100} is not two points\n"
+            '    remedy: give x,y,z of both, in the unit and axes of the mesh: "12.5,-3,40 10,2,38", or '
+            '"handle: 12.5,-3,40 10,2,38"'
+        )
+    p, q = (_triple(np.array(point.split(","), dtype=np.float64)) for point in found.groups())
+    return PointPair(name.strip() or f"{found[1]} to {found[2]}", p, q)
+
+
+def read_pairs(path: Path) -> list[PointPair]:
+    """The pairs of a text file, one a line; empty lines and those that begin with # count as nothing."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(
+            f"--distances {path}: cannot be read ({first_line(error)})\n"
+            "    remedy: give a text file with a line such as `handle: 12.5,-3,40 10,2,38` for each distance"
+        ) from error
+    kept = [
+        (number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not kept:
+        raise UserError(f"--distances {path}: holds no distances\n    remedy: give a line `name: x,y,z x,y,z` for each")
+    return [parse_pair(line, f"{path}, line {number}") for number, line in kept]
+
+
+def measure_lengths(
+    pairs: Sequence[PointPair],
+    mesh: Mesh,
+    quality: VertexQuality | None,
+    scan: Scan,
+    poses: DevicePoses,
+    joint: JointCovariance | None,
+) -> list[Length]:
+    """The distances between the surface points nearest to each pair; sigma needs `quality` and `joint`.
+
+    Raises UserError for a point that is far from the surface, or where both are the same point.
+    """
+    if not pairs:
+        return []
+    surface = IndexedMesh(mesh)
+    given = np.array([[pair.p, pair.q] for pair in pairs])
+    near = surface.closest(given.reshape(-1, 3))
+    for k, away in enumerate(near.distance):
+        if away > _OFF_SURFACE * surface.diagonal:
+            raise UserError(_off_surface(pairs[k // 2], given[k // 2, k % 2], float(away), surface, scan.units))
+    ends = near.point.reshape(-1, 2, 3)
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    for pair, length in zip(pairs, lengths, strict=True):
+        if not length > 0:
+            raise UserError(f"--distance {pair.name}: both points are the same\n    remedy: give two points")
+    used = np.unique(mesh.faces)
+    vertices = used[np.asarray(KDTree(mesh.vertices[used]).query(near.point)[1]).reshape(-1, 2)]
+    shared = independent = np.full(len(pairs), np.nan)
+    if quality is not None and joint is not None:
+        found = length_sigma(mesh, quality.sigma_independent, vertices, scan, poses, joint)
+        shared, independent = found.shared, found.independent
+    views = None if quality is None else quality.views[vertices]
+    return [
+        Length(
+            pair.name,
+            _triple(ends[k, 0]),
+            _triple(ends[k, 1]),
+            float(lengths[k]),
+            _known(float(np.hypot(shared[k], independent[k]))),
+            _known(float(shared[k])),
+            _known(float(independent[k])),
+            None if views is None else (int(views[k, 0]), int(views[k, 1])),
+        )
+        for k, pair in enumerate(pairs)
+    ]
+
+
+def typical_sigma(
+    mesh: Mesh, quality: VertexQuality | None, scan: Scan, poses: DevicePoses, joint: JointCovariance | None
+) -> float | None:
+    """Median 1 sigma of distances across the surface, as a share of their length; None if it is not known."""
+    seen = np.flatnonzero(quality.views > 0) if quality is not None else np.empty(0)
+    if quality is None or joint is None or len(seen) < 2:
+        return None
+    ends = np.random.default_rng(0).choice(seen, (_TYPICAL, 2))
+    length = np.linalg.norm(mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]], axis=1)
+    lower, upper = mesh.bounds()
+    long = length > _LONG * float(np.linalg.norm(upper - lower))
+    if not long.any():
+        return None
+    found = length_sigma(mesh, quality.sigma_independent, ends[long], scan, poses, joint)
+    return _known(float(np.nanmedian(np.hypot(found.shared, found.independent) / length[long])))
+
+
+def _triple(p: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    return float(p[0]), float(p[1]), float(p[2])
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _off_surface(pair: PointPair, point: Float[ndarray, "3"], away: float, surface: IndexedMesh, units: str) -> str:
+    at = ",".join(f"{v:g}" for v in point)
+    low, high = (",".join(f"{v:.4g}" for v in corner) for corner in (surface.lower, surface.upper))
+    return (
+        f"--distance {pair.name}: {at} is {away:.4g} away from the surface (unit: {units})\n"
+        f"    cause:  the point is in other axes or another unit; the mesh reaches from {low} to {high}\n"
+        "    remedy: pick both points on the mesh itself, in a viewer that shows its coordinates"
     )

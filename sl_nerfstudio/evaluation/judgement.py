@@ -2,20 +2,176 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
-from sl_nerfstudio.evaluation.advice import capture_next, disagreeing_frames
-from sl_nerfstudio.evaluation.capture_agreement import FrameAgreement
-from sl_nerfstudio.evaluation.completeness.figures import completeness_figures
-from sl_nerfstudio.evaluation.completeness.next_view import NextView
-from sl_nerfstudio.evaluation.evaluate import Evaluation
-from sl_nerfstudio.evaluation.figures import JudgedFigure, judged
-from sl_nerfstudio.evaluation.reference import MeshReference
-from sl_nerfstudio.evaluation.training_steps import TrainedSteps, training_figure
-from sl_nerfstudio.verdict.departed_frames import DepartedFrame, departed_reasons
-from sl_nerfstudio.verdict.judge import cross_reasons
-from sl_nerfstudio.verdict.settings import VerdictSettings
-from sl_nerfstudio.verdict.verdict import Band, Reason, Verdict, worst
+from sl_nerfstudio.console import figure, unit_word
+from sl_nerfstudio.evaluation.agreement import FrameAgreement
+from sl_nerfstudio.evaluation.completeness import Completeness, NextView
+from sl_nerfstudio.evaluation.evaluate import Evaluation, Length, SurfaceScore
+from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, PoseErrors
+from sl_nerfstudio.review.agreement import VerdictSettings
+from sl_nerfstudio.review.verdict import (
+    Band,
+    DepartedFrame,
+    Reason,
+    Verdict,
+    cross_reasons,
+    departed_reasons,
+    frame_band,
+    listed,
+    worst,
+)
+
+# A figure with its judgement by two limits.
+
+
+@dataclass(frozen=True)
+class JudgedFigure:
+    """One figure, with its judgement."""
+
+    name: str
+    value: float
+    text: str  # the value with its unit
+    band: Band | Literal["unknown"]  # unknown: the figure does not exist
+    good: str  # the limit of "good", in words
+    acceptable: str
+    meaning: str
+    advice: str  # what to do if it is not good
+
+
+def judged(
+    name: str, value: float, form: str, good: float, acceptable: float, limit: str, meaning: str, advice: str
+) -> JudgedFigure:
+    """Judge `value`; whether larger is better follows from the order of the limits."""
+    sign = 1 if good < acceptable else -1
+    band: Band | Literal["unknown"] = "poor"
+    if not math.isfinite(value):
+        band = "unknown"
+    elif sign * value <= sign * good:
+        band = "good"
+    elif sign * value <= sign * acceptable:
+        band = "acceptable"
+    text = form.format(value) if math.isfinite(value) else "none"
+    worst = limit.format(f"{acceptable:g}") if math.isfinite(acceptable) else "any"
+    return JudgedFigure(name, value, text, band, limit.format(f"{good:g}"), worst, meaning, advice)
+
+
+# How completeness is judged: by shares of what was observed, and of the surface.
+
+
+def completeness_figures(found: Completeness, units: str) -> list[JudgedFigure]:
+    """What is missing of the observed surface is a fault; what nobody observed is at most a weakness."""
+    o, unit = found.openings, unit_word(units)
+    size = f"{len(o)}, {figure(o.area.sum())} {unit}² in all, borders {figure(o.length.sum())} {unit} long"
+    return [
+        judged(
+            "Observed surface", 100 * found.observed, "{:.1f} % present", 99.0, 96.0, "≥ {} %",
+            "Share of the decoded pixels of all frames at which the mesh has a surface near the measured point.",
+            "surface is missing where it was measured: train longer, or export with a finer resolution",
+        ),
+        judged(
+            "Holes", 100 * found.hole_share, f"{{:.1f}} % of the surface beside the rim (openings: {size})", 5.0,
+            float("inf"), "≤ {} %",
+            "Area of all places where the mesh ends, except for the largest one, the rim of the scan, as a share of "
+            "the surface. Objects are closed: behind each of them is surface that no frame saw.",
+            "capture what no frame saw, or export with --keep-unobserved, which invents it",
+        ),
+    ]  # fmt: skip
+
+
+# How long a surface was trained, against what is recommended.
+
+
+@dataclass(frozen=True)
+class TrainedSteps:
+    """Steps of a training."""
+
+    done: int
+    wanted: int  # recommended for the method, or what the run was started with if that is more
+
+    @property
+    def share(self) -> float:
+        """Part of the wanted steps that was done."""
+        return self.done / self.wanted
+
+
+def trained_steps(training: dict[str, Any] | None) -> TrainedSteps | None:
+    """From a training.json; None if it does not say."""
+    settings = (training or {}).get("settings")
+    if not isinstance(settings, dict):
+        return None
+    step, numbers = settings.get("step"), (settings.get("recommended_steps"), settings.get("schedule_iterations"))
+    known = [n for n in numbers if isinstance(n, int) and n > 0]
+    if not isinstance(step, int) or step < 0 or not known:
+        return None
+    return TrainedSteps(step + 1, max(known))
+
+
+def training_figure(steps: TrainedSteps) -> JudgedFigure:
+    """Below a tenth of the steps a surface has not formed; in between it may be good, but the other figures decide."""
+    return judged(
+        "Training", 100 * steps.share, f"{{:.0f}} % ({steps.done} of {steps.wanted} steps)", 100.0, 10.0, "≥ {} %",
+        "Steps of the training, compared with those that are recommended for the method, or with the run's own length.",
+        "train to the end, or with the recommended number of steps",
+    )  # fmt: skip
+
+
+# What to do next, in words: frames to leave out or to capture again, and the capture that would add most.
+
+_LARGE = {"coordinate_px_median": 2.0, "coordinate_px_p95": 3.0}  # multiples of the median frame's value
+_LEAST_AGREEING = 0.85  # share of a frame's decoded pixels that agree with the surface within the noise
+_MOST = 0.5  # of the frames: if more disagree, it is not them
+_WORTH = 0.02  # of the surface and its openings that a capture must newly show to be proposed
+_STEEP_DEG = 60.0  # above or below the horizon
+
+
+def disagreeing_frames(evaluation: Evaluation) -> tuple[str, ...]:
+    """At most one sentence, with all frames that contradict the others or the surface; none with starting poses."""
+    if evaluation.starting_poses:
+        return ()
+    frames = evaluation.agreement.frames
+    names = [f.name for k, f in enumerate(frames) if _stands_out(f, frames) or _contradicts(evaluation, k)]
+    if not names or len(names) > _MOST * len(frames):
+        return ()
+    several = len(names) > 1
+    them = "them" if several else "it"
+    return (f"{listed(names)} {'disagree' if several else 'disagrees'}: leave {them} out or capture {them} again",)
+
+
+def _stands_out(frame: FrameAgreement, frames: tuple[FrameAgreement, ...]) -> bool:
+    for key, factor in _LARGE.items():
+        known = sorted(v for f in frames if math.isfinite(v := getattr(f, key)))
+        if known and getattr(frame, key) > factor * known[len(known) // 2]:
+            return True
+    return frame.agreeing_share < _LEAST_AGREEING
+
+
+def _contradicts(evaluation: Evaluation, number: int) -> bool:
+    cross = evaluation.cross
+    return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number], VerdictSettings()) != "good"
+
+
+def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
+    """Where to capture next and what that would show; "" if nothing that no frame has seen would show."""
+    found = evaluation.completeness
+    if found is None or view is None:
+        return ""
+    whole = found.surface_area + float(found.openings.area.sum())
+    if view.new_area < _WORTH * whole:
+        return ""
+    unit = unit_word(evaluation.units)
+    nearest = evaluation.agreement.frames[view.nearest].name
+    side, way = f"the side {view.nearest_deg:.0f}° from {nearest}, the nearest frame", "it"
+    if view.elevation_deg < -_STEEP_DEG:
+        side, way = "the underside", "it from below, or turn the object over"
+    elif view.elevation_deg > _STEEP_DEG:
+        side, way = "the top", "it from above"
+    return (
+        f"No frame sees {side}: capture {way}; this would show {view.new_area / view.unseen_area:.0%} of what no frame "
+        f"has seen ({figure(view.new_area)} {unit}²)"
+    )
+
 
 ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
 _ORDER: dict[str, int] = {"good": 0, "unknown": 1, "acceptable": 1, "poor": 2}
@@ -232,3 +388,109 @@ def _sentence(band: Band, evaluation: Evaluation) -> str:
         "poor": "At least one figure shows that something is wrong",
     }[band]
     return f"{start} ({evidence})."
+
+
+# The evaluation as JSON.
+
+
+def to_json(
+    evaluation: Evaluation, verdict: Verdict, capture: NextView | None = None, lengths: Sequence[Length] = ()
+) -> dict[str, Any]:
+    """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
+
+    `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
+    errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
+    the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
+    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` are the distances that were
+    asked for.
+    """
+    out: dict[str, Any] = {
+        "format": 1,
+        "verdict": verdict.band,
+        "reasons": list(verdict.reasons),
+        "units": evaluation.units,
+    }
+    if evaluation.reference is not None or evaluation.pose_errors is not None:
+        out["truth_units"] = evaluation.truth_units
+    if evaluation.reference is not None:
+        out["reference"] = evaluation.reference.description
+    for name, score in evaluation.surface.items():
+        out[name] = _surface(score)
+    if evaluation.pose_errors is not None:
+        out |= _poses(evaluation.pose_errors)
+    if evaluation.initial_pose_errors is not None:
+        out["initial"] = _poses(evaluation.initial_pose_errors)
+    out["fit"] = asdict(evaluation.agreement)
+    if evaluation.completeness is not None:
+        out["coverage"] = _coverage(evaluation.completeness) | {"next_capture": _capture(capture)}
+    if evaluation.cross is not None:
+        out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
+    if lengths:
+        out["lengths"] = [asdict(length) for length in lengths]
+    return _finite(out)
+
+
+def _coverage(found: Completeness) -> dict[str, Any]:
+    o = found.openings
+    openings = {
+        "count": len(o),
+        "area": float(o.area.sum()),
+        "boundary_length": float(o.length.sum()),
+        "largest_area": found.rim_area,
+        "largest_boundary_length": float(o.length[:1].sum()),
+    }
+    return {"observed": found.observed, "surface_area": found.surface_area, "openings": openings}
+
+
+def _capture(view: NextView | None) -> dict[str, Any] | None:
+    if view is None:
+        return None
+    return {
+        "transform_matrix": view.T_world_camera.tolist(),
+        "projector_transform_matrix": view.T_world_projector.tolist(),
+        "new_area": view.new_area,
+        "unseen_area": view.unseen_area,
+        "removed_share": view.removed,
+        "degrees_from_nearest_frame": view.nearest_deg,
+        "elevation_deg": view.elevation_deg,
+    }
+
+
+def _surface(score: SurfaceScore) -> dict[str, Any]:
+    return {
+        "accuracy": asdict(score.accuracy),
+        "completeness": asdict(score.completeness),
+        "chamfer": score.chamfer,
+        "f_score": {f"{distance:g}": value for distance, value in score.f_score.items()},
+        "scale": score.scale,
+        "matrix": score.S_truth_result.matrix().tolist(),
+    }
+
+
+def _poses(errors: PoseErrors) -> dict[str, Any]:
+    return {
+        "camera": _device(errors.camera),
+        "projector": _device(errors.projector),
+        "relative": _device(errors.relative),
+        "scale_error": errors.scale_error,
+    }
+
+
+def _device(errors: DeviceErrors) -> dict[str, Any]:
+    return {
+        "translation_rmse": errors.translation_rmse,
+        "rotation_rmse_deg": errors.rotation_rmse_deg,
+        "translation": errors.translation.tolist(),
+        "rotation_deg": errors.rotation_deg.tolist(),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows neither NaN nor infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

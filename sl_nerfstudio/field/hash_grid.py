@@ -8,10 +8,27 @@ All implementations follow the same rule at cell faces: `cell = clamp(floor(x), 
 """
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+# The interface of a field that rendering needs.
+
+
+@runtime_checkable
+class SignedDistance(Protocol):
+    """A signed distance in scene units, negative inside; differentiable with respect to its parameters."""
+
+    def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distances of points; differentiable once with respect to `p`."""
+        ...
+
+    def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+        """Signed distances and their gradients by the point; `p` is a constant."""
+        ...
+
 
 PRIMES = (1, 2654435761, 805459861)  # of the spatial hash; the first is 1, so neighbours along x share a cache line
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sl_nerfstudio.device_kernels import launch
+from sl_nerfstudio.field import warp_kernels as grid_kernels
+from sl_nerfstudio.field import warp_kernels as layer_kernels
 from sl_nerfstudio.field.backend import FieldState, Kept, Pulled
+from sl_nerfstudio.field.device_kernels import launch
 from sl_nerfstudio.field.hash_grid import GridLayout
-from sl_nerfstudio.field.warp_kernels import grid as grid_kernels
-from sl_nerfstudio.field.warp_kernels import layers as layer_kernels
-from sl_nerfstudio.field.warp_kernels.grid import FEATURES, FIRST
+from sl_nerfstudio.field.warp_kernels import FEATURES, FIRST
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,46 @@
 """Triangulation of a camera ray and a projector ray, with its uncertainty."""
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float64, Int64
+from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.geometry.devices import Intrinsics, project_jacobian
-from sl_nerfstudio.geometry.rays import pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, rotate, transform
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian, unproject
+from sl_nerfstudio.geometry.lie import inverse, rotate, transform
+
+# Pixel centres, the rays of pixels in the world, and the pixels of points in the world.
+
+
+def pixel_centres(device: Device, dtype: torch.dtype = torch.float32) -> Float[Tensor, "h w 2"]:
+    """Coordinates (x, y) of all pixel centres of a device, starting with (0.5, 0.5)."""
+    y, x = torch.meshgrid(
+        torch.arange(device.h, dtype=dtype) + 0.5, torch.arange(device.w, dtype=dtype) + 0.5, indexing="ij"
+    )
+    return torch.stack([x, y], -1)
+
+
+def pixel_rays(
+    intrinsics: Intrinsics, T_world_device: Float[Tensor, "*#batch 4 4"], uv: Float[Tensor, "*#batch 2"]
+) -> tuple[Float[Tensor, "*#batch 3"], Float[Tensor, "*#batch 3"]]:
+    """Origin and unit direction, in the world, of the rays through pixels `uv`."""
+    d_world = rotate(T_world_device, unproject(intrinsics, uv))
+    return T_world_device[..., :3, 3].expand_as(d_world), d_world
+
+
+def world_pixels(
+    device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "n 3"]
+) -> tuple[Float64[ndarray, "n 2"], Bool[ndarray, "n"]]:
+    """Pixels of points in the world, and whether each is in front of the device and inside its image."""
+    T = inverse(torch.as_tensor(T_world_device, dtype=torch.float64))
+    p_device = transform(T, torch.as_tensor(p_world, dtype=torch.float64))
+    uv, in_front = project(Intrinsics.of(device, torch.float64), p_device)
+    u, v = uv.numpy().T
+    return uv.numpy(), in_front.numpy() & (u >= 0) & (v >= 0) & (u < device.w) & (v < device.h)
+
 
 _PARALLEL = 1e-12  # sin^2 of the angle between rays, below which they count as parallel
 
@@ -69,3 +101,109 @@ def triangulate(
         gap=(p_c - p_p).norm(dim=-1),
         sigma_depth=1 / slope.norm(dim=-1).clamp_min(1e-12),
     )
+
+
+# Epipolar geometry of a camera and a projector.
+
+
+def epipolar_residual(
+    camera: Intrinsics,
+    T_world_camera: Float[Tensor, "*#batch 4 4"],
+    uv_camera: Float[Tensor, "*#batch 2"],
+    projector: Intrinsics,
+    T_world_projector: Float[Tensor, "*#batch 4 4"],
+    uv_projector: Float[Tensor, "*#batch 2"],
+) -> Float[Tensor, "*#batch"]:
+    """Signed distance, in projector pixels, of `uv_projector` from the epipolar curve of `uv_camera`.
+
+    The curve is the image of the camera ray in the projector. It is linearised where the two rays come
+    closest to each other, so it is valid for pinhole, distorted and DOE projectors alike.
+    NaN if that point is behind either device or the rays are parallel.
+    """
+    o_c, d_c = pixel_rays(camera, T_world_camera, uv_camera)
+    o_p, d_p = pixel_rays(projector, T_world_projector, uv_projector)
+    depth, depth_projector = closest_approach(o_c, d_c, o_p, d_p)
+    T_projector_world = inverse(T_world_projector)
+    p_projector = transform(T_projector_world, o_c + depth[..., None] * d_c)
+    uv, in_front = project(projector, p_projector)
+    tangent = (project_jacobian(projector, p_projector) * rotate(T_projector_world, d_c)[..., None, :]).sum(-1)
+    tangent = tangent / tangent.norm(dim=-1, keepdim=True)
+    offset = uv - uv_projector
+    residual = tangent[..., 0] * offset[..., 1] - tangent[..., 1] * offset[..., 0]
+    valid = in_front & (depth > 0) & (depth_projector > 0)
+    return residual.where(valid, residual.new_tensor(float("nan")))
+
+
+# From where to look at a scene: beside the first camera, and far enough away to see everything.
+
+_BESIDE, _ABOVE, _STEEPEST = 0.35, 0.3, 1.2  # radian
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """An eye, the point it looks at, and what is upwards for it."""
+
+    eye: Float64[ndarray, "3"]
+    centre: Float64[ndarray, "3"]
+    up: Float64[ndarray, "3"]
+
+
+def beside(towards: Float64[ndarray, "3"], up: Float64[ndarray, "3"]) -> Float64[ndarray, "3"]:
+    """A unit direction a little beside `towards`, and nearer to `up`; both directions lead away from the object."""
+    z = up / np.linalg.norm(up)
+    level = towards - (towards @ z) * z
+    if np.linalg.norm(level) < 1e-6 * np.linalg.norm(towards):  # straight above: any horizontal direction will do
+        level = np.cross(z, np.eye(3)[int(np.argmin(np.abs(z)))])
+    x = level / np.linalg.norm(level)
+    elevation = math.asin(max(-1.0, min(1.0, float(towards @ z) / float(np.linalg.norm(towards)))))
+    elevation = min(elevation + _ABOVE, _STEEPEST)
+    turned = math.cos(_BESIDE) * x + math.sin(_BESIDE) * np.cross(z, x)
+    return math.cos(elevation) * turned + math.sin(elevation) * z
+
+
+def far_enough(
+    points: Float64[ndarray, "n 3"],
+    centre: Float64[ndarray, "3"],
+    direction: Float64[ndarray, "3"],
+    up: Float64[ndarray, "3"],
+    vertical_fov: float,
+    aspect: float,
+    margin: float = 1.1,
+) -> Viewpoint:
+    """The nearest eye in `direction` (unit) from `centre` that sees all points, with a margin around them.
+
+    `vertical_fov` is in radian, `aspect` is width by height of the picture. Points that are not finite do not count.
+    """
+    offset = points[np.isfinite(points).all(1)] - centre
+    right = np.cross(up, direction)
+    right = right / np.linalg.norm(right)
+    across, along = np.abs(offset @ right), offset @ direction
+    upwards = np.abs(offset @ np.cross(direction, right))
+    tangent = math.tan(vertical_fov / 2)
+    needed = along + margin * np.maximum(across / (tangent * aspect), upwards / tangent)
+    distance = float(needed.max()) if len(needed) else 1.0
+    return Viewpoint(centre + distance * direction, centre, up)
+
+
+# Outlines of cameras and projectors, for pictures of a scene.
+
+_MARK_WIDTH, _MARK_HEIGHT = 0.25, 0.3  # of the mark above the upper edge, as shares of the image's width and height
+
+OUTLINE: Int64[ndarray, "14"] = np.array([0, 1, 2, 0, 3, 4, 0, 4, 1, 5, 7, 6, 2, 3])
+"""Indices into the points of `frustum`: one line that draws all edges of the pyramid and the mark."""
+
+
+def frustum(device: Device, T_world_device: Float64[ndarray, "4 4"], length: float) -> Float64[ndarray, "8 3"]:
+    """Points of a pyramid in world axes.
+
+    The centre of projection; the image's corners, each at `length` along its own ray, clockwise from the upper left as
+    the device sees it; and three points of a mark above the upper edge: on its left, on its right, and its tip.
+    """
+    w, h = float(device.w), float(device.h)
+    uv = [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]
+    rays = unproject(Intrinsics.of(device, torch.float64), torch.tensor(uv, dtype=torch.float64)).numpy()
+    corners = np.concatenate([np.zeros((1, 3)), length * rays])
+    left, right = (corners[1] + (0.5 + side * _MARK_WIDTH) * (corners[2] - corners[1]) for side in (-0.5, 0.5))
+    tip = (left + right) / 2 + _MARK_HEIGHT * (corners[1] - corners[4])
+    points = np.concatenate([corners, [left, right, tip]])
+    return points @ T_world_device[:3, :3].T + T_world_device[:3, 3]

@@ -3,24 +3,223 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 from scipy.ndimage import find_objects
 
-from sl_nerfstudio.decoding.grid.drawn_grid import DrawnGrid, draw_sharpnesses
-from sl_nerfstudio.decoding.grid.smoothing import shrink
-from sl_nerfstudio.decoding.regions import drop_small_regions
+from sl_nerfstudio.decoding.decoder import drop_small_regions, large_regions, torn
+from sl_nerfstudio.decoding.grid_fit import (
+    DrawnGrid,
+    GridLight,
+    draw_sharpnesses,
+    fit_shift,
+    flattened,
+    measure_light,
+    shrink,
+)
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.matching.confidence import RIGHT, features_of
-from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
-from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
-from sl_nerfstudio.matching.hypotheses import hypotheses, numbers_of, with_offset
-from sl_nerfstudio.matching.line_fit import LineFit
-from sl_nerfstudio.matching.resolution import enlarged, pixels_a_period
-from sl_nerfstudio.matching.semi_global import Matches, match_semi_globally
-from sl_nerfstudio.matching.settings import MATCHING_DEFAULTS, MatchingSettings
+from sl_nerfstudio.matching.costs import (
+    Statistics,
+    StereoMatches,
+    correlations,
+    hypotheses,
+    image_statistics,
+    match_semi_globally,
+    matching_costs,
+    numbers_of,
+    with_offset,
+)
+from sl_nerfstudio.matching.lines import (
+    MATCHING_DEFAULTS,
+    EpipolarLines,
+    LineFitSettings,
+    MatchingSettings,
+    enlarged,
+    pixels_a_period,
+)
+from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import GridPattern
+
+# Matched coordinates fitted to the image.
+#
+# Where surfaces are flat, so is the inverse distance over the image: matches are smoothed as planes of it. Then
+# shifts of
+# the pattern are fitted as the decoder's dense fit does. A shift competes with the flat surface, each with its
+# variance:
+# what noise explains is not taken for detail. Across the line there is no detail, but shifts are held back less
+# there:
+# distances from the line tell how noisy coordinates are, and where the projector stands.
+
+
+@dataclass(frozen=True)
+class LineFit:
+    """What the fit needs besides the matches: the pattern, and how large a period is in the image."""
+
+    grid: DrawnGrid
+    pixels_a_period: float
+    settings: LineFitSettings
+
+    def fitted(
+        self, image: Float32[ndarray, "h w"], lines: EpipolarLines, w: Float64[ndarray, "h w"]
+    ) -> Float32[ndarray, "h w 2"]:
+        """Coordinates; NaN in small regions."""
+        coords = lines.at(w)
+        out = np.full_like(coords, np.nan)
+        largest, least = self.settings.tear * self.grid.period, self.settings.least_area * self.pixels_a_period**2
+        for box, inside in large_regions(coords, largest, least):
+            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside)[inside]
+        return out
+
+    def _region(
+        self,
+        image: Float32[ndarray, "h w"],
+        lines: EpipolarLines,
+        w: Float64[ndarray, "h w"],
+        inside: Bool[ndarray, "h w"],
+    ) -> Float32[ndarray, "h w 2"]:
+        s, period, size = self.settings, np.float32(self.grid.period), self.pixels_a_period
+        trust, light = inside.astype(np.float32), GridLight.even(image.shape)
+        slope = lines.slopes(w)
+        steep = np.hypot(slope[..., 0], slope[..., 1])
+        flat = lines.at(self._smooth(w, inside, steep))
+        # Where the image moves the matches, and flat again: steps of the inverse distance leave errors of their own.
+        flat = flat + period * fit_shift(image, flat, trust, self.grid, light, size, s.window).shift
+        light = measure_light(image, flat, trust, self.grid, size)
+        flat = lines.at(self._smooth(lines.nearest(flat), inside, steep))
+        direction = slope / np.maximum(steep[..., None], np.float32(1e-12))
+        total = np.zeros_like(flat)
+        for _ in range(s.rounds):
+            fit = fit_shift(image, flat + total * period, trust, self.grid, light, size, s.window)
+            _take(fit.shift, fit.variance, direction, (s.dependent, s.detail**2, s.across**2, s.largest), total)
+        return flat + total * period
+
+    def _smooth(
+        self, w: Float64[ndarray, "h w"], inside: Bool[ndarray, "h w"], slope: Float32[ndarray, "h w"]
+    ) -> Float64[ndarray, "h w"]:
+        """On planes that are near the pixel's own match, along its line."""
+        unit = float(np.median(w[inside]))
+        scaled = np.where(inside, w / unit, 1).astype(np.float32)
+
+        def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
+            return np.abs(apart[..., 0]) * unit * slope < limit * self.grid.period
+
+        windows = [(window * self.pixels_a_period, limit) for window, limit in self.settings.smoothing]
+        both = np.dstack([scaled, scaled])  # planes are fitted to two values at a time
+        return flattened(both, inside, windows, is_near)[..., 0].astype(np.float64) * unit
+
+
+@compiled
+def _take(
+    shift: ndarray, variance: ndarray, direction: ndarray, limits: tuple[float, float, float, float], total: ndarray
+) -> None:
+    """Add shifts to the total, in place; both parts of it are then drawn back to zero by their variances."""
+    dependent, detail, across, largest = limits
+    for row in range(total.shape[0]):
+        for column in range(total.shape[1]):
+            x, y = total[row, column, 0] + shift[row, column, 0], total[row, column, 1] + shift[row, column, 1]
+            dx, dy = direction[row, column, 0], direction[row, column, 1]
+            noise = dependent * variance[row, column]
+            a, b = x * dx + y * dy, y * dx - x * dy
+            a, b = a * detail / (detail + noise), b * across / (across + noise)
+            total[row, column, 0] = min(max(a * dx - b * dy, -largest), largest)
+            total[row, column, 1] = min(max(a * dy + b * dx, -largest), largest)
+
+
+# How probable it is that a matched pixel is right, by a logistic model of what is known about it.
+#
+# Its weights come from `python -m training.matching`.
+
+FEATURES = (
+    "margin over the best rival, logarithm",
+    "cost of the match",
+    "matched where it was decoded",
+    "matched elsewhere than it was decoded",
+    "in the decoder's mask",
+    "distance from a jump, periods, logarithm",
+    "correlation after the fit",
+    "share of opposite neighbours with it between them",
+)
+_REACH, _STRIDE = 4, 2  # of those neighbours, pixels
+_BETWEEN = 2.0  # steps of the inverse distance from the middle of two neighbours
+_FARTHEST = 2.0  # distance from a jump beyond which it does not count, periods
+_NEAREST = 0.07  # added to that distance, periods
+_NOWHERE = -1e6  # in place of unknown coordinates, so that known ones jump there
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A constant, and a weight for each of `FEATURES`."""
+
+    constant: float
+    weights: tuple[float, ...]
+
+    def probability(self, features: Float32[ndarray, "*pixels f"]) -> Float32[ndarray, "*pixels"]:
+        """That a pixel is right."""
+        odds = features @ np.array(self.weights, dtype=np.float32) + np.float32(self.constant)
+        return 1 / (1 + np.exp(-odds))
+
+
+RIGHT = Logistic(-3.697, (0.0923, -0.0068, 2.4458, -0.9122, 2.3262, 0.6447, 2.7155, 0.9038))
+
+
+def features_of(
+    matches: StereoMatches,
+    fitted: Float32[ndarray, "h w 2"],
+    correlation: Float32[ndarray, "h w"],
+    decoded: Float32[ndarray, "h w 2"],
+    mask: Bool[ndarray, "h w"],
+    near: float,
+    jump: float,
+    pixels_a_period: float,
+) -> Float32[ndarray, "h w f"]:
+    """`FEATURES` of every pixel; `near` and `jump` are in pattern pixels. Unknown where nothing was fitted."""
+    apart = np.linalg.norm(fitted - decoded, axis=-1)
+    between = np.zeros(mask.shape, dtype=np.float32)
+    _count_between(matches.index, np.float32(_BETWEEN), between)
+    from_jump = np.minimum(_distance_from_jumps(fitted, jump) / pixels_a_period, _FARTHEST)
+    return np.stack(
+        [
+            np.log1p(np.maximum(matches.margin, 0)),
+            matches.cost,
+            apart < near,
+            apart >= near,  # both False for NaN
+            mask,
+            np.log(from_jump + _NEAREST),
+            np.nan_to_num(correlation),
+            between,
+        ],
+        axis=-1,
+    ).astype(np.float32)
+
+
+def _distance_from_jumps(coords: Float32[ndarray, "h w 2"], jump: float) -> Float64[ndarray, "h w"]:
+    """Pixels to the nearest one beside which coordinates jump or end."""
+    ended = np.where(np.isfinite(coords[..., :1]), coords, np.float32(_NOWHERE))
+    smooth = (~torn(ended, jump)).astype(np.uint8)
+    return cv2.distanceTransform(smooth, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+
+
+@compiled
+def _count_between(index: ndarray, most: float, out: ndarray) -> None:
+    """Share of the pairs of opposite pixels around, on a lattice, whose mean is nearly the pixel's own match.
+
+    All are on a plane, however steep it is.
+    """
+    h, w = index.shape
+    for row in range(h):
+        for column in range(w):
+            count, pairs = 0, 0
+            for dr in range(0, _REACH + 1, _STRIDE):
+                for dc in range(-_REACH, _REACH + 1, _STRIDE):
+                    if dr == 0 and dc <= 0:
+                        continue
+                    a, b = min(row + dr, h - 1), min(max(column + dc, 0), w - 1)
+                    c, d = max(row - dr, 0), min(max(column - dc, 0), w - 1)
+                    pairs += 1
+                    count += abs((index[a, b] + index[c, d]) / 2 - index[row, column]) < most
+            out[row, column] = count / pairs
 
 
 @dataclass(frozen=True)
@@ -127,7 +326,7 @@ class LineMatcher:
         tried: Float64[ndarray, "k"],
         grid: DrawnGrid,
         size: float,
-    ) -> Matches:
+    ) -> StereoMatches:
         """Strips of rows that overlap, as high as memory allows."""
         s, (h, w) = self._settings, grey.shape
         margin = round(s.strip_margin * size)
@@ -142,7 +341,7 @@ class LineMatcher:
             parts.append(
                 match_semi_globally(costs, decoded[some], s.smoothness).part(slice(first - begin, first - begin + rows))
             )
-        return Matches.joined(parts)
+        return StereoMatches.joined(parts)
 
     def _sharpness(self, image: DecodedImage, statistics: Statistics, sigma: float) -> DrawnGrid:
         """The pattern as sharp as the image shows it."""

@@ -1,15 +1,291 @@
 """The zero level of a signed distance field as a mesh, at a cost that grows with its area, not with the volume."""
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
+from numpy import ndarray
 from torch import Tensor
 
+from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.meshing.marching_table import EDGE_CORNERS, triangle_table
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.sparse_grid import LEAF, Field, Grid, Leaves, evaluate_leaves, find_leaves
+
+# The 256 cases of marching cubes, derived by program, so that the surface is closed by construction.
+#
+# Corner `c` of a cell lies at `(c & 1, c >> 1 & 1, c >> 2 & 1)`. Bit `c` of a case is set where the field is
+# negative there (inside). Edge `4 * axis + k` runs along `axis`; see EDGE_CORNERS.
+#
+# On every face of the cell the negative corners are separated: a diagonal pair gives two segments, each cutting off
+# one
+# negative corner. This depends only on the signs at that face, so the two cells at a face draw the same segments,
+# and
+# each edge that the surface cuts has exactly one segment on each of its faces: the segments form closed loops
+# (Lorensen and Cline, SIGGRAPH 1987, with the face rule that makes their table free of holes).
+
+AXIS_STEP = (1, 2, 4)  # what a step along x, y, z adds to a corner's number
+
+
+def _edge_corners() -> list[tuple[int, int]]:
+    return [(c, c + step) for step in AXIS_STEP for c in range(8) if not c & step]
+
+
+EDGE_CORNERS: tuple[tuple[int, int], ...] = tuple(_edge_corners())
+"""Lower and upper corner of each of the 12 edges; edges 0 to 3 along x, 4 to 7 along y, 8 to 11 along z."""
+
+_EDGE_OF_CORNERS = {frozenset(pair): edge for edge, pair in enumerate(EDGE_CORNERS)}
+
+
+def _face_corners() -> list[tuple[int, int, int, int]]:
+    """Corners of the six faces, counter-clockwise as seen from outside the cell."""
+    faces = []
+    for axis in range(3):
+        u, v, w = AXIS_STEP[(axis + 1) % 3], AXIS_STEP[(axis + 2) % 3], AXIS_STEP[axis]
+        faces.append((0, v, u + v, u))
+        faces.append((w, w + u, w + u + v, w + v))
+    return faces
+
+
+FACE_CORNERS = _face_corners()
+_FACE_EDGES = [{_EDGE_OF_CORNERS[frozenset((f[i], f[i - 1]))] for i in range(4)} for f in FACE_CORNERS]
+
+
+def _loops(case: int) -> list[list[int]]:
+    """Closed polygons of cut edges, counter-clockwise as seen from the positive side."""
+    successor: dict[int, int] = {}
+    for face in FACE_CORNERS:
+        inside = [bool(case >> c & 1) for c in face]
+        for i in range(4):
+            if inside[i] and not inside[i - 1]:  # a sequence of negative corners begins here
+                j = i
+                while inside[(j + 1) % 4]:
+                    j += 1
+                enters = _EDGE_OF_CORNERS[frozenset((face[i - 1], face[i]))]
+                leaves = _EDGE_OF_CORNERS[frozenset((face[j % 4], face[(j + 1) % 4]))]
+                successor[enters] = leaves
+    loops = []
+    while successor:
+        loop = [next(iter(successor))]
+        while (following := successor.pop(loop[-1])) != loop[0]:
+            loop.append(following)
+        loops.append(loop)
+    return loops
+
+
+def _on_one_face(a: int, b: int) -> bool:
+    return any(a in edges and b in edges for edges in _FACE_EDGES)
+
+
+def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
+    """Triangles of a loop without a diagonal inside a face of the cell; None if there is no such choice.
+
+    The neighbouring cell could draw the same diagonal inside a face: four triangles would meet in it.
+    """
+    if len(loop) == 3:
+        return [(loop[0], loop[1], loop[2])]
+    n = len(loop)
+    for i, j in combinations(range(n), 2):
+        if j - i in (1, n - 1) or _on_one_face(loop[i], loop[j]):
+            continue
+        left, right = _triangulate(loop[i : j + 1]), _triangulate(loop[j:] + loop[: i + 1])
+        if left is not None and right is not None:
+            return left + right
+    return None
+
+
+@cache
+def triangle_table() -> tuple[Int[ndarray, "256 t 3"], Int[ndarray, "256"]]:
+    """Edges of the triangles of each case (-1 beyond the last) and how many triangles it has.
+
+    Triangles are counter-clockwise as seen from the positive side, so normals point outward.
+    Raises ValueError if a case has no such triangulation (tests show that all have one).
+    """
+    cases = []
+    for case in range(256):
+        triangles: list[tuple[int, int, int]] = []
+        for loop in _loops(case):
+            clean = _triangulate(loop)
+            if clean is None:
+                raise ValueError(f"case {case} has no triangulation without diagonals in faces")
+            triangles += clean
+        cases.append(triangles)
+    table = np.full((256, max(map(len, cases)), 3), -1, dtype=np.int64)
+    for case, triangles in enumerate(cases):
+        if triangles:
+            table[case, : len(triangles)] = triangles
+    return table, np.array([len(triangles) for triangles in cases], dtype=np.int64)
+
+
+# A regular grid of cells of which only those near the surface are visited.
+#
+# Cells and corners have integer positions (x, y, z) from 0. A block is a cube of `size` cells, named by its lower
+# cell.
+
+Field = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
+"""Signed distance, negative inside, of points; both in the units of the box."""
+
+LEAF = 2  # cells along an edge of the smallest blocks
+MAX_LEAVES = 30_000_000  # about 30 GB: if more are near the zero level, the field is not a surface
+
+
+@dataclass(frozen=True)
+class SparseGrid:
+    """A box cut into `cells` along x, y, z (each a multiple of LEAF), and how its field is evaluated."""
+
+    field: Field
+    lower: tuple[float, float, float]
+    step: tuple[float, float, float]
+    cells: tuple[int, int, int]
+    device: torch.device
+    chunk: int = 1 << 18
+
+    def points(self, position: Num[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Points, in float64, of positions counted in cells."""
+        lower = torch.tensor(self.lower, dtype=torch.float64, device=position.device)
+        return lower + position.double() * torch.tensor(self.step, dtype=torch.float64, device=position.device)
+
+    def values(self, position: Num[Tensor, "n 3"], stage: str) -> Float[Tensor, "n"]:
+        """Field at positions counted in cells (whole or not), chunk by chunk.
+
+        Raises UserError where the field is not a number.
+        """
+        out = torch.empty(len(position), dtype=torch.float32, device=self.device)
+        with torch.no_grad():
+            for start in track(range(0, len(position), self.chunk), f"surface: {stage}"):
+                part = self.points(position[start : start + self.chunk]).float()
+                out[start : start + len(part)] = self.field(part).reshape(-1)
+        if not bool(torch.isfinite(out).all()):
+            raise UserError(
+                f"the field is not a number at {int((~torch.isfinite(out)).sum())} of {len(out)} points: "
+                "its training diverged. Train again with a lower learning rate, or export an earlier checkpoint."
+            )
+        return out
+
+    def corner_keys(self, corner: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
+        """One number for each corner of the grid."""
+        nx, ny = self.cells[0] + 1, self.cells[1] + 1
+        return corner[..., 0] + nx * (corner[..., 1] + ny * corner[..., 2])
+
+    def corners(self, key: Int[Tensor, "n"]) -> Int[Tensor, "n 3"]:
+        """Inverse of `corner_keys`."""
+        nx, ny = self.cells[0] + 1, self.cells[1] + 1
+        return torch.stack([key % nx, key // nx % ny, key // (nx * ny)], -1)
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Blocks of LEAF^3 cells with the field at their corners; `at` points into `value` and `key`."""
+
+    lower: Int[Tensor, "n 3"]  # lower cell of each block
+    at: Int[Tensor, "n 27"]  # corners of a block: x fastest, then y, then z
+    key: Int[Tensor, "c"]  # Grid.corner_keys, sorted
+    value: Float[Tensor, "c"]
+
+
+def _offsets(n: int, device: torch.device) -> Int[Tensor, "n3 3"]:
+    """All (x, y, z) below n, x fastest."""
+    i = torch.arange(n, device=device)
+    z, y, x = torch.meshgrid(i, i, i, indexing="ij")
+    return torch.stack([x, y, z], -1).reshape(-1, 3)
+
+
+def slope_bound(grid: SparseGrid, samples: int = 32) -> float:
+    """Slope of the field between neighbours of a coarse lattice: its 99th percentile, at least 1.
+
+    A distance has slope 1, a trained field almost. The bound scales the radius within which a block is kept.
+    """
+    extent = torch.tensor(grid.cells, device=grid.device)
+    value = grid.values(_offsets(samples, grid.device) / (samples - 1) * extent, "slope").reshape((samples,) * 3)
+    spacing = [s * c / (samples - 1) for s, c in zip(grid.step, grid.cells, strict=True)]
+    slopes = torch.cat([value.diff(dim=2 - axis).abs().reshape(-1) / spacing[axis] for axis in range(3)])
+    return max(1.0, float(torch.quantile(slopes, 0.99)))
+
+
+def find_leaves(grid: SparseGrid, safety: float) -> Int[Tensor, "n 3"]:
+    """Lower cells of all leaf blocks that may hold the zero level.
+
+    Starting from about 64 blocks along the longest side, a block is split into eight while the field at its centre is
+    smaller than `safety * slope_bound` times half the block's diagonal. Raises UserError if that is nearly everywhere.
+    """
+    reach = safety * slope_bound(grid)
+    size = LEAF
+    while max(grid.cells) > 64 * size:
+        size *= 2
+    extent = torch.tensor(grid.cells, device=grid.device)
+    counts = [-(-c // size) for c in grid.cells]
+    block = _offsets(max(counts), grid.device) * size
+    block = block[(block < extent).all(-1)]
+    while True:
+        centre = torch.minimum(block + size / 2, extent)
+        half_diagonal = 0.5 * size * sum(s * s for s in grid.step) ** 0.5
+        block = block[grid.values(centre, f"blocks of {size} cells").abs() <= reach * half_diagonal]
+        if size == LEAF:
+            return block
+        if len(block) * 8 > MAX_LEAVES * 2:
+            raise UserError(
+                f"the zero level passes through {len(block)} blocks of {size} cells: the field is not a surface yet. "
+                "Train longer, or lower --resolution."
+            )
+        size //= 2
+        block = (block[:, None] + _offsets(2, grid.device) * size).reshape(-1, 3)
+        block = block[(block < extent).all(-1)]
+
+
+def evaluate_leaves(grid: SparseGrid, lower: Int[Tensor, "n 3"]) -> Leaves:
+    """The field at the corners of leaf blocks, and of those that the surface enters from them.
+
+    Where the field is not a distance the search may have missed a block; the surface then continues through a face of a
+    known block. Such neighbours are added until none is missing, so a component is found completely if any part of it
+    was found.
+    """
+    offsets = _offsets(LEAF + 1, grid.device)
+    key = torch.empty(0, dtype=torch.long, device=grid.device)
+    value = torch.empty(0, dtype=torch.float32, device=grid.device)
+    while True:
+        wanted, at = torch.unique(grid.corner_keys(lower[:, None] + offsets), return_inverse=True)
+        fresh = wanted[~_contains(key, wanted)]
+        key, value = torch.cat([key, fresh]), torch.cat([value, grid.values(grid.corners(fresh), "corners")])
+        if len(fresh) < len(key):
+            key, order = key.sort()
+            value = value[order]
+        leaves = Leaves(lower, at, key, value)
+        missing = _entered_neighbours(grid, leaves)
+        if len(missing) == 0:
+            return leaves
+        lower = torch.cat([lower, missing])
+
+
+def _contains(sorted_keys: Tensor, wanted: Tensor) -> Tensor:
+    if len(sorted_keys) == 0:
+        return torch.zeros_like(wanted, dtype=torch.bool)
+    index = torch.searchsorted(sorted_keys, wanted).clamp_max(len(sorted_keys) - 1)
+    return sorted_keys[index] == wanted
+
+
+def _entered_neighbours(grid: SparseGrid, leaves: Leaves) -> Int[Tensor, "m 3"]:
+    """Blocks not among `leaves` at whose common face with one of them the field changes its sign."""
+    offsets = _offsets(LEAF + 1, grid.device)
+    inside = leaves.value[leaves.at] < 0
+    surface = inside.any(-1) & ~inside.all(-1)
+    lower, inside = leaves.lower[surface], inside[surface]
+    known = grid.corner_keys(leaves.lower).sort().values
+    extent = torch.tensor(grid.cells, device=grid.device)
+    found = []
+    for axis in range(3):
+        for side, step in ((0, -LEAF), (LEAF, LEAF)):
+            face = inside[:, offsets[:, axis] == side]
+            shift = torch.zeros(3, dtype=torch.long, device=grid.device)
+            shift[axis] = step
+            neighbour = (lower + shift)[face.any(-1) & ~face.all(-1)]
+            neighbour = neighbour[((neighbour >= 0) & (neighbour < extent)).all(-1)]
+            found.append(neighbour[~_contains(known, grid.corner_keys(neighbour))])
+    return grid.corners(torch.unique(grid.corner_keys(torch.cat(found))))
+
 
 _MARGIN = 1e-3  # of an edge: the smallest distance of a vertex from a corner, so that no triangle collapses
 
@@ -50,17 +326,17 @@ def _grid(
     lower: tuple[float, float, float],
     upper: tuple[float, float, float],
     device: torch.device,
-) -> Grid:
+) -> SparseGrid:
     sides = [u - low for low, u in zip(lower, upper, strict=True)]
     if min(sides) <= 0:
         raise ValueError(f"the box is empty: lower {lower}, upper {upper}")
     cell = max(sides) / resolution
     cells = [LEAF * math.ceil(side / cell / LEAF - 1e-9) for side in sides]
     step = [side / n for side, n in zip(sides, cells, strict=True)]
-    return Grid(sdf, lower, (step[0], step[1], step[2]), (cells[0], cells[1], cells[2]), device)
+    return SparseGrid(sdf, lower, (step[0], step[1], step[2]), (cells[0], cells[1], cells[2]), device)
 
 
-def _no_surface(grid: Grid) -> str:
+def _no_surface(grid: SparseGrid) -> str:
     centre = torch.tensor([[c / 2 for c in grid.cells]], device=grid.device)
     sign = "positive" if float(grid.values(centre, "centre")[0]) > 0 else "negative"
     return (
@@ -101,7 +377,7 @@ def _triangles(corner: Int[Tensor, "m 8"], case: Int[Tensor, "m"]) -> tuple[Int[
     return torch.stack([key // 3, high], -1), faces
 
 
-def _vertices(grid: Grid, leaves: Leaves, edges: Int[Tensor, "v 2"], polish: int) -> Float[Tensor, "v 3"]:
+def _vertices(grid: SparseGrid, leaves: Leaves, edges: Int[Tensor, "v 2"], polish: int) -> Float[Tensor, "v 3"]:
     """Zeros of the field along the cut edges, in the box's frame, float64."""
     start, end = (grid.corners(leaves.key[edges[:, i]]).double() for i in range(2))
     direction = end - start

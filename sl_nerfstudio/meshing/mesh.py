@@ -1,14 +1,14 @@
 """The mesh type of this package."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.connectivity import component_labels
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.geometry.numerics import component_labels
 
 
 @dataclass(frozen=True)
@@ -85,3 +85,64 @@ class Mesh:
         """Median length of an edge: the resolution of the mesh."""
         a, b = self.vertices[self.faces[:, 0]], self.vertices[self.faces[:, 1]]
         return float(np.median(np.linalg.norm(a - b, axis=1))) if len(self.faces) else 0.0
+
+
+# What is known about each vertex of a mesh.
+
+
+@dataclass(frozen=True)
+class VertexQuality:
+    """Quality of every vertex; lengths in the scan's unit. NaN where no frame confirms the vertex."""
+
+    sigma: Float64[ndarray, "v"]  # 1 sigma along the normal
+    sigma_independent: Float64[ndarray, "v"]  # the part that distant vertices do not share
+    views: Int64[ndarray, "v"]  # frames that saw, lit and confirmed it; 0: invented or interpolated surface
+    residual: Float64[ndarray, "v"]  # mean distance of predicted and decoded coordinates, projector pixels
+    ray_angle: Float64[ndarray, "v"]  # largest angle between camera ray and projector ray, degrees
+
+
+# Everything that is written with a vertex beside its place.
+
+GREY = 128
+"""Of vertices whose colour no capture shows."""
+
+
+@dataclass(frozen=True)
+class VertexProperties:
+    """Properties of every vertex of a mesh."""
+
+    quality: VertexQuality
+    invented: Bool[ndarray, "v"]  # no frame observed the surface there: it is the field's own continuation
+    colour: UInt8[ndarray, "v 3"] | None = None  # sRGB; None: no frame was also captured without the pattern
+
+    def chosen(self, index: Int[ndarray, "n"] | Bool[ndarray, "v"]) -> "VertexProperties":
+        """Those of the chosen vertices, in that order."""
+        quality = VertexQuality(**{name: values[index] for name, values in vars(self.quality).items()})
+        return VertexProperties(quality, self.invented[index], None if self.colour is None else self.colour[index])
+
+    def moved(self, distance: Float[ndarray, "v"]) -> "VertexProperties":
+        """Those of vertices that were moved away from the surface: a further error in their uncertainty."""
+        q = self.quality
+        sigma, independent = (np.hypot(values, distance) for values in (q.sigma, q.sigma_independent))
+        return replace(self, quality=replace(q, sigma=sigma, sigma_independent=independent))
+
+
+# What a textured mesh has beside its triangles.
+
+
+@dataclass(frozen=True)
+class Charts:
+    """A mesh laid out flat in pieces: a vertex has one corner for each of the charts that it belongs to."""
+
+    corners: Int64[ndarray, "f 3"]  # of each triangle
+    uv: Float32[ndarray, "c 2"]  # of each corner, in [0, 1]: to the right, and down
+    vertex: Int64[ndarray, "c"]  # of each corner
+    count: int  # charts
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Texture coordinates of a mesh's triangles, and the image they refer to."""
+
+    charts: Charts
+    image: UInt8[ndarray, "n n 3"]  # sRGB; its first row is at v = 0

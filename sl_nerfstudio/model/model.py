@@ -1,5 +1,6 @@
 """The nerfstudio model: a signed distance field, and the poses of the devices that saw it."""
 
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -11,23 +12,25 @@ from nerfstudio.models.base_model import Model
 from numpy import ndarray
 from torch import Tensor, nn
 
-from sl_nerfstudio.bundle_adjustment.free_parameters import constrained
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.field.cached_grid import CachedGrid
-from sl_nerfstudio.field.sdf_field import SDFField
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration, constrained
+from sl_nerfstudio.field.field import CachedGrid, SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
-from sl_nerfstudio.geometry.se3 import inverse, rotate
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.model.decoding_noise import measure_decoding
-from sl_nerfstudio.model.history import History
-from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, rotate
 from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
-from sl_nerfstudio.model.outputs import fit_metrics, image_metrics_and_images, picture_outputs, ray_outputs
-from sl_nerfstudio.model.pose_parameters import FrameTransforms, make_pose_parameters
+from sl_nerfstudio.model.outputs import (
+    History,
+    MeasuredCoordinates,
+    fit_metrics,
+    image_metrics_and_images,
+    measure_decoding,
+    picture_outputs,
+    ray_outputs,
+)
 from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
+from sl_nerfstudio.model.poses import FrameTransforms, make_pose_parameters
 from sl_nerfstudio.model.settings import SLModelSettings
+from sl_nerfstudio.parallel import one_torch_thread
 from sl_nerfstudio.rendering.direct_losses import (
     DecodingNoise,
     MeasuredRays,
@@ -35,13 +38,11 @@ from sl_nerfstudio.rendering.direct_losses import (
     field_losses,
     random_points,
 )
-from sl_nerfstudio.rendering.losses import coordinate_loss, pattern_loss
+from sl_nerfstudio.rendering.losses import coordinate_loss, kappa_at, level_weights_at, pattern_loss, surface_width_at
 from sl_nerfstudio.rendering.renderer import Renderer
-from sl_nerfstudio.rendering.schedule import kappa_at, level_weights_at, surface_width_at
 from sl_nerfstudio.rendering.volume_rendering import Rendered
+from sl_nerfstudio.review.verdict import departed_frames
 from sl_nerfstudio.scan import Scan
-from sl_nerfstudio.threads import one_torch_thread
-from sl_nerfstudio.verdict.departed_frames import departed_frames
 
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
 
@@ -391,3 +392,30 @@ def _corrected(bundle: RayBundle, views: Tensor, now: FrameTransforms) -> tuple[
     """Move rays from the starting pose, at which they were made, to the current one."""
     directions = rotate(now.correction[views], bundle.directions)
     return now.camera_centre[views], directions / directions.norm(dim=-1, keepdim=True)
+
+
+# The configuration from which nerfstudio creates the model, and that of the paper's method.
+
+
+@dataclass
+class SLModelConfig(SLModelSettings):
+    """A signed distance field seen as projector coordinates and pattern intensity, with the poses of both devices."""
+
+    _target: type = field(default_factory=lambda: SLModel)
+
+
+def paper_model() -> SLModelConfig:
+    """The paper's model: initial sphere, independent poses by Adam, all levels, uniform samples, no direct terms."""
+    c = SLModelConfig(pose_method="render-independently", warm_start=0.0)
+    losses = replace(
+        c.losses,
+        coordinates=0.0,
+        coordinates_per_pixel=1000 / 65535,
+        pattern=0.05,
+        eikonal=0.01,
+        surface=0.0,
+        free_space=0.0,
+    )
+    sampling = replace(c.sampling, strategy="uniform", samples=64, render_rays=2024, eikonal_points=4096)
+    annealing = replace(c.annealing, kappa_start=32.0, kappa_end=200.0, kappa_growth="linear", coarse_to_fine=False)
+    return replace(c, losses=losses, sampling=sampling, annealing=annealing)

@@ -14,7 +14,7 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim.lr_scheduler import LambdaLR
 
-from sl_nerfstudio.field.row_adam import RowAdam
+from sl_nerfstudio.field.optimiser import RowAdam
 
 
 @dataclass

@@ -1,13 +1,150 @@
 """The model's outputs outside training: images for viewer, exporters and evaluation."""
 
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
-from sl_nerfstudio.geometry.se3 import inverse
+from sl_nerfstudio.dataparser.dataparser import PixelSamples
+from sl_nerfstudio.geometry.devices import Intrinsics, project
+from sl_nerfstudio.geometry.lie import inverse, transform
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, evenly_spaced
+from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
+from sl_nerfstudio.rendering.direct_losses import DecodingNoise
 from sl_nerfstudio.rendering.renderer import Ends, Renderer
+from sl_nerfstudio.scan import Scan
+
+# Decoded coordinates looked up at scene points, for the residual image in the viewer.
+
+_KEPT = 2  # frames whose coordinates stay in memory
+
+
+class MeasuredCoordinates:
+    """The coordinate files of a scan; the frames that were used last stay in memory."""
+
+    def __init__(self, scan: Scan) -> None:
+        self._scan = scan
+        self._image = lru_cache(maxsize=_KEPT)(self._read)
+
+    def at(
+        self, p: Float[Tensor, "n 3"], views: Int[Tensor, "n"], T_camera_scene: Float[Tensor, "frames 4 4"]
+    ) -> Float[Tensor, "n 2"]:
+        """The coordinates decoded at the pixels where frames `views` see scene points; NaN where not decoded."""
+        result = torch.full_like(p[:, :2], float("nan"))
+        for view in views.unique().tolist():
+            mine = views == view
+            camera = self._scan.frames[view].camera
+            uv, in_front = project(Intrinsics.of(camera).to(p.device), transform(T_camera_scene[view], p[mine]))
+            inside = in_front & (uv >= 0).all(-1) & (uv < uv.new_tensor([camera.w, camera.h])).all(-1)
+            pixel = torch.where(inside[:, None], uv, 0.0).long()
+            decoded = self._image(view).to(p.device)[pixel[:, 1], pixel[:, 0]]
+            result[mine] = torch.where(inside[:, None], decoded, float("nan"))
+        return result
+
+    def _read(self, view: int) -> Float[Tensor, "h w 2"]:
+        return torch.from_numpy(self._scan.frames[view].read_coords())
+
+
+# How well a scan's coordinates are decoded, measured once before the first step.
+
+_PER_FRAME = 2000  # pixels
+_LEAST_PX = 0.02  # smallest plausible noise, pattern pixels
+
+
+@torch.no_grad()
+def measure_decoding(
+    scan: Scan,
+    samples: PixelSamples,
+    T_scene_camera: Float[Tensor, "n 4 4"],
+    T_scene_projector: Float[Tensor, "n 4 4"],
+) -> DecodingNoise:
+    """Robust 1 sigma of the epipolar residual, and the median slope of coordinates along camera rays."""
+    residuals, slopes = [], []
+    projector = Intrinsics.of(scan.projector, torch.float64)
+    for number, frame in enumerate(scan.frames):
+        first, last = int(samples.first[number]), int(samples.first[number + 1])
+        if last == first:
+            continue
+        pixels = samples.at(first + torch.from_numpy(evenly_spaced(last - first, min(_PER_FRAME, last - first))))
+        ok = pixels.decoded
+        camera = Intrinsics.of(frame.camera, torch.float64)
+        arguments = (
+            camera,
+            T_scene_camera[number],
+            pixels.uv[ok].double(),
+            projector,
+            T_scene_projector[number],
+            pixels.coords[ok].double(),
+        )
+        residuals.append(epipolar_residual(*arguments).abs())
+        slopes.append(1 / triangulate(*arguments).sigma_depth)
+    residual, slope = torch.cat(residuals), torch.cat(slopes)
+    finite = residual.isfinite() & slope.isfinite()
+    sigma = float(residual[finite].median()) * MAD_TO_SIGMA
+    return DecodingNoise(max(sigma, _LEAST_PX), float(slope[finite].median()))
+
+
+# Convergence curves that are saved in the checkpoint.
+
+_ROWS = 512
+
+
+class History(nn.Module):
+    """A table of values over the run, thinned out when full, so that a run of any length fits."""
+
+    table: Tensor
+    state: Tensor
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__()
+        self.names = tuple(names)
+        self.register_buffer("table", torch.full((_ROWS, len(names) + 1), float("nan"), dtype=torch.float64))
+        self._used = 0  # rows
+        self.every = 5
+        """Steps between two entries."""
+        self.register_buffer("state", torch.tensor([self._used, self.every]))  # the same two, for the checkpoint
+        self.register_load_state_dict_post_hook(_read_state)
+        self.register_state_dict_pre_hook(_write_state)
+
+    @torch.no_grad()
+    def add(self, step: int, values: Mapping[str, Float[Tensor, ""]]) -> None:
+        """Append one row; missing values are NaN. When the table is full, every other row is removed.
+
+        Values on a GPU stay there, so that the host need not wait for them.
+        """
+        row = self.table[self._used]
+        row[1:] = torch.stack([values.get(name, row[0]) for name in self.names])  # unused rows are NaN
+        row[0].fill_(step)
+        self._used += 1
+        if self._used == _ROWS:
+            kept = self.table[::2].clone()
+            self.table.fill_(float("nan"))
+            self.table[: len(kept)] = kept
+            self._used = len(kept)
+            self.every *= 2
+
+    def latest(self, name: str) -> float:
+        """The value of the last row, NaN if there is none."""
+        return float(self.table[self._used - 1, 1 + self.names.index(name)]) if self._used else float("nan")
+
+    def curves(self) -> dict[str, list[float]]:
+        """Columns by name, `step` first."""
+        rows = self.table[: self._used].cpu()
+        return {name: rows[:, i].tolist() for i, name in enumerate(("step", *self.names))}
+
+
+def _write_state(history: History, *_: object) -> None:
+    """Before a checkpoint is written."""
+    history.state.copy_(torch.tensor([history._used, history.every]))
+
+
+def _read_state(history: History, _: object) -> None:
+    """After a checkpoint was loaded."""
+    history._used, history.every = history.state.tolist()
+
 
 _OPAQUE = 0.5
 _MODULO = 128.0  # pattern pixels of one cycle of the coordinate colours

@@ -17,18 +17,15 @@ from nerfstudio.utils import comms
 from torch import Tensor
 from torchvision.utils import save_image
 
-from sl_nerfstudio.console import command, next_steps, paragraph, short_path
+from sl_nerfstudio.console import command, next_steps, paragraph, short_path, track
 from sl_nerfstudio.dataparser.datamanager import SLDataManager
-from sl_nerfstudio.dataparser.fingerprint import require_same_scan
+from sl_nerfstudio.dataparser.dataparser import require_same_scan
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.exporters import quicken_exporters
+from sl_nerfstudio.model.loop import SLTrainer
 from sl_nerfstudio.model.model import SLModel
-from sl_nerfstudio.model.training.checkpoints import SCAN_KEY, SETTINGS_KEY
-from sl_nerfstudio.model.training.fingerprints import as_tensor, as_text
-from sl_nerfstudio.model.training.interruption import INTERRUPTION
-from sl_nerfstudio.model.training.loop import SLTrainer
-from sl_nerfstudio.model.viewer.scene_view import SceneView
-from sl_nerfstudio.progress import track
+from sl_nerfstudio.model.run_files import INTERRUPTION, SCAN_KEY, SETTINGS_KEY, as_tensor, as_text
+from sl_nerfstudio.model.viewer import SceneView
 
 _WELL_DECODED = 0.8  # share of the pixels with the pattern; above it, decoding again changed poses by less than a half
 _HELD_OUT_PIXELS = 4096  # of one frame, at most: enough for a median to two digits
@@ -100,7 +97,7 @@ class SLPipeline(VanillaPipeline):
         sampler, model = self.datamanager.train_pixel_sampler, self._sl_model
         if sampler.samples.device != model.pattern.device or not model.has_kernels:
             return super().get_train_loss_dict(step)
-        from sl_nerfstudio.model.kernel_step import kernel_step  # imports Warp
+        from sl_nerfstudio.model.warp_step import kernel_step  # imports Warp
 
         self.datamanager.train_count += 1
         return {}, *kernel_step(model, sampler.samples, sampler.choose(step))

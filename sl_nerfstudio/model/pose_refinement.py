@@ -8,30 +8,35 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, CrossValidation, HeldOutPixels, adjust, cross_validate
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
-from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation, HeldOutPixels, cross_validate
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses, constrained
-from sl_nerfstudio.bundle_adjustment.gauge import agreeing_scale, baseline_scale, of_baselines, restore
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance, joint_of_prior
-from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import (
+from sl_nerfstudio.bundle_adjustment.covariance import (
+    JointCovariance,
+    frame_sigmas,
+    joint_of_prior,
     of_all_lengths,
     with_known_length,
 )
-from sl_nerfstudio.bundle_adjustment.priors import INTRINSICS_SIGMA, PosePrior
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    INTRINSICS_SIGMA,
+    UNKNOWNS,
+    PosePrior,
+    RefinePoses,
+    SelfCalibration,
+    agreeing_scale,
+    baseline_scale,
+    constrained,
+    of_baselines,
+    restore,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.dataparser.held_out import BLOCK
-from sl_nerfstudio.dataparser.samples import PixelBatch, PixelSamples
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.dataparser.dataparser import BLOCK, PixelBatch, PixelSamples
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.se3 import inverse, log_se3
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, log_se3
+from sl_nerfstudio.geometry.numerics import evenly_spaced
+from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
-from sl_nerfstudio.threads import one_library_thread
 
 _STEP = 1e-5  # scene units and radian, of central differences
 _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable

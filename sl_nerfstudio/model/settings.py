@@ -7,12 +7,11 @@ from typing import Literal
 import torch
 from nerfstudio.models.base_model import ModelConfig
 
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
+from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.field.sdf_field import FieldConfig
+from sl_nerfstudio.field.field import FieldConfig
 from sl_nerfstudio.model.pose_refinement import PriorConfig
-from sl_nerfstudio.rendering.schedule import AnnealingConfig
-from sl_nerfstudio.rendering.settings import LossConfig, SamplingConfig
+from sl_nerfstudio.rendering.losses import AnnealingConfig, LossConfig, SamplingConfig
 
 RECOMMENDED_STEPS = {"sl-neus": 1000, "sl-neus-paper": 10_000}  # by method; the paper's is its own
 

@@ -13,28 +13,33 @@ from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sl_nerfstudio.console import short_path
-from sl_nerfstudio.cores import cores
-from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, scan_root
-from sl_nerfstudio.dataparser.fingerprint import require_same_scan
+from sl_nerfstudio.console import phase, short_path
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, require_same_scan, scan_root
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import write_atomic
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
-from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.intrinsics_refinement import refine_intrinsics
-from sl_nerfstudio.model.messages import refined_intrinsics_message
+from sl_nerfstudio.model import loop
+from sl_nerfstudio.model.loop import SLTrainer
+from sl_nerfstudio.model.messages import refine_intrinsics, refined_intrinsics_message
+from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
-from sl_nerfstudio.model.training.checkpoints import Checkpoint, checkpoints_in, find_checkpoint, read_checkpoint
-from sl_nerfstudio.model.training.fingerprints import settings_fingerprint
-from sl_nerfstudio.model.training.interruption import INTERRUPTION
-from sl_nerfstudio.model.training.launching import launch_well
-from sl_nerfstudio.model.training.loop import SLTrainer
-from sl_nerfstudio.model.training.quiet import quiet_nerfstudio
-from sl_nerfstudio.model.training.run_folder import CONFIG, RunFolder, go_on_command, require_unused
-from sl_nerfstudio.progress import phase
-from sl_nerfstudio.rendering import compile_ahead
+from sl_nerfstudio.model.processes import launch_well
+from sl_nerfstudio.model.run_files import (
+    CONFIG,
+    INTERRUPTION,
+    Checkpoint,
+    RunFolder,
+    checkpoints_in,
+    find_checkpoint,
+    go_on_command,
+    quiet_nerfstudio,
+    read_checkpoint,
+    require_unused,
+    settings_fingerprint,
+)
+from sl_nerfstudio.parallel import cores
 from sl_nerfstudio.scan import require_valid
+from sl_nerfstudio.storage import write_atomic
 
 _TAKEN: dict[Path, RunFolder] = {}
 """The folders that this process writes to: not part of a configuration, which is written to config.yml."""
@@ -93,7 +98,7 @@ class SLTrainerConfig(TrainerConfig):
         self._require_flags()
         _require_devices(self.machine)
         if self.machine.device_type == "cpu":
-            compile_ahead.start()
+            loop.start()
         checkpoint = find_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         begun = None if checkpoint is None else read_checkpoint(checkpoint.absolute())
         with phase("check") as check:

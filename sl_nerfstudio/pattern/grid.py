@@ -5,16 +5,152 @@ ends of the segments that meet there, and a segment runs straight from one shift
 a little, but the nodes stay on the regular grid.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Bool, Float, Float32, Int8
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margins, is_generated
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout, number, whole_number
+
+# Means in Gaussian windows of any width.
+
+_FINEST = 3  # squares per standard deviation: what is averaged over wide windows need not be known more finely
+
+
+def gaussian_window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray, "h w *k"]:
+    """Means about each pixel in a Gaussian window of `sigma` pixels, with zeros outside the image; up to four channels.
+
+    Quotients of two such means are means over the image, or a part of it, alone. Wide windows are applied to means over
+    squares of pixels and interpolated in between, with the variance of both taken off the window's: this takes the same
+    time for each pixel however wide the window is.
+    """
+    step = max(1, int(sigma / _FINEST))
+    if step == 1:
+        return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+    h, w = values.shape[:2]
+    rows, columns = -(-h // step) + 2, -(-w // step) + 2  # with one square more on each side, to interpolate towards
+    borders = step, (rows - 1) * step - h, step, (columns - 1) * step - w
+    whole = cv2.copyMakeBorder(values, *borders, cv2.BORDER_CONSTANT)
+    coarse = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    narrower = float(np.sqrt((sigma / step) ** 2 - 1 / 12 - 1 / 6))  # less what the squares and the interpolation add
+    coarse = cv2.GaussianBlur(coarse, (0, 0), narrower, borderType=cv2.BORDER_CONSTANT)
+    fine = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
+    return fine[step : step + h, step : step + w]
+
+
+# Local intensity normalisation: makes a captured image look like the pattern that was projected on the object.
+
+
+def normalise_locally(
+    image: Float[ndarray, "h w"],
+    mask: Bool[ndarray, "h w"],
+    sigma: float,
+    mean: float = 0.5,
+    contrast: float = 0.25,
+) -> Float32[ndarray, "h w"]:
+    """Remove albedo, shading and fall-off: the local mean and standard deviation become those of the pattern.
+
+    Both are computed in a Gaussian window of `sigma` pixels (about the period of the pattern in the image), and only
+    from pixels inside the mask. The result is clipped to [0, 1], and is 0 outside the mask.
+    """
+    weight = mask.astype(np.float32)
+    values = np.where(mask, image, 0).astype(np.float32)
+    known, mean_of_all = cv2.split(gaussian_window(np.dstack([weight, values]), sigma))
+    known = np.maximum(known, np.float32(1e-6))
+    local_mean = mean_of_all / known
+    spread = np.where(mask, values - local_mean, np.float32(0))
+    local_std = np.sqrt(gaussian_window(spread * spread, sigma) / known)
+    floor = 1e-3 * max(float(values.max(initial=0)), 1e-12)  # flat regions stay flat
+    normalised = mean + contrast * (values - local_mean) / np.maximum(local_std, floor)
+    return np.where(mask, np.clip(normalised, 0, 1), 0).astype(np.float32)
+
+
+# How strongly a surface returns the projector's light: what remains of an image without the pattern and the room.
+
+_LEAST_KNOWN = 0.3  # of a window: fewer decoded pixels say too little
+_LEAST_VARIANCE = 1e-4  # of the pattern in a window
+
+
+class _Fit(NamedTuple):
+    slope: Float32[ndarray, "h w"]
+    explained: float  # share of the image's variance in the windows, median
+
+
+def projected_light(
+    image: Float[ndarray, "h w"],
+    coords: Float32[ndarray, "h w 2"],
+    pictures: Sequence[Float32[ndarray, "ph pw"]],
+    sigma: float,
+) -> Float32[ndarray, "h w"]:
+    """Light that a pattern value of one adds at each decoded pixel, in the image's unit; NaN where that is unknown.
+
+    The slope of the image over the pattern by least squares, in a Gaussian window of `sigma` pixels. Light that does
+    not come from the pattern (the room, other surfaces) falls out. `coords` are pattern pixels, NaN where not decoded;
+    `pictures` the pattern at several degrees of sharpness, of which the one counts that explains most: with another,
+    fine parts of the pattern would seem darker than coarse ones.
+    """
+    known = np.isfinite(coords).all(-1)
+    weight = known.astype(np.float32)
+    grey = image.astype(np.float32) * weight
+    image_means = gaussian_window(np.dstack([weight, grey, grey * grey]), sigma)
+    place = np.nan_to_num(coords) - np.float32(0.5)
+    fits = (_fit(grey, weight, image_means, place, picture, sigma) for picture in pictures)
+    return max(fits, key=lambda fit: fit.explained).slope
+
+
+def _fit(
+    grey: Float32[ndarray, "h w"],
+    weight: Float32[ndarray, "h w"],
+    image_means: Float32[ndarray, "h w 3"],
+    place: Float32[ndarray, "h w 2"],
+    picture: Float32[ndarray, "ph pw"],
+    sigma: float,
+) -> _Fit:
+    """With one picture; `image_means` are those of the weight, of the grey and of its square."""
+    drawn = cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    drawn = drawn * weight
+    p, pp, ip = cv2.split(gaussian_window(np.dstack([drawn, drawn * drawn, grey * drawn]), sigma))
+    n, i, ii = cv2.split(image_means)
+    some = (weight > 0) & (n > _LEAST_KNOWN)
+    n = np.maximum(n, np.float32(1e-6))
+    p, i = p / n, i / n
+    variance, common, contrast = pp / n - p * p, ip / n - i * p, ii / n - i * i
+    some &= variance > _LEAST_VARIANCE
+    slope = np.where(some, common / np.maximum(variance, np.float32(1e-9)), np.float32(np.nan)).astype(np.float32)
+    explained = common[some] ** 2 / np.maximum(variance[some] * contrast[some], np.float32(1e-12))
+    return _Fit(slope, float(np.median(explained)) if len(explained) else 0.0)
+
+
+# Any image as a pattern: bilinear interpolation.
+
+
+def sample_bilinear(image: Float32[ndarray, "h w"], uv: Float[ndarray, "*n 2"]) -> Float32[ndarray, "*n"]:
+    """Value at pixel coordinates (x, y) whose first pixel centre is (0.5, 0.5).
+
+    Beyond the outermost pixel centres the value at the border continues; NaN coordinates give NaN.
+    """
+    h, w = image.shape
+    place = uv.astype(np.float32) - np.float32(0.5)
+    x, y = np.clip(place[..., 0], 0, w - 1), np.clip(place[..., 1], 0, h - 1)
+    unknown = np.isnan(place).any(-1)
+    if unknown.any():
+        x, y = np.where(unknown, 0, x), np.where(unknown, 0, y)
+    left = np.minimum(x.astype(np.int32), max(w - 2, 0))
+    top = np.minimum(y.astype(np.int32), max(h - 2, 0))
+    fx, fy = x - left, y - top
+    right, bottom = np.minimum(left + 1, w - 1), np.minimum(top + 1, h - 1)
+    flat = image.reshape(-1)
+    upper = flat[top * w + left] * (1 - fx) + flat[top * w + right] * fx
+    lower = flat[bottom * w + left] * (1 - fx) + flat[bottom * w + right] * fx
+    value = upper * (1 - fy) + lower * fy
+    return np.where(unknown, np.float32(np.nan), value).astype(np.float32)
+
 
 # Offsets, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right).
 _OFFSETS = np.array(

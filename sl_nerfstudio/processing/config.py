@@ -8,7 +8,7 @@ from typing import Literal
 import tyro
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.sequence import SequenceName
+from sl_nerfstudio.pattern.layout import SequenceName
 
 Rig = Literal["free", "rigid", "static-projector"]
 

@@ -18,11 +18,10 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     find_registered_minimum,
     keep_registered,
 )
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import angle_deg
-from sl_nerfstudio.processing.kept.large_clouds import LargeClouds
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.reinclusion import include_left_out, with_edges_at_poses, with_relative_pose
+from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
+from sl_nerfstudio.parallel import one_library_thread, results
+from sl_nerfstudio.processing.records import LargeClouds
+from sl_nerfstudio.registration.register import include_left_out, with_edges_at_poses, with_relative_pose
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     PairsContradict,
@@ -31,11 +30,8 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
     without_frames,
 )
-from sl_nerfstudio.threads import one_library_thread, results
-from sl_nerfstudio.verdict.agreement import CrossFrameAgreement
-from sl_nerfstudio.verdict.blocks import agreeing_groups
-from sl_nerfstudio.verdict.scan_agreement import compare_frames
-from sl_nerfstudio.verdict.settings import VerdictSettings
+from sl_nerfstudio.registration.surfaces import FrameCloud
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, VerdictSettings, agreeing_groups, compare_frames
 
 _ROUNDS = 4
 _MOVES = 3  # times that frames are tried at other places

@@ -7,41 +7,181 @@ Decoded frames, the registration and the adjustment are kept in the work folder,
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.files.new_folder import NewFolder
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.processing.capture_files.cameras import refine_camera
+from sl_nerfstudio.console import track
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.object_separation.separate import Part
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.pattern.layout import ShownImage
+from sl_nerfstudio.processing.cache import StageStore, work_folder
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
-from sl_nerfstudio.processing.failures import FEWEST_FRAMES, require_given_poses, too_few_frames
-from sl_nerfstudio.processing.frame_stage import run_frame_stage_again
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_clouds
-from sl_nerfstudio.processing.given_poses import GivenPoses
-from sl_nerfstudio.processing.inputs import Inputs, read_inputs
-from sl_nerfstudio.processing.kept.stages import StageStore
-from sl_nerfstudio.processing.kept.work_folder import work_folder
-from sl_nerfstudio.processing.preview import Preview
-from sl_nerfstudio.processing.projector.found import describe
-from sl_nerfstudio.processing.projector.refinement import adjustment_settings, refine_projector
-from sl_nerfstudio.processing.projector.rigid import with_equal_baselines
-from sl_nerfstudio.processing.projector.stage import calibrate_frames
-from sl_nerfstudio.processing.projector.stated_test import contradiction_by_epipolar_geometry, within_stated_doubt
-from sl_nerfstudio.processing.result import ProcessResult, with_object_only
-from sl_nerfstudio.processing.scan_poses import find_scan_poses, require_known_frames
-from sl_nerfstudio.processing.selection.object_only import find_object_only, with_usable_scale
-from sl_nerfstudio.processing.selection.object_words import object_sentences
-from sl_nerfstudio.processing.summary import summarise
-from sl_nerfstudio.processing.writing import write_scan
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
-from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.processing.frames import (
+    FrameJob,
+    FrameStageResult,
+    FrameWorker,
+    clouds_of,
+    run_frame_stage_again,
+    with_clouds,
+)
+from sl_nerfstudio.processing.inputs import GivenPoses, Inputs, read_inputs, refine_camera
+from sl_nerfstudio.processing.object_only import (
+    Preview,
+    find_object_only,
+    make_preview,
+    object_sentences,
+    with_usable_scale,
+)
+from sl_nerfstudio.processing.projector import (
+    adjustment_settings,
+    calibrate_frames,
+    contradiction_by_epipolar_geometry,
+    describe,
+    refine_projector,
+    with_equal_baselines,
+    within_stated_doubt,
+)
+from sl_nerfstudio.processing.result import ProcessResult, first_line, left_out, summarise, with_object_only
+from sl_nerfstudio.processing.scan_poses import ScanPoses, find_scan_poses, require_known_frames
+from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import Registration, without_undecided
-from sl_nerfstudio.verdict.missing_surface import missing_shares
-from sl_nerfstudio.verdict.shared_surface import SurfaceShares, shared_surface
+from sl_nerfstudio.registration.surfaces import FrameCloud
+from sl_nerfstudio.review.coverage import SurfaceShares, missing_shares, shared_surface
+from sl_nerfstudio.scan.document import FileError
+from sl_nerfstudio.scan.images import read_photograph
+from sl_nerfstudio.scan.write import ScanWriter, encode_json
+from sl_nerfstudio.storage import NewFolder, write_atomic
+
+# The errors of a run whose frames cannot make a scan: they say what happened to every frame.
+
+FEWEST_FRAMES = 2
+REPORT = "processing.html"
+_LISTED = 20  # frames in a message
+
+
+def too_few_frames(
+    result: ProcessResult, usable: int, make_report: Callable[[ProcessResult, Sequence[Preview]], str]
+) -> UserError:
+    """The error of a run in which fewer than two frames are usable; its report goes to the work folder."""
+    config = result.config
+    path = config.work_folder / REPORT
+    write_atomic(path, make_report(result, [Preview(None, None)] * len(result.frames)).encode())
+    lost = [frame for frame in result.frames if not frame.in_scan]
+    first = lost[0].reason.strip().splitlines()[1:] if lost else []
+    if result.contradiction:  # measured, and cause enough
+        first = [f"    {line}" if k == 0 else line for k, line in enumerate(result.contradiction.splitlines())]
+    return UserError(
+        f"{config.images}: {usable} of {len(result.frames)} frames can be used, a scan needs at least "
+        f"{FEWEST_FRAMES}\n"
+        f"{_listed([f'{f.name}: {first_line(f.reason)}' for f in lost])}\n" + "\n".join(first) + f"\n    report: {path}"
+    )
+
+
+def require_given_poses(
+    config: ProcessConfig, given: GivenPoses, results: Sequence[FrameStageResult], registration: Registration
+) -> None:
+    """Raise UserError unless at least two frames with given poses, at different places, were registered.
+
+    `given` is in the order of `results`. Fewer poses determine neither axes nor unit.
+    """
+    path = Path() if config.poses is None else config.poses
+    reasons = {result.name: left_out(result, registration) for result in results}
+    with_pose = [r.name for r, pose in zip(results, given.known, strict=True) if pose]
+    usable = [name for name in with_pose if reasons[name] is None]
+    if len(usable) < FEWEST_FRAMES:
+        lines = []
+        for name in with_pose:
+            failure = reasons[name]
+            what = "registered" if failure is None else f"left out in {failure.stage}: {first_line(failure.reason)}"
+            lines.append(f"{name}: {what}")
+        raise UserError(
+            f"{path}: {len(usable)} of the {len(with_pose)} frames with given poses could be registered, the axes and "
+            f"the unit of the scan need at least {FEWEST_FRAMES}\n{_listed(lines)}\n"
+            "    cause:  the frames with given poses are among those that cannot be used\n"
+            "    remedy: give poses of other frames, capture these again, or leave --poses out"
+        )
+    chosen = np.array([name in usable for name in (r.name for r in results)])
+    if not given.at_different_places(chosen):
+        raise UserError(
+            f"{path}: the given poses of the registered frames are all at the same place\n"
+            "    cause:  frames with other positions are among those that cannot be used\n"
+            "    remedy: give poses of other frames, capture those again, or leave --poses out"
+        )
+
+
+def _listed(lines: Sequence[str]) -> str:
+    more = f"\n  and {len(lines) - _LISTED} more" if len(lines) > _LISTED else ""
+    return "\n".join(f"  {line}" for line in lines[:_LISTED]) + more
+
+
+# The scan folder of the registered frames, with the report on all frames.
+
+_SUPERSAMPLING = 4  # of pattern.png
+
+
+def write_scan(
+    folder: NewFolder,
+    job: FrameJob,
+    results: Sequence[FrameStageResult],
+    poses: ScanPoses,
+    result: ProcessResult,
+    make_report: Callable[[ProcessResult, Sequence[Preview]], str],
+) -> None:
+    """Write all frames that are in the scan by `result`. Leaving the folder completes it."""
+    layout = job.decoder.layout
+    shown = layout.place(ShownImage("white")) or 0 if isinstance(layout, GrayCode) else 0
+    row = {cloud.name: k for k, cloud in enumerate(clouds_of(results))}
+    worker = FrameWorker(job)
+    size = (job.projector.w, job.projector.h)
+    previews: list[Preview] = []
+    with ScanWriter(
+        folder.root,
+        units=poses.units,
+        scale=poses.scale,
+        projector=job.projector,
+        projector_extra=None if result.projector is None else {"intrinsics_sigma": result.projector.sigmas()},
+        pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
+        camera=job.camera,
+        within=folder,
+    ) as writer:
+        for frame, record in zip(track(results, "writing"), result.frames, strict=True):
+            image = _image(frame, shown)
+            cloud = frame.cloud
+            part = None if result.object_only is None else result.object_only.parts.get(frame.name)
+            previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part, len(results)))
+            if not record.in_scan or cloud is None or image is None:
+                continue
+            decoded, k = worker.load(frame), row[frame.name]
+            keep = np.ones_like(decoded.mask) if part is None else part == Part.OBJECT
+            writer.add_frame(
+                frame.name,
+                image=image,
+                coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
+                mask=decoded.mask & keep,
+                pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
+                camera=job.camera_of(frame.frame) if job.cameras else None,
+                T_world_camera=poses.adjusted.poses.T_world_camera[k],
+                T_world_projector=poses.adjusted.poses.T_world_projector[k],
+                pose_sigma=poses.adjusted.sigma[k],
+            )
+        writer.add_file("pattern.json", layout.encode())
+        writer.add_file("processing.json", encode_json(result.document()))
+        writer.add_file(REPORT, make_report(result, previews).encode())
+
+
+def _image(frame: FrameStageResult, shown: int) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
+    """The capture (of a sequence the image in full light, by its place); None if it cannot be read."""
+    try:
+        return read_photograph(frame.frame.images[shown])
+    except (FileError, IndexError):
+        return None
+
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]

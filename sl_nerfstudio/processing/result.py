@@ -1,15 +1,136 @@
 """The result of `sl-process`, for the report and for programs."""
 
+import importlib.metadata
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
-from sl_nerfstudio.processing.capture_files.captured import CaptureNotes
+import numpy as np
+
+from sl_nerfstudio import __version__
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
+from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
+from sl_nerfstudio.calibration.stated import describe_change
+from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.placed import PlacedGroup
-from sl_nerfstudio.processing.projector.found import FoundProjector
-from sl_nerfstudio.processing.selection.object_only import ObjectOnly
-from sl_nerfstudio.processing.selection.object_words import object_document
-from sl_nerfstudio.verdict.verdict import Verdict
+from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.inputs import CaptureNotes
+from sl_nerfstudio.processing.object_only import ObjectOnly, object_document
+from sl_nerfstudio.processing.projector import FoundProjector
+from sl_nerfstudio.processing.scan_poses import PlacedGroup, ScanPoses, place_frames
+from sl_nerfstudio.registration.pairs import support_of
+from sl_nerfstudio.registration.result import (
+    CoordinatesDisagree,
+    Exclusion,
+    NoCommonSurface,
+    PairsContradict,
+    Registration,
+    SeparateComponent,
+    SurfaceDisagrees,
+    UncertainRotation,
+    UndecidedProjector,
+)
+from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
+from sl_nerfstudio.review.coverage import SurfaceShares
+from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
+
+# Sentences for what relative pose estimation and registration found out about frames.
+
+_LISTED = 3  # other frames of a group in a sentence
+_DEGENERACIES: dict[DegeneracyKind, str] = {
+    "few points": "only {:.0f} decoded pixels agree with each other; capture the object larger in the image, or with "
+    "more light",
+    "small part of the pattern": "decoded pixels cover only {:.0f} of {:.0f} squares of the pattern; let more of the "
+    "pattern fall on the object",
+    "pure rotation": "a rotation of the projector alone, without any distance to the camera, explains the coordinates "
+    "to within {:.2g} px; hold the projector farther from the camera",
+    "small parallax": "camera rays and projector rays meet at only {:.2g} degrees; hold the projector farther from the "
+    "camera",
+    "planar": "all points lie in one plane to within {:.2g} px, and a plane does not determine the pose; show parts at "
+    "other depths in this view",
+    "epipole in view": "one device is in the other's view of the object, and depth cannot be measured around that "
+    "place; move the projector to the side",
+    "ambiguous": "a second pose explains {:.0%} of the coordinates, and this one {:.0%}; show parts at other depths in "
+    "this view",
+    "many outliers": "{:.0%} of the coordinates contradict the rest; check the pattern file and the light",
+    "poor fit": "coordinates miss their epipolar curves by {:.2g} px; check the intrinsics of both devices and the "
+    "projector's model (OPENCV or DOE)",
+    "uncertain": "the pose is known only to {:.2g} degrees (rotation) and {:.2g} degrees (direction of the baseline)",
+}
+
+
+def degeneracy_sentence(degeneracy: Degeneracy) -> str:
+    """What was found in a frame, and what to do about it."""
+    return _DEGENERACIES[degeneracy.kind].format(*degeneracy.figures)
+
+
+def exclusion_sentence(exclusion: Exclusion) -> str:
+    """Why a frame was not registered, and what to do about it."""
+    if isinstance(exclusion, SurfaceDisagrees):
+        return (
+            f"only {exclusion.fitness:.0%} of its surface agrees with that of the other frames where its pairs place "
+            "it; the object moved, or the relative pose of this frame is wrong: capture this view again"
+        )
+    if isinstance(exclusion, NoCommonSurface):
+        return "no other frame shows any of its surface; capture views in between"
+    if isinstance(exclusion, PairsContradict):
+        return (
+            f"{exclusion.contradicting} of its {exclusion.pairs} pairs with other frames contradict the pose that the "
+            "rest of them say; capture this view again, and views beside it"
+        )
+    if isinstance(exclusion, UndecidedProjector):
+        return (
+            f"two poses of the projector, {exclusion.angle_deg:.0f} degrees apart, explain its coordinates, and the "
+            "other frames do not decide between them; show parts at other depths in this view"
+        )
+    if isinstance(exclusion, CoordinatesDisagree):
+        others = [name for name in exclusion.group if name != exclusion.frame]
+        with_others = f" and those of {listed(others, _LISTED)} agree with each other but" if others else ""
+        who = f"its coordinates{with_others}"
+        return f"{who} contradict those of the other frames wherever these place it; capture this view again"
+    if isinstance(exclusion, SeparateComponent):
+        others = [name for name in exclusion.component if name != exclusion.frame]
+        group = f"it and {listed(others, _LISTED)} form a group whose" if others else "its"
+        remedy = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
+        why = "may slip along the surface (of revolution, or a plane)" if exclusion.slips else "is not certain"
+        more = (
+            ", with marks on the object (chalk, tape) or something beside it that does not look the same from all sides"
+        )
+        return f"{group} connection to the other frames {why}; capture views {remedy}{more if exclusion.slips else ''}"
+    return (
+        f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "
+        f"{exclusion.fitness:.0%} of what both saw agrees (needed: {exclusion.least_overlap:.0%} and "
+        f"{exclusion.least_fitness:.0%}); capture views in between"
+    )
+
+
+def uncertainty_sentence(uncertainty: UncertainRotation) -> str:
+    """What is uncertain about a registered frame."""
+    return (
+        f"{uncertainty.frame}: it may slip along the surface; its rotation is known only to "
+        f"{uncertainty.sigma_deg:.1f} degrees (surface of revolution, or plane?)"
+    )
+
+
+# What `sl-process` says about intrinsics that the captures contradict.
+
+
+def contradiction(found: SelfCalibration | None, cameras: Sequence[Device], projector: Device) -> str:
+    """Which intrinsics would agree better; "" if the captures do not contradict the stated ones."""
+    if found is None or not found.contradicts():
+        return ""
+    change, sigma = (IntrinsicsChange.of(values.tolist()) for values in (found.change, found.sigma))
+    return "\n".join(
+        [
+            f"The intrinsics contradict the captures (chi square {found.chi_square:.0f}, by chance 6). These changes, "
+            "together, would agree better:",
+            *(f"    {line}" for line in describe_change(change, sigma, cameras, projector)),
+            "    cause:  the calibration of a device is off, or was made with another zoom, focus or image size",
+            "    remedy: calibrate again, or train with --pipeline.model.refine-intrinsics True",
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -116,3 +237,264 @@ def with_object_only(result: ProcessResult, found: ObjectOnly) -> ProcessResult:
     )
     placed = tuple(group.only_object(found.parts) for group in result.placed)
     return replace(result, frames=frames, object_only=found, placed=placed)
+
+
+# What to capture again, and why.
+
+_LOW_RATE = 0.6  # decoded share of the pattern
+_SMALL_SHARE = 0.03  # of the image that shows the pattern
+_POOR_FITNESS = 0.65  # share of a frame's points that agree with other frames
+
+
+def what_to_recapture(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: bool) -> tuple[str, ...]:
+    """One sentence for each problem, the most important first; empty if nothing is needed."""
+    return (*_lost(frames), *_gaps(frames, edges, ordered), *(s for f in frames if f.in_scan for s in _weak(f)))
+
+
+def _lost(frames: Sequence[FrameRecord]) -> list[str]:
+    """One sentence for all frames that were left out for the same reason, or are connected with each other."""
+    together: dict[tuple[int, str], list[FrameRecord]] = {}
+    for frame in frames:
+        if not frame.in_scan:
+            key = (frame.component, "") if frame.component > 0 else (-1, first_line(frame.reason))
+            together.setdefault(key, []).append(frame)
+    sentences = []
+    for (component, _), group in together.items():
+        names, why = ", ".join(f.name for f in group), f"left out ({first_line(group[0].reason)})"
+        if len(group) == 1:
+            sentences.append(f"{names}: capture it again; it was {why}")
+        elif component > 0:
+            connect = f"capture views that connect this group {component} with the scan"
+            sentences.append(f"{names}: {connect}; {group[0].name} was {why}")
+        else:
+            sentences.append(f"{names}: capture them again; each was {why}")
+    return sentences
+
+
+def first_line(reason: str) -> str:
+    """The problem without cause and remedy."""
+    return reason.strip().splitlines()[0] if reason.strip() else "no reason known"
+
+
+def _gaps(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: bool) -> list[str]:
+    """Places where frames are connected to the others badly or not at all."""
+    if ordered:
+        return [
+            f"between {a} and {b}: add a frame; the two share too little of the surface to be registered directly"
+            for a, b in unconnected_neighbours(frames, edges)
+        ]
+    used = _used(edges)
+    present = [f.name for f in frames if f.in_scan]
+    single = [name for name in present if sum(name in pair for pair in used) == 1 and len(present) > 2]
+    return [f"near {name}: add a frame; only one other frame overlaps it" for name in single]
+
+
+def unconnected_neighbours(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]) -> list[tuple[str, str]]:
+    """Frames of the scan that follow each other, but were not registered with each other."""
+    used = _used(edges)
+    present = [f.name for f in frames if f.in_scan]
+    return [(a, b) for a, b in pairwise(present) if frozenset((a, b)) not in used]
+
+
+def _used(edges: Sequence[EdgeRecord]) -> set[frozenset[str]]:
+    return {frozenset(edge.frames) for edge in edges if edge.used}
+
+
+def _weak(frame: FrameRecord) -> list[str]:
+    """What makes a frame of the scan unreliable."""
+    advice = [f"{frame.name}: {degeneracy}" for degeneracy in frame.degeneracies]
+    shared = frame.shared_decoded is not None
+    rate, what = (frame.shared_decoded, "surface that other frames show") if shared else (frame.decode_rate, "pattern")
+    if rate is not None and rate < _LOW_RATE:
+        advice.append(
+            f"{frame.name}: only {rate:.0%} of the {what} was decoded; focus better, use more light from "
+            "the projector and less from the room, and expose so that lines are neither faint nor saturated"
+        )
+    if frame.mask_share is not None and frame.mask_share < _SMALL_SHARE:
+        advice.append(
+            f"{frame.name}: the pattern fills only {frame.mask_share:.1%} of the image; go closer, or aim better"
+        )
+    if frame.fitness is not None and frame.fitness < _POOR_FITNESS:
+        advice.append(
+            f"{frame.name}: only {frame.fitness:.0%} of its points agree with the frames it overlaps; something moved, "
+            "or its pose is uncertain: capture it again"
+        )
+    return advice
+
+
+# From the results of the stages to what the report shows.
+
+_ALONE = "too few other frames could be used"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a frame is not in the scan."""
+
+    stage: str  # reading, decoding, calibrating, registering
+    reason: str  # problem, cause and remedy
+
+
+def left_out(result: FrameStageResult, registration: Registration | None) -> Failure | None:
+    """Why a frame cannot be in the scan; None if it was registered. `registration` is None where it was not reached."""
+    if result.cloud is None:
+        return Failure(result.stage, result.reason)
+    if registration is None:
+        return Failure("registering", _ALONE)
+    if registration.registered[registration.names.index(result.name)]:
+        return None
+    exclusion = next(e for e in registration.exclusions if e.frame == result.name)
+    return Failure("registering", exclusion_sentence(exclusion))
+
+
+def summarise(
+    config: ProcessConfig,
+    decoder: str,
+    results: Sequence[FrameStageResult],
+    registration: Registration | None,
+    poses: ScanPoses | None,
+    cross: CrossFrameAgreement | None = None,
+    shares: Sequence[SurfaceShares] = (),
+    found: FoundProjector | None = None,
+    contradicted: str = "",
+) -> ProcessResult:
+    """The result of a run; without `poses` no frame is in a scan.
+
+    `cross` and `shares` (of what others show) are of the registered frames.
+    `found`: the projector, if it was found from the frames. `contradicted`: which intrinsics the epipolar geometry
+    contradicts; what the joint adjustment finds is said where this is empty.
+    """
+    frames = _with_others([_record(result, registration, poses) for result in results], cross, shares)
+    edges = () if registration is None else registration.edges
+    records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
+    adjusted = None if poses is None else poses.adjusted
+    wrong = contradicted or _contradiction(results, adjusted)
+    return ProcessResult(
+        config=config,
+        decoder=decoder,
+        units="arbitrary" if poses is None else poses.units,
+        scale_source=poses.scale.source if poses is not None and poses.scale.known else "",
+        frames=frames,
+        edges=records,
+        remarks=(
+            *([wrong] if wrong else []),
+            *([found.doubt] if found and found.doubt else []),
+            *_uncertain(registration),
+        ),
+        recapture=what_to_recapture(frames, records, not config.unordered),
+        joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
+        cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
+        verdict=judge_scan(
+            ScanFacts(
+                tuple(map(_facts, frames)),
+                tuple(
+                    PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness))
+                    for e in records
+                    if e.used or not e.undecided
+                ),
+                cross,
+                bool(wrong),
+                () if registration is None else registration.turns_deg,
+                registration is not None and registration.by_order,
+                adjusted=not config.no_adjust,
+            )
+        ),
+        projector=found,
+        contradiction=wrong,
+        placed=place_frames(results, registration, poses),
+        versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
+    )
+
+
+def _with_others(
+    frames: Sequence[FrameRecord], cross: CrossFrameAgreement | None, shares: Sequence[SurfaceShares]
+) -> tuple[FrameRecord, ...]:
+    """The records with what the other frames say about each."""
+    if cross is None:
+        return tuple(frames)
+    found = iter(zip(cross.frames, shares or [SurfaceShares(None, None)] * len(cross.frames), strict=True))
+    return tuple(_agreeing(f, *next(found)) if f.in_scan else f for f in frames)
+
+
+def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shares: SurfaceShares) -> FrameRecord:
+    figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
+               "cross_excess": found.excess}  # fmt: skip
+    known = {key: value for key, value in figures.items() if np.isfinite(value)}
+    return replace(frame, seen_share=found.seen, shared_decoded=shares.decoded, missing_share=shares.missing, **known)
+
+
+def _facts(frame: FrameRecord) -> FrameFacts:
+    """What the verdict judges of a frame."""
+    return FrameFacts(
+        frame.name,
+        frame.in_scan,
+        frame.component if frame.component >= 0 else None,
+        frame.undecided,
+        frame.sigma_rotation_deg,
+        frame.decode_rate,
+        frame.shared_decoded,
+        frame.missing_share,
+        frame.own_share,
+        bool(frame.degeneracies),
+    )
+
+
+def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:
+    """Which intrinsics the captures contradict; "" if none."""
+    clouds = clouds_of(results)
+    if adjusted is None or not clouds:
+        return ""
+    return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+
+
+def _uncertain(registration: Registration | None) -> tuple[str, ...]:
+    """What registration could not decide."""
+    return () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
+
+
+def _both_known(before: float, after: float) -> tuple[float, float] | None:
+    """None where no point of one frame was seen by another: then there is nothing to compare."""
+    return (float(before), float(after)) if np.isfinite([before, after]).all() else None
+
+
+def _record(result: FrameStageResult, registration: Registration | None, poses: ScanPoses | None) -> FrameRecord:
+    """What is known of one frame."""
+    decoded = result.stage not in ("reading", "decoding")
+    rate, share = (result.decode_rate, result.mask_share) if decoded else (None, None)
+    failure, cloud = left_out(result, registration), result.cloud
+    if cloud is None:
+        return FrameRecord(result.name, False, result.stage, result.reason, rate, share)
+    if failure is None and poses is None:
+        failure = Failure("registering", _ALONE)
+    record = FrameRecord(
+        name=result.name,
+        in_scan=failure is None,
+        stage="" if failure is None else failure.stage,
+        reason="" if failure is None else failure.reason,
+        decode_rate=rate,
+        mask_share=share,
+        epipolar_px=float(cloud.pose.residual_px),
+        own_share=float(cloud.pose.inliers.mean()),
+        relative_sigma_rotation_deg=cloud.pose.sigma_rotation_deg,
+        relative_sigma_direction_deg=cloud.pose.sigma_direction_deg,
+        degeneracies=tuple(map(degeneracy_sentence, cloud.pose.degeneracies)),
+    )
+    return record if registration is None else _registered(record, registration, poses)
+
+
+def _registered(record: FrameRecord, registration: Registration, poses: ScanPoses | None) -> FrameRecord:
+    """The record with what registration and the joint adjustment found."""
+    k = registration.names.index(record.name)
+    record = replace(record, component=int(registration.component[k]))
+    if not record.in_scan or poses is None:
+        return record
+    doubts = [u for u in registration.uncertainties if u.frame == record.name]
+    stated = poses.adjusted.sigma[k]
+    sigmas = [u.sigma_deg for u in doubts if isinstance(u, UncertainRotation)]
+    return replace(
+        record,
+        undecided=bool(doubts),
+        sigma_rotation_deg=max([*sigmas, *([] if stated is None else [stated.camera_rotation_deg])], default=None),
+        fitness=float(np.nan_to_num(registration.fitness[k])),
+        baseline=float(poses.adjusted.poses.baseline[k]),
+    )

@@ -1,14 +1,22 @@
 """The axes and the unit of the scan: those of given poses, of a known length, or arbitrary ones."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.given_poses import GivenPoses, align_to
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.known_length import KnownLength, scale_to
-from sl_nerfstudio.registration.result import Registration
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.object_separation.separate import Part
+from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.inputs import GivenPoses, align_to
+from sl_nerfstudio.registration.result import KnownLength, Registration, scale_to
+from sl_nerfstudio.registration.surfaces import FrameCloud, reliable_points
 from sl_nerfstudio.scan.types import UNITS, PickedPixel, Scale, ScaleBar
 
 
@@ -72,3 +80,104 @@ def stated_scale(known: KnownLength) -> Scale:
     first, second = (PickedPixel(*end) for end in zip(known.frames, known.pixels, strict=True))
     length = known.metres / (UNITS[known.unit] or 1.0)
     return Scale(True, known.source, bar=ScaleBar((first, second), length))
+
+
+# Where the frames are and what they see, for the 3D view of the report.
+
+MOST_POINTS = 40_000  # of all frames together: half a megabyte in the page
+_MOST_OF_A_FRAME = 2000
+
+
+@dataclass(frozen=True)
+class PlacedFrame:
+    """A frame in the axes and the unit of its group."""
+
+    name: str
+    camera: Device
+    projector: Device
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    points: Float32[ndarray, "n 3"]  # some of the surface that it sees
+    uv_camera: Float64[ndarray, "n 2"]  # the pixels that see them
+
+
+@dataclass(frozen=True)
+class PlacedGroup:
+    """Frames that are connected with each other: the scan, another component, or a frame by itself."""
+
+    component: int  # 0: the scan; 1, 2, ...: others, each in its own axes and unit; -1: a frame by itself
+    frames: tuple[PlacedFrame, ...]
+
+    def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
+        """Without the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
+        return replace(
+            self, frames=tuple(_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
+        )
+
+
+def place_frames(
+    results: Sequence[FrameStageResult], registration: Registration | None, poses: ScanPoses | None
+) -> tuple[PlacedGroup, ...]:
+    """The scan first, then the other components, then single frames that were decoded and calibrated."""
+    clouds = clouds_of(results)
+    most = min(_MOST_OF_A_FRAME, MOST_POINTS // max(len(clouds), 1))
+    groups = [g for g in _groups(clouds, registration, poses, most) if g.frames]
+    placed = {frame.name for group in groups for frame in group.frames}
+    alone = [c for c in clouds if c.name not in placed]
+    return (*groups, *(PlacedGroup(-1, (_placed(c, np.eye(4), 1.0, most),)) for c in alone))
+
+
+def _groups(
+    clouds: Sequence[FrameCloud], registration: Registration | None, poses: ScanPoses | None, most: int
+) -> Iterator[PlacedGroup]:
+    if registration is None:
+        return
+    inside = registration.registered if poses is not None else np.zeros(len(clouds), dtype=bool)
+    if poses is not None:
+        devices = poses.adjusted.poses
+        yield PlacedGroup(
+            0,
+            tuple(
+                _at(clouds[k], devices.T_world_camera[k], devices.T_world_projector[k], most)
+                for k in np.flatnonzero(inside).tolist()
+            ),
+        )
+    by_name = {cloud.name: k for k, cloud in enumerate(clouds)}
+    for separate in registration.separate:
+        left = [(by_name[name], i) for i, name in enumerate(separate.frames) if not inside[by_name[name]]]
+        frames = [_placed(clouds[k], separate.T_world_camera[i], float(separate.baseline[i]), most) for k, i in left]
+        if len(frames) > 1:  # of the others, one alone is no component
+            yield PlacedGroup(int(registration.component[left[0][0]]), tuple(frames))
+
+
+def _placed(cloud: FrameCloud, T_world_camera: Float64[ndarray, "4 4"], baseline: float, most: int) -> PlacedFrame:
+    """A frame with its own relative pose, and a baseline of some length."""
+    T = cloud.pose.T_camera_projector.copy()
+    T[:3, 3] *= baseline / np.linalg.norm(T[:3, 3])
+    return _at(cloud, T_world_camera, T_world_camera @ T, most)
+
+
+def _at(
+    cloud: FrameCloud, T_world_camera: Float64[ndarray, "4 4"], T_world_projector: Float64[ndarray, "4 4"], most: int
+) -> PlacedFrame:
+    """A frame with points triangulated at these poses; those with by far the largest uncertainty are left out."""
+    good = np.flatnonzero(reliable_points(cloud))
+    uv = cloud.uv_camera[good[np.linspace(0, len(good) - 1, min(most, len(good))).astype(np.int64)]]
+    column, row = np.floor(uv).astype(np.int64).T
+    found = triangulate(
+        Intrinsics.of(cloud.camera, torch.float64),
+        torch.from_numpy(T_world_camera),
+        torch.from_numpy(uv),
+        Intrinsics.of(cloud.projector, torch.float64),
+        torch.from_numpy(T_world_projector),
+        torch.from_numpy(cloud.coords[row, column].astype(np.float64)),
+    )
+    seen = (found.depth_camera > 0).numpy()
+    points = found.p_world.numpy()[seen].astype(np.float32)
+    return PlacedFrame(cloud.name, cloud.camera, cloud.projector, T_world_camera, T_world_projector, points, uv[seen])
+
+
+def _only_object(frame: PlacedFrame, part: UInt8[ndarray, "h w"]) -> PlacedFrame:
+    column, row = np.floor(frame.uv_camera).astype(np.int64).T
+    keep = part[row, column] == Part.OBJECT
+    return replace(frame, points=frame.points[keep], uv_camera=frame.uv_camera[keep])

@@ -4,27 +4,427 @@ The result is a camera pose and the length of the baseline of every frame. Lengt
 the registered frames' baselines is 1 until `known_length` says how long one of them really is.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.acceptance import accept_frames
-from sl_nerfstudio.registration.assembly import Component
-from sl_nerfstudio.registration.capture_order import chain_of_small_steps, sides_are_open, typical_step_deg
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
-from sl_nerfstudio.registration.result import Registration
-from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, RegistrationSettings
-from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.symmetry.turning_back import turn_blocks_back
-from sl_nerfstudio.registration.view_graph import ViewGraph
-from sl_nerfstudio.side_by_side import tracked
-from sl_nerfstudio.threads import one_library_thread
+from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
+from sl_nerfstudio.parallel import one_library_thread, results, tracked
+from sl_nerfstudio.registration.agreement import Tolerance, agreement_at
+from sl_nerfstudio.registration.assembly import Assembly, Component, Nodes, PoseGraphSolution, node_at
+from sl_nerfstudio.registration.pairs import (
+    PairMatch,
+    is_accepted,
+    is_ambiguous,
+    quality,
+    register_pair,
+    search_score,
+    support,
+)
+from sl_nerfstudio.registration.result import (
+    Edge,
+    Exclusion,
+    NoCommonSurface,
+    PairsContradict,
+    PoorPair,
+    Registration,
+    SeparateComponent,
+    SeparatePoses,
+    SurfaceDisagrees,
+    UncertainRotation,
+    UndecidedProjector,
+)
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, EdgeSettings, RegistrationSettings
+from sl_nerfstudio.registration.surfaces import FrameCloud, SurfaceMap, build_surface_map
+from sl_nerfstudio.registration.symmetry import (
+    chain_of_small_steps,
+    sides_are_open,
+    symmetric_turns_deg,
+    turn_blocks_back,
+    typical_step_deg,
+)
+from sl_nerfstudio.registration.view_graph import ViewGraph, split_by_slip, starting_similarities, with_common_centre
+
+# Which frames are registered in the end, why the others are not, and what is uncertain.
+
+
+def accept_frames(
+    names: tuple[str, ...], graph: ViewGraph, ordered: bool, others: Sequence[PairMatch] = ()
+) -> Registration:
+    """Poses and baselines of the largest component; every other frame with its reason.
+
+    `others`: pairs that are not in the graph, and may say that the surface looks the same after a turn.
+    """
+    components, settings = graph.assemble(), graph.settings
+    edges = graph.holding(components[0])
+    main = components[0] if len(components[0]) > 1 else {}
+    component = _numbers(components, len(names))
+    solution = graph.solve(components[0])
+    connected = component == 0
+    rngs = graph.rng.spawn(len(names))
+    fitness = np.array(
+        results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
+    )
+    agrees = connected & (fitness >= settings.acceptance.least_fitness)
+    doubts = _doubtful(names, agrees, edges, solution.consistent, settings.edge)
+    few = len(doubts) <= settings.acceptance.most_doubtful * agrees.sum()
+    registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
+    poses, baseline = _in_first_camera(solution.S_world_camera, registered)
+    consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
+    return Registration(
+        names,
+        poses,
+        baseline,
+        registered,
+        component,
+        np.where(registered, fitness, np.nan),
+        tuple(
+            Edge(
+                (names[e.source], names[e.target]), e.S_target_source.R, e.overlap, e.fitness, bool(used),
+                is_ambiguous(e, settings.edge), e.rotation_sigma_deg, e.by_tone,
+            )
+            for e, used in zip(edges, solution.consistent, strict=True)
+        ),
+        tuple(
+            doubts[k]
+            if agrees[k]
+            else SurfaceDisagrees(names[k], float(fitness[k]))
+            if connected[k]
+            else _exclusion(k, names, components, main, graph)
+            for k in np.flatnonzero(~registered).tolist()
+        ),
+        tuple(_uncertainties(names, consistent, registered, graph)),
+        tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
+        symmetric_turns_deg(graph.sides, edges, solution, settings, [*others, *graph.put_aside]),
+        ordered,
+    )  # fmt: skip
+
+
+def _doubtful(
+    names: Sequence[str],
+    inside: Bool[ndarray, "n"],
+    edges: Sequence[PairMatch],
+    consistent: Bool[ndarray, "edges"],
+    settings: EdgeSettings,
+) -> dict[int, PairsContradict]:
+    """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
+    found = {}
+    frames: list[int] = np.flatnonzero(inside).tolist()
+    for k in frames:
+        mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
+        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e, settings)]
+        against = [e for e, used in mine if not used]
+        if math.fsum(map(support, against)) > math.fsum(support(e) for e, used in mine if used):
+            found[k] = PairsContradict(names[k], len(mine), len(against))
+    return found
+
+
+def _separate_poses(names: Sequence[str], component: Component, graph: ViewGraph) -> SeparatePoses:
+    """The poses of a component that is not the largest, among themselves."""
+    inside = np.isin(np.arange(len(names)), list(component))
+    poses, baseline = _in_first_camera(graph.solve(component).S_world_camera, inside)
+    return SeparatePoses(tuple(np.array(names)[inside].tolist()), poses[inside], baseline[inside])
+
+
+def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
+    """Number of each frame's component; -1 for single frames."""
+    number = np.full(n, -1, dtype=np.int64)
+    for c, frames in enumerate(c for c in components if len(c) > 1):
+        number[list(frames)] = c
+    return number
+
+
+def _fitness_of(
+    k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
+) -> float:
+    """Of a frame's points that other frames can judge, the share that agrees."""
+    S, settings = solution.S_world_camera[k], graph.settings.pair
+    if S is None or not connected[k]:
+        return 0.0
+    agreeing = expected = 0.0
+    for j in np.flatnonzero(connected).tolist():
+        other = solution.S_world_camera[j]
+        if j == k or other is None or not graph.see_same_side(S, other):
+            continue
+        maps = graph.maps[k], graph.maps[j]
+        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
+        agreeing += found.agreeing[0]
+        expected += found.expected[0]
+    return agreeing / expected if expected else 0.0
+
+
+def _in_first_camera(
+    nodes: Nodes, registered: Bool[ndarray, "n"]
+) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n"]]:
+    """Camera poses and baselines in the axes of the first registered camera, geometric mean of the baselines one."""
+    n = len(registered)
+    poses, baseline = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
+    frames: list[int] = np.flatnonzero(registered).tolist()
+    if not frames:
+        return poses, baseline
+    world = [node_at(nodes, k) for k in frames]
+    unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
+    gauge = Similarity.scaling(1 / unit) @ Similarity(1.0, world[0].R, world[0].t).inverse()
+    for k, S in zip(frames, (gauge @ S for S in world), strict=True):
+        baseline[k] = S.scale
+        poses[k] = np.eye(4)
+        poses[k, :3, :3], poses[k, :3, 3] = S.R, S.t
+    return poses, baseline
+
+
+def _exclusion(
+    k: int, names: Sequence[str], components: Sequence[Component], main: Component, graph: ViewGraph
+) -> Exclusion:
+    """Why a frame is not in the largest component."""
+    settings = graph.settings.edge
+    mine = [e for e in graph.matches if k in (e.source, e.target)]
+    if not mine:
+        return NoCommonSurface(names[k])
+    best = max(mine, key=lambda e: quality(e, settings))
+    if not is_accepted(best, settings):
+        partner = names[best.other(k)]
+        return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+    component = next(c for c in components if k in c)
+    across = [
+        (e, e.source if e.source in main else e.target)
+        for e in graph.matches
+        if (e.source in main and e.target in component) or (e.target in main and e.source in component)
+    ]
+    partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
+    # where no two frames could be joined, every pair of the frame might have joined it
+    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e, settings)]
+    slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
+    return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
+
+
+def _uncertainties(
+    names: Sequence[str], consistent: Sequence[PairMatch], registered: Bool[ndarray, "n"], graph: ViewGraph
+) -> list[UncertainRotation]:
+    """Registered frames that no pair determines well."""
+    out: list[UncertainRotation] = []
+    frames: list[int] = np.flatnonzero(registered).tolist()
+    for k in frames:
+        mine = [e for e in consistent if k in (e.source, e.target)]
+        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
+        if mine and all(e.slip_deg > 0 for e in mine):
+            out.append(UncertainRotation(names[k], graph.settings.acceptance.unknown_sigma_rotation_deg))
+        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
+            out.append(UncertainRotation(names[k], sigma_deg))
+    return out
+
+
+# Frames that were left out are placed against the others once those are adjusted.
+#
+# Before the joint adjustment every surface is bent by the errors of its own relative pose, and only as certain as
+# that.
+# Afterwards a weak frame has to agree with surfaces that are known far better.
+
+
+def with_relative_pose(
+    cloud: FrameCloud,
+    T_camera_projector: Float64[ndarray, "4 4"],
+    sigma_rotation_rad: float,
+    sigma_direction_rad: float,
+) -> FrameCloud:
+    """The cloud with another pose of its projector (baseline of any length), known to the given sigma per axis."""
+    T = T_camera_projector.copy()
+    T[:3, 3] /= np.linalg.norm(T[:3, 3])
+    old = cloud.pose
+    pose = replace(
+        old,
+        T_camera_projector=T,
+        covariance=np.diag([sigma_rotation_rad**2] * 3 + [sigma_direction_rad**2] * 2),
+        inliers=np.ones(int(old.inliers.sum()), dtype=bool),
+        noise_px=old.noise_px[old.inliers],
+        alternatives=(),
+    )
+    return cloud.with_pose(cloud.projector, pose)
+
+
+@one_library_thread()
+def include_left_out(
+    clouds: Sequence[FrameCloud],
+    registration: Registration,
+    adjusted: DevicePoses,
+    left_out: Sequence[int],
+    seed: int = 0,
+    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
+) -> Registration:
+    """The registration, at the adjusted poses, with those of `left_out` that can now be placed by more than one pair.
+
+    `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
+    """
+    n = len(clouds)
+    graph = ViewGraph(
+        [build_surface_map(c, settings.surface_map) for c in clouds], [None] * n, np.random.default_rng(seed), settings
+    )
+    main: Component = {
+        k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
+        for k, T in enumerate(adjusted.T_world_camera)
+        if registration.registered[k]
+    }
+    search = settings.pair.anywhere
+    for k in left_out:
+        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
+    used = [e.fitness for e in registration.edges if e.used]
+    firm, slipping = split_by_slip(graph.edges, settings.pair.bounded_slip_deg)
+    # after the adjustment right frames fit as well as the others do
+    strict = replace(settings.assembly, misfit_factor=settings.assembly.inner_misfit_factor)
+    assembly = Assembly(graph.sides, graph.pivots, firm, replace(settings, assembly=strict), used or None, slipping)
+    placed: Component = {}
+    singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
+    for block in (*_blocks(registration, left_out), *singles):
+        joint = None if block.keys() <= placed.keys() else assembly.decide(main, block)
+        if joint is not None and joint.links > 1:
+            placed |= {k: joint.S_first_second @ S for k, S in block.items()}
+    return _with_frames(registration, adjusted, placed)
+
+
+def _blocks(registration: Registration, left_out: Sequence[int]) -> list[Component]:
+    """Frames that registration connected with each other but not with the rest: together they may be certain."""
+    number = {registration.names[k]: k for k in left_out}
+    blocks: list[Component] = []
+    for one in registration.separate:
+        rows = zip(one.frames, one.baseline.tolist(), one.T_world_camera, strict=True)
+        blocks.append({number[name]: Similarity(b, T[:3, :3], T[:3, 3]) for name, b, T in rows if name in number})
+    return [block for block in blocks if len(block) > 1]
+
+
+def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Component) -> Registration:
+    registered, component = registration.registered.copy(), registration.component.copy()
+    T, baseline, fitness = adjusted.T_world_camera.copy(), adjusted.baseline.copy(), registration.fitness.copy()
+    for k, S in placed.items():
+        registered[k], component[k], baseline[k], fitness[k] = True, 0, S.scale, 1.0
+        T[k] = np.eye(4)
+        T[k, :3, :3], T[k, :3, 3] = S.R, S.t
+    names = {registration.names[k] for k in placed}
+    found = replace(
+        registration,
+        registered=registered,
+        component=component,
+        T_world_camera=T,
+        baseline=baseline,
+        fitness=fitness,
+        exclusions=tuple(e for e in registration.exclusions if e.frame not in names),
+    )
+    return with_edges_at_poses(found, names)
+
+
+def with_edges_at_poses(
+    registration: Registration, frames: Collection[str], settings: RegistrationSettings = REGISTRATION_DEFAULTS
+) -> Registration:
+    """The registration; pairs of `frames`, which stand elsewhere now, are used if they say the same rotation."""
+    T = dict(zip(registration.names, registration.T_world_camera, strict=True))
+
+    def says_the_same(edge: Edge) -> bool:
+        first, second = (T[name][:3, :3] for name in edge.frames)
+        if not np.isfinite([first, second]).all():
+            return False
+        limit_deg = settings.pair.same_rotation_deg + settings.pair.kernel_sigmas * edge.rotation_sigma_deg
+        return angle_deg(edge.R_second_first @ first.T @ second) <= limit_deg
+
+    edges = (replace(e, used=says_the_same(e)) if set(e.frames) & set(frames) else e for e in registration.edges)
+    return replace(registration, edges=tuple(edges))
+
+
+# Frames of which two poses of the projector explain the coordinates: which one, by what neighbouring frames saw.
+#
+# A wrong pose of the projector bends the surface of its frame, so it agrees less with those of other frames.
+
+
+@dataclass(frozen=True)
+class ProjectorChoice:
+    """Which cloud of every frame, and the frames where the choice is not certain."""
+
+    chosen: tuple[int, ...]  # for every frame 0, its own cloud, or the number of an alternative from 1
+    undecided: tuple[UndecidedProjector, ...]
+
+
+def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[FrameCloud]:
+    """Of every frame the cloud that was chosen, without alternatives."""
+    return [replace((cloud, *cloud.alternatives)[k], alternatives=()) for cloud, k in zip(clouds, chosen, strict=True)]
+
+
+@one_library_thread()
+def choose_projectors(
+    clouds: Sequence[FrameCloud],
+    sequence: bool = True,
+    seed: int = 0,
+    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
+) -> ProjectorChoice:
+    """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
+    open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
+    if not open_frames:
+        return ProjectorChoice((0,) * len(clouds), ())
+    search = _Choice(clouds, sequence, np.random.default_rng(seed), settings)
+    chosen, undecided = [0] * len(clouds), []
+    for k in track(open_frames, "comparing poses of projectors"):
+        support = search.support(k)
+        best = int(np.argmax(support))
+        chosen[k] = best
+        rivals = [h for h in range(len(support)) if h != best and support[h] >= settings.choice.rival * support[best]]
+        if rivals:
+            angle = max(_angle_deg(search.choices[k][best], search.choices[k][h]) for h in rivals)
+            undecided.append(UndecidedProjector(clouds[k].name, angle))
+    return ProjectorChoice(tuple(chosen), tuple(undecided))
+
+
+class _Choice:
+    """All clouds of all frames, and how well pairs of them agree."""
+
+    def __init__(
+        self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator, settings: RegistrationSettings
+    ) -> None:
+        self.choices = [(c, *c.alternatives) for c in clouds]
+        maps = iter(
+            results([partial(build_surface_map, c, settings.surface_map) for all_ in self.choices for c in all_])
+        )
+        self._maps = [[next(maps) for _ in choice] for choice in self.choices]
+        self._sequence, self._rng, self._settings = sequence, rng, settings
+
+    def support(self, k: int) -> list[float]:
+        """For every cloud of a frame the sum of what agrees with its neighbours, less what contradicts."""
+        partners = self._partners(k)
+        pairs = [(m, j) for m in self._maps[k] for j in partners]
+        tasks = [
+            partial(self._agreement, *pair, rng) for pair, rng in zip(pairs, self._rng.spawn(len(pairs)), strict=True)
+        ]
+        return np.reshape(results(tasks), (len(self._maps[k]), -1)).sum(1).tolist()
+
+    def _partners(self, k: int) -> list[int]:
+        """Frames taken shortly before and after; of an unordered set those that look most alike."""
+        s, n = self._settings.choice, len(self.choices)
+        if self._sequence:
+            return [j for j in range(max(0, k - s.reach), min(n, k + s.reach + 1)) if j != k]
+        search = self._settings.pair.anywhere
+        others = [j for j in range(n) if j != k]
+        tasks = [
+            partial(search_score, (self._maps[k][0], self._maps[j][0]), search, rng, self._settings.pair)
+            for j, rng in zip(others, self._rng.spawn(len(others)), strict=True)
+        ]
+        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * s.reach]]
+
+    def _agreement(self, own: SurfaceMap, partner: int, rng: np.random.Generator) -> float:
+        pair = self._settings.pair
+        search = pair.neighbours if self._sequence else pair.anywhere
+        best = 0.0
+        for other in self._maps[partner]:
+            match = register_pair((own, other), (0, 1), search, rng, None, pair)
+            if match is not None and is_accepted(match, self._settings.edge):
+                contradicting = match.overlap * (1 / match.fitness - 1)
+                best = max(best, match.overlap - pair.agreement.penalty * contradicting)
+        return best
+
+
+def _angle_deg(a: FrameCloud, b: FrameCloud) -> float:
+    R = a.pose.T_camera_projector[:3, :3] @ b.pose.T_camera_projector[:3, :3].T
+    return angle_deg(R)
 
 
 @one_library_thread()

@@ -1,11 +1,18 @@
 """What registration found: poses, the pairs that support them, frames that were left out, and what is uncertain."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
+
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
+from sl_nerfstudio.registration.surfaces import FrameCloud
+from sl_nerfstudio.relative_pose.epipolar import directions
+from sl_nerfstudio.relative_pose.intrinsics import camera_depth
 
 
 @dataclass(frozen=True)
@@ -155,3 +162,130 @@ def without_undecided(registration: Registration, undecided: Sequence[UndecidedP
     """
     names = {name for name, here in zip(registration.names, registration.registered, strict=True) if here}
     return without_frames(registration, [doubt for doubt in undecided if doubt.frame in names])
+
+
+# One known length sets the scale: the baseline of a frame, or the distance between two points picked in images.
+
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+_NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
+_PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
+_BASELINE = re.compile(rf"baseline of frame (\S+) *= *{_NUMBER} *(\w+)")
+_BAR = re.compile(rf"distance (?:between|from) {_PIXEL} (?:and|to) {_PIXEL} *= *{_NUMBER} *(\w+)")
+
+
+@dataclass(frozen=True)
+class KnownLength:
+    """A length in metres and what it belongs to: a baseline, or the distance between two picked pixels."""
+
+    metres: float
+    unit: str
+    frames: tuple[str, ...]  # number or name of the frame, or of the two frames
+    pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y); the centre of the first pixel is (.5, .5)
+
+    @property
+    def source(self) -> str:
+        """Where the scale of a scan comes from, in words."""
+        if self.pixels:
+            return "scale bar between frame {} and frame {}".format(*self.frames)
+        return f"baseline of frame {self.frames[0]}"
+
+
+def parse_known_length(text: str) -> KnownLength:
+    """`baseline of frame 0 = 85 mm` or `distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm`.
+
+    Raises UserError where the text is neither, the unit is unknown, or the length is not above zero or beyond reason.
+    """
+    text = " ".join(text.split())
+    if baseline := _BASELINE.fullmatch(text):
+        frames, pixels, length, unit = (baseline[1],), (), float(baseline[2]), baseline[3]
+    elif bar := _BAR.fullmatch(text):
+        frames, length, unit = (bar[1], bar[4]), float(bar[7]), bar[8]
+        pixels = ((float(bar[2]), float(bar[3])), (float(bar[5]), float(bar[6])))
+    else:
+        raise UserError(
+            f'known length "{text}" is not understood\n    remedy: write "baseline of frame 0 = 85 mm" or '
+            '"distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm" (pixels x, y)'
+        )
+    if unit not in _METRES:
+        raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
+    metres = length * _METRES[unit]
+    limits = KNOWN_LENGTH_DEFAULTS
+    if not limits.least_metres <= metres <= limits.most_metres:
+        least, most = limits.least_metres / _METRES[unit], limits.most_metres / _METRES[unit]
+        problem = "above zero" if length <= 0 else f"between {least:g} and {most:g} {unit}"
+        raise UserError(f'known length "{text}": a length must be {problem}')
+    return KnownLength(metres, unit, frames, pixels)
+
+
+def scale_to(
+    known: KnownLength,
+    unit: str,
+    clouds: Sequence[FrameCloud],
+    T_world_camera: Float64[ndarray, "n 4 4"],
+    T_world_projector: Float64[ndarray, "n 4 4"],
+    settings: KnownLengthSettings = KNOWN_LENGTH_DEFAULTS,
+) -> float:
+    """Factor by which all positions must be multiplied for the length to be true, in `unit` ("m", "cm", "mm", "um").
+
+    Raises UserError where a frame does not exist or was not registered, or where nothing was decoded at a pixel.
+    """
+    index = [_frame_index(frame, clouds) for frame in known.frames]
+    for k in index:
+        if not np.isfinite(T_world_camera[k]).all():
+            raise UserError(
+                f"{clouds[k].name} was not registered, so a length in it cannot set the scale\n"
+                "    remedy: give a length that involves registered frames"
+            )
+    if known.pixels:
+        ends = [
+            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k], settings.picking_radius_px)
+            for k, pixel in zip(index, known.pixels, strict=True)
+        ]
+        found = float(np.linalg.norm(ends[0] - ends[1]))
+    else:
+        k = index[0]
+        found = float(np.linalg.norm(T_world_camera[k, :3, 3] - T_world_projector[k, :3, 3]))
+    if found <= 0:
+        raise UserError(f"{known.source}: the two ends are the same point\n    remedy: pick two different places")
+    return known.metres / _METRES[unit] / found
+
+
+def is_index(frame: str, count: int) -> bool:
+    """Whether a text is a number from 0 to below `count`."""
+    return frame.isdecimal() and len(frame) <= len(str(count)) and int(frame) < count
+
+
+def _frame_index(frame: str, clouds: Sequence[FrameCloud]) -> int:
+    names = [c.name for c in clouds]
+    if frame in names:
+        return names.index(frame)
+    if is_index(frame, len(names)):
+        return int(frame)
+    raise UserError(f'there is no frame "{frame}"\n    remedy: give its number (0 to {len(names) - 1}) or its name')
+
+
+def _point_at(
+    cloud: FrameCloud,
+    pixel: tuple[float, float],
+    T_world_camera: Float64[ndarray, "4 4"],
+    T_world_projector: Float64[ndarray, "4 4"],
+    radius_px: float,
+) -> Float64[ndarray, "3"]:
+    """World point of a picked pixel, at the median depth of what was decoded around it."""
+    first = np.maximum(np.floor(np.array(pixel) - radius_px).astype(np.int64), 0)
+    last = np.maximum(np.ceil(np.array(pixel) + radius_px).astype(np.int64), 0)
+    around = cloud.coords[first[1] : last[1], first[0] : last[0]]
+    row, column = np.nonzero(np.isfinite(around[..., 0]))
+    uv_camera = first + np.stack([column, row], -1) + 0.5
+    near = np.linalg.norm(uv_camera - pixel, axis=1) < radius_px
+    if not near.any():
+        raise UserError(
+            f"{cloud.name}: nothing was decoded within {radius_px:g} pixels of ({pixel[0]:g}, {pixel[1]:g})\n"
+            "    remedy: pick a place where the pattern can be seen"
+        )
+    # Not the cloud's points: bundle adjustment may have changed the relative pose, and depth depends on it.
+    T = np.linalg.inv(T_world_camera) @ T_world_projector
+    d_projector = directions(cloud.projector, around[row[near], column[near]].astype(np.float64))
+    depth = camera_depth(T[:3, :3], T[:3, 3], directions(cloud.camera, uv_camera[near]), d_projector)
+    ray = directions(cloud.camera, np.array([pixel], dtype=np.float64))[0]
+    return T_world_camera[:3, :3] @ (float(np.median(depth)) * ray) + T_world_camera[:3, 3]

@@ -2,8 +2,124 @@
 
 from dataclasses import dataclass, field
 
-from sl_nerfstudio.registration.symmetry.settings import SymmetrySettings, TurnedBlockSettings
-from sl_nerfstudio.registration.tone.settings import ToneMatchSettings, ToneSettings
+# Settings of tones: what of a frame's brightness belongs to its surface, and when it holds two frames.
+
+
+@dataclass(frozen=True)
+class ToneSettings:
+    """What of a frame's brightness belongs to its surface."""
+
+    window: float = 0.06
+    """standard deviation of the window in which brightness is compared, as a share of the map's longer side: what
+    changes more slowly is light, not surface"""
+    least_cosine: float = 0.35
+    """cosine of the normal with the ray of either device, below which the surface is seen or lit too obliquely"""
+    knots_deg: tuple[float, ...] = (
+        *(0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0),
+        *(37.0, 45.0, 54.0, 63.0, 72.0, 81.0, 90.0),
+    )
+    """angles of the normal to light, camera and the middle of both, in degrees, between which brightness is linear:
+    highlights are narrow"""
+    ridge: float = 1e-4
+    """weight of the squares of those functions, relative to one pixel's"""
+    border: int = 2
+    """map pixels along the border of what is known that have no tone"""
+    fewest_pixels: int = 60
+    """map pixels of a connected part of the surface that has a tone"""
+    largest: float = 3.0
+    """tone, in robust standard deviations of the frame's, beyond which it is cut off: a highlight"""
+
+
+@dataclass(frozen=True)
+class ToneMatchSettings:
+    """Frames that slip along each other, held by the tone of their surface."""
+
+    step_deg: float = 3.0
+    """rotation between places that are compared, degrees"""
+    follow_steps: int = 2
+    """steps by which the rest of the motion follows each of them"""
+    followed_points: int = 300
+    """points of each frame by which it follows"""
+    points: int = 5000
+    """points of a frame that are compared at most"""
+    least_share: float = 0.15
+    """share of a frame's toned points that the other must see, for a correlation to count"""
+    least_correlation: float = 0.3
+    """correlation of the tones at the place that is taken"""
+    largest_correlation: float = 0.999
+    """correlation that counts at most: Fisher's transform of 1 is infinite"""
+    least_lead: float = 2.0
+    """lead of that place over all others, Fisher's transforms, in standard deviations of what chance gives"""
+    fewest_others: int = 12
+    """other places that it must be compared with"""
+    least_sigma_deg: float = 0.3
+    """smallest standard deviation, in degrees, of a rotation found so"""
+    largest_sigma_deg: float = 1.5
+    """largest such standard deviation: broad shades are as likely light as surface"""
+    largest_loss: float = 0.05
+    """share of the points that may agree less there than where the surfaces agree best"""
+
+
+# Settings of what looks the same, or nearly, from several sides. Lengths are in radii, see `registration.settings`.
+
+
+@dataclass(frozen=True)
+class SymmetrySettings:
+    """When a surface looks the same after a turn."""
+
+    same_rotation_deg: float = 8.0
+    """rotation between two turns, in degrees, below which they are one"""
+    largest_log_scale: float = 0.05
+    """logarithm of the scale of a turn, which is 0 but for the errors of the pairs"""
+    least_agreeing: float = 0.25
+    """points that must agree after the turn, as a share of those that agree before it: what was seen from one side only
+    covers little of its place upside down"""
+    neighbours: int = 6
+    """frames with which each one is compared after the turn"""
+    most_compared: int = 12
+    """turns that are tried"""
+    exact_widths: tuple[float, ...] = (0.06, 0.04, 0.03, 0.02, 0.01, 0.0, 0.0)
+    """kernel width, in radii, of each step that makes a turn exact; never below `kernel_sigmas` of pairs"""
+    exact_rcond: float = 1e-6
+    """singular values, relative to the largest, along which a turn is not moved: what is round slips"""
+    least_excess: float = 8.0
+    """how many times as much must contradict after a part of a turn as after all of it; less: it is round, or long"""
+
+
+@dataclass(frozen=True)
+class TurnedBlockSettings:
+    """Which blocks of frames are at the wrong one of several sides that look nearly the same."""
+
+    fewest_frames: int = 3
+    """frames of a component in which blocks are looked for"""
+    neighbours: int = 16
+    """frames with which each one is compared"""
+    most_compared: int = 12
+    """turns that are tried"""
+    least_judged: float = 0.1
+    """points that a pair can judge, in frames, if it says how much usually contradicts"""
+    better_quantile: float = 0.25
+    """quantile of the shares that contradict in pairs: those inside a block, even if blocks contradict each other"""
+    least_misfit: float = 0.003
+    """share that may contradict in such pairs: points at edges do in every pair"""
+    usual_factor: float = 1.5
+    """times as much may contradict before it counts against a block"""
+    least_contradicting: float = 0.5
+    """points that must contradict beyond the usual, in frames, if a block is looked for"""
+    starts: int = 24
+    """frames from which a block is grown"""
+    least_agreeing: float = 1.0
+    """points of a block that must agree with the other frames after the turn, in frames: 1 is all points of one"""
+    least_overlap: float = 0.1
+    """the same, relative to those that agreed before it"""
+    largest_remainder: float = 0.5
+    """share that contradicts across a block after the turn, relative to that before it"""
+    least_improvement: float = 0.8
+    """share that contradicts among all frames after the turn, relative to that before it"""
+    most_tried: int = 2
+    """turned blocks of a component that are tried, those that contradict most"""
+    most_turned: int = 4
+    """times that blocks are turned, one after the other"""
 
 
 @dataclass(frozen=True)

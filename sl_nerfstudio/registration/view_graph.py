@@ -1,5 +1,6 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import partial
 
@@ -9,18 +10,122 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import Assembly, Component
-from sl_nerfstudio.registration.graph_residuals import Nodes, Pivots
-from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, quality
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair, search_score
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement_at
-from sl_nerfstudio.registration.pose_graph import PoseGraphSolution, optimise_pose_graph
-from sl_nerfstudio.registration.settings import RegistrationSettings, Search
-from sl_nerfstudio.registration.surface_map import SurfaceMap
-from sl_nerfstudio.registration.tone.cycles import with_confirmed_tones
-from sl_nerfstudio.side_by_side import tracked
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.parallel import tracked
+from sl_nerfstudio.registration.agreement import Side, Tolerance, agreement_at
+from sl_nerfstudio.registration.assembly import (
+    Assembly,
+    Component,
+    Nodes,
+    Pivots,
+    PoseGraphSolution,
+    optimise_pose_graph,
+)
+from sl_nerfstudio.registration.pairs import PairMatch, edge_weights, is_accepted, quality, register_pair, search_score
+from sl_nerfstudio.registration.settings import (
+    REGISTRATION_DEFAULTS,
+    PairSettings,
+    RegistrationSettings,
+    Search,
+    StartSettings,
+)
+from sl_nerfstudio.registration.surfaces import SurfaceMap
+
+# Pairs that only tones hold, confirmed by a third frame.
+#
+# Where the shape leaves a turn open, two tones may agree by accident anywhere. Three pairs that close a cycle do
+# not.
+
+
+def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots, settings: PairSettings) -> list[PairMatch]:
+    """The pairs in their order; those that tones hold and no cycle of three confirms are taken to slip."""
+    if not any(e.by_tone for e in edges):
+        return list(edges)
+    held: defaultdict[int, dict[int, PairMatch]] = defaultdict(dict)
+    for e in edges:
+        if e.slip_deg <= settings.bounded_slip_deg:
+            held[e.source][e.target] = held[e.target][e.source] = e
+    return [
+        e.without_tone() if e.by_tone and not _confirmed(e, held[e.source], held[e.target], pivots, settings) else e
+        for e in edges
+    ]
+
+
+def _confirmed(
+    e: PairMatch,
+    of_source: dict[int, PairMatch],
+    of_target: dict[int, PairMatch],
+    pivots: Pivots,
+    settings: PairSettings,
+) -> bool:
+    """Whether the way over a third frame leads to the same similarity."""
+    around = (
+        of_target[k].between(k, e.target) @ of_source[k].between(e.source, k) for k in of_source if k in of_target
+    )
+    return any(_same(e.S_target_source, S, pivots, e.source, settings) for S in around)
+
+
+def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int, settings: PairSettings) -> bool:
+    """Whether two similarities turn a frame alike, and put its centre at about the same place."""
+    if angle_deg(a.R @ b.R.T) > settings.same_rotation_deg:
+        return False
+    centre = pivots.centre[frame][None]
+    shift = float(np.linalg.norm(a.points(centre) - b.points(centre)))
+    return shift < settings.same_shift * a.scale * float(pivots.radius[frame])
+
+
+# Camera poses that a user knows roughly, as a start of registration: the baselines that fit them are found here.
+
+
+def starting_similarities(
+    T_world_camera: Float64[ndarray, "n 4 4"],
+    maps: Sequence[SurfaceMap],
+    settings: StartSettings = REGISTRATION_DEFAULTS.start,
+) -> list[Similarity | None]:
+    """`S_world_camera` of frames with known camera poses; None where a pose holds NaN.
+
+    The clouds of all frames must lie at about the same place. The baselines are therefore those for which all
+    centroids, each on its own ray, come nearest to one point (linear least squares).
+    """
+    known = [k for k in range(len(maps)) if np.isfinite(T_world_camera[k]).all()]
+    if not known:
+        return [None] * len(maps)
+    A, b = np.zeros((3 * len(known), len(known) + 3)), np.zeros(3 * len(known))
+    for row, k in enumerate(known):
+        T, rows = T_world_camera[k], slice(3 * row, 3 * row + 3)
+        ray = T[:3, :3] @ maps[k].centroid
+        # Unit rays: only their directions count, whatever unit the baseline makes.
+        A[rows, row] = ray / np.linalg.norm(ray)
+        A[rows, len(known) :] = -np.eye(3)
+        b[rows] = -T[:3, 3]
+    distances = np.linalg.lstsq(A, b, rcond=None)[0][: len(known)]
+    positive = distances[distances > 0]
+    typical = float(np.median(positive)) if len(positive) else 1.0
+    out: list[Similarity | None] = [None] * len(maps)
+    for k, found in zip(known, distances, strict=True):
+        distance = found if found > settings.least_distance * typical else typical
+        T = T_world_camera[k]
+        out[k] = Similarity(float(distance / np.linalg.norm(maps[k].centroid)), T[:3, :3], T[:3, 3])
+    return out
+
+
+def with_common_centre(
+    S_world_camera: Sequence[Similarity | None], maps: Sequence[SurfaceMap]
+) -> list[Similarity | None]:
+    """The same, each moved so that the centres of what the frames see lie in one place.
+
+    A camera that is rotated wrongly by a few degrees looks past the object by more than the object's size. Its rotation
+    is still a good start.
+    """
+    pairs = zip(S_world_camera, maps, strict=True)
+    centres = [None if S is None else S.points(m.views[0].centre[None])[0] for S, m in pairs]
+    known = [p for p in centres if p is not None]
+    common = np.median(known, axis=0) if known else np.zeros(3)
+    return [
+        None if S is None or p is None else Similarity(S.scale, S.R, S.t + common - p)
+        for S, p in zip(S_world_camera, centres, strict=True)
+    ]
+
 
 Pair = tuple[int, int]
 Snapshot = tuple[dict[Pair, PairMatch | None], list[PairMatch]]  # what pairs say, and what was put aside

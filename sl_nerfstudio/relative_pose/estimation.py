@@ -4,23 +4,150 @@ Five degrees of freedom; the length of the baseline cannot be seen in one frame 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA
-from sl_nerfstudio.relative_pose.candidates import Candidate, ranked, relative_pose_candidates
-from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, find_degeneracies
-from sl_nerfstudio.relative_pose.epipolar_fit import covariance, distinct_fits, fit_epipolar
-from sl_nerfstudio.relative_pose.five_point import in_front
-from sl_nerfstudio.relative_pose.pattern_blocks import block_count
-from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs, subsample
-from sl_nerfstudio.relative_pose.sampson import sampson
-from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, RelativePoseSettings
-from sl_nerfstudio.threads import one_library_thread
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
+from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.relative_pose.candidates import (
+    Candidate,
+    in_front,
+    plane_relief,
+    ranked,
+    relative_pose_candidates,
+    rotation_relief,
+)
+from sl_nerfstudio.relative_pose.epipolar import (
+    RELATIVE_POSE_DEFAULTS,
+    DegeneracyLimits,
+    EpipolarFit,
+    RayPairs,
+    RelativePoseSettings,
+    block_count,
+    block_numbers,
+    blocks_of,
+    correspondences_of,
+    covariance,
+    distinct_fits,
+    fit_epipolar,
+    lattice_step,
+    ray_pairs,
+    sampson,
+    subsample,
+)
+
+# Degeneracies: frames whose correspondences determine the relative pose badly, or not at all.
+
+DegeneracyKind = Literal[
+    "few points",
+    "small part of the pattern",
+    "pure rotation",
+    "small parallax",
+    "planar",
+    "epipole in view",
+    "ambiguous",
+    "many outliers",
+    "poor fit",
+    "uncertain",
+]
+
+
+@dataclass(frozen=True)
+class Degeneracy:
+    """One reason to trust a frame's relative pose less, with the figures that show it.
+
+    The figures of each kind:
+
+    - few points: correspondences that agree with the pose
+    - small part of the pattern: squares of the pattern that hold points, and all its squares
+    - pure rotation, planar: relief that is left, in projector pixels
+    - small parallax: median angle between the rays, in degrees
+    - epipole in view: none
+    - ambiguous: shares of the correspondences that the second best solution and the best one explain
+    - many outliers: share of the correspondences that disagree
+    - poor fit: noise of the residuals, in projector pixels
+    - uncertain: standard deviations of the rotation and of the baseline's direction, in degrees
+    """
+
+    kind: DegeneracyKind
+    figures: tuple[float, ...]
+
+
+def find_degeneracies(
+    found: EpipolarFit,
+    rays: RayPairs,
+    inlier: Bool[ndarray, "n"],
+    sigma_deg: tuple[float, float],
+    explained: tuple[float, float] | None,
+    blocks_of_pattern: int,
+    limits: DegeneracyLimits = RELATIVE_POSE_DEFAULTS.degeneracy,
+) -> tuple[Degeneracy, ...]:
+    """All degeneracies that a frame shows.
+
+    Args:
+        found: the pose.
+        rays: the frame's correspondences.
+        inlier: those that agree with the pose.
+        sigma_deg: standard deviations of rotation and of the baseline's direction.
+        explained: what the second best solution and this one explain, where another explains nearly as much.
+        blocks_of_pattern: number of squares of the whole pattern.
+        limits: when a frame counts as degenerate.
+    """
+    good = rays.chosen(inlier)
+    blocks = len(np.unique(good.block))
+    noise = found.noise_px
+    least_relief = limits.least_relief_sigmas * noise
+    plane, rotation = plane_relief(good, limits), rotation_relief(good, limits)
+    parallax_deg = float(np.degrees(np.median(ray_angles(found, good))))
+    outliers = 1 - float(inlier.mean())
+    too_uncertain = (
+        sigma_deg[0] > limits.largest_sigma_rotation_deg or sigma_deg[1] > limits.largest_sigma_direction_deg
+    )
+    rules: tuple[tuple[bool, DegeneracyKind, tuple[float, ...]], ...] = (
+        (len(good) < limits.least_points, "few points", (len(good),)),
+        (blocks / blocks_of_pattern < limits.least_block_share, "small part of the pattern",
+         (blocks, blocks_of_pattern)),
+        (rotation < least_relief, "pure rotation", (rotation,)),
+        (rotation >= least_relief and parallax_deg < limits.least_parallax_deg, "small parallax", (parallax_deg,)),
+        (rotation >= least_relief and plane < least_relief, "planar", (plane,)),
+        (epipole_in_view(found, good, limits.epipole_sectors), "epipole in view", ()),
+        (explained is not None, "ambiguous", explained or ()),
+        (outliers > limits.largest_outlier_share, "many outliers", (outliers,)),
+        (noise > limits.largest_noise_px, "poor fit", (noise,)),
+        (too_uncertain, "uncertain", sigma_deg),
+    )  # fmt: skip
+    return tuple(Degeneracy(kind, tuple(map(float, figures))) for holds, kind, figures in rules if holds)
+
+
+def ray_angles(found: EpipolarFit, rays: RayPairs) -> Float64[ndarray, "n"]:
+    """Angles, in radian, at which camera rays and projector rays meet."""
+    d_p = rays.d_projector @ found.R.T
+    return np.arctan2(np.linalg.norm(np.cross(rays.d_camera, d_p), axis=-1), (rays.d_camera * d_p).sum(-1))
+
+
+def epipole_in_view(
+    found: EpipolarFit, rays: RayPairs, sectors: int = RELATIVE_POSE_DEFAULTS.degeneracy.epipole_sectors
+) -> bool:
+    """Whether one device, or its mirror image behind, lies within the cone of rays that see the object."""
+    return _surrounded(found.t, rays.d_camera, sectors) or _surrounded(found.R.T @ found.t, rays.d_projector, sectors)
+
+
+def _surrounded(axis: Float64[ndarray, "3"], directions: Float64[ndarray, "n 3"], sectors: int) -> bool:
+    """Whether the line of `axis` has directions in all sectors around it."""
+    axis = axis * np.sign(axis @ directions.mean(0))
+    helper = np.eye(3)[np.abs(axis).argmin()]
+    u = np.cross(axis, helper)
+    u = u / np.linalg.norm(u)
+    angle = np.arctan2(directions @ np.cross(axis, u), directions @ u)
+    if axis @ directions.mean(0) <= 0:
+        return False
+    sector = np.floor((angle + np.pi) / (2 * np.pi / sectors)).astype(int).clip(0, sectors - 1)
+    return len(np.unique(sector)) == sectors
 
 
 class RelativePoseError(UserError):
@@ -196,3 +323,60 @@ def _no_pose(problem: str) -> RelativePoseError:
         "image is mirrored or turned, or most coordinates are wrong\n"
         "    remedy: check pattern and intrinsics (their image sizes first), and look at the decoded coordinates"
     )
+
+
+# Which coordinates of a frame agree with its relative pose, also between the pixels that the pose was found from.
+
+
+def agreeing_coords(
+    coords: Float32[ndarray, "h w 2"],
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+    settings: RelativePoseSettings = RELATIVE_POSE_DEFAULTS,
+) -> Float32[ndarray, "h w 2"]:
+    """The coordinates without those that contradict the pose, which become NaN.
+
+    `pose.inliers` are those of `correspondences_of(coords)`. Pixels between them are judged by the same rule, with the
+    noise in their square of the pattern; if all of `pose.inliers` agree, these do.
+    """
+    known, step = np.isfinite(coords).all(-1), lattice_step(*coords.shape[:2])
+    agrees = known.copy()
+    if step > 1 and not pose.inliers.all():
+        noise_px = _noise_by_block(coords, projector, pose, settings)
+        for first in range(0, len(coords), settings.lattice.rows):
+            rows = slice(first, first + settings.lattice.rows)
+            agrees[rows] = _agree(coords[rows], first, camera, projector, pose, noise_px, settings)
+    agrees[::step, ::step][known[::step, ::step]] = pose.inliers
+    return np.where(agrees[..., None], coords, np.float32(np.nan))
+
+
+def _noise_by_block(
+    coords: Float32[ndarray, "h w 2"], projector: Device, pose: RelativePose, settings: RelativePoseSettings
+) -> Float64[ndarray, "blocks"]:
+    """Noise in each square of the pattern; that of the whole frame where the pose was found from nothing there."""
+    block = blocks_of(correspondences_of(coords)[1], projector, settings.blocks)
+    measured = np.isfinite(pose.noise_px)
+    noise_px = np.full(block_numbers(settings.blocks), pose.residual_px)
+    noise_px[block[measured]] = pose.noise_px[measured]
+    return noise_px
+
+
+def _agree(
+    coords: Float32[ndarray, "h w 2"],
+    first_row: int,
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+    noise_px: Float64[ndarray, "blocks"],
+    settings: RelativePoseSettings,
+) -> Bool[ndarray, "h w"]:
+    """Which pixels of some rows of an image agree."""
+    row, column = np.nonzero(np.isfinite(coords).all(-1))
+    uv_camera = np.stack([column, row + first_row], -1) + 0.5
+    rays, usable = ray_pairs(uv_camera, coords[row, column].astype(np.float64), camera, projector, settings.blocks)
+    R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
+    good = usable[agree(R, t, rays, sampson(R, t, rays), noise_px[rays.block], settings)]
+    out = np.zeros(coords.shape[:2], dtype=bool)
+    out[row[good], column[good]] = True
+    return out

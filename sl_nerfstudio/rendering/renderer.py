@@ -7,13 +7,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sl_nerfstudio.field.cached_grid import CachedGrid
-from sl_nerfstudio.field.signed_distance import SignedDistance
+from sl_nerfstudio.field.field import CachedGrid
+from sl_nerfstudio.field.hash_grid import SignedDistance
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.rendering.compiled_rendering import comes_below, compiled_serves, first_crossings
-from sl_nerfstudio.rendering.ray_samples import first_crossing, sphere_interval, uniform_samples
-from sl_nerfstudio.rendering.settings import SamplingConfig
-from sl_nerfstudio.rendering.volume_rendering import Rendered, render
+from sl_nerfstudio.rendering.losses import SamplingConfig
+from sl_nerfstudio.rendering.volume_rendering import (
+    Rendered,
+    comes_below,
+    compiled_serves,
+    first_crossing,
+    first_crossings,
+    render,
+    sphere_interval,
+    uniform_samples,
+)
 
 CACHE_SAMPLES = 64  # along a ray, to find the surface
 _SHADOW_SAMPLES = 32

@@ -1,35 +1,350 @@
 """The surface and the refined poses of a trained run, extracted and written."""
 
+import io
+import platform
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
+from scipy.spatial import KDTree
 
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import write_atomic
-from sl_nerfstudio.meshing.finishing.decimate import Decimated, decimate
-from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
-from sl_nerfstudio.meshing.formats.point_files import observed_points, write_points
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import write_mesh
-from sl_nerfstudio.meshing.texture.colours import Textured, surface_texture
-from sl_nerfstudio.meshing.vertex_colour import Colours, has_pictures, vertex_colours
-from sl_nerfstudio.meshing.vertex_properties import VertexProperties
-from sl_nerfstudio.meshing.vertex_uncertainty import vertex_uncertainty
-from sl_nerfstudio.runs.covariance_file import write_covariance
-from sl_nerfstudio.runs.device_files import require_possible_files, write_device_files
-from sl_nerfstudio.runs.export_settings import ExportSettings
-from sl_nerfstudio.runs.run_record import training_record
-from sl_nerfstudio.runs.surface import Surface, build_surface
-from sl_nerfstudio.runs.trained_run import TrainedModel, TrainedRun
-from sl_nerfstudio.scan import PoseSigma, Scan, write_transforms
+from sl_nerfstudio.geometry.devices import IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.files import observed_points, write_mesh, write_points
+from sl_nerfstudio.meshing.finish import (
+    ClosedField,
+    Decimated,
+    FilledHoles,
+    MarkedMesh,
+    Planes,
+    decimate,
+    fill_holes,
+    hull_planes,
+)
+from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
+from sl_nerfstudio.meshing.texture import Colours, Textured, has_pictures, surface_texture, vertex_colours
+from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
+from sl_nerfstudio.meshing.visibility import Trimmed, trim_to_observed
+from sl_nerfstudio.model.run_files import plain
+from sl_nerfstudio.model.settings import RECOMMENDED_STEPS
+from sl_nerfstudio.object_separation.planes import SEPARATION_DEFAULTS, DecodedFrame, PlaneFinding
+from sl_nerfstudio.object_separation.separate import Separation, separate
+from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.runs.cameras import (
+    encode_blender,
+    encode_colmap,
+    encode_kitti,
+    encode_tum,
+    posed_frames,
+    require_possible,
+    surface_tracks,
+)
+from sl_nerfstudio.runs.export_settings import BLENDER_FILE, COLMAP_FOLDER, ExportSettings
+from sl_nerfstudio.runs.run import TrainedModel, TrainedRun
+from sl_nerfstudio.scan import FileError, PoseSigma, Scan, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
-from sl_nerfstudio.scan.writing import encode_json, sigma_fields
-from sl_nerfstudio.threads import one_library_thread
+from sl_nerfstudio.scan.images import ARRAY_DAMAGE
+from sl_nerfstudio.scan.types import UNITS
+from sl_nerfstudio.scan.write import encode_json, sigma_fields
+from sl_nerfstudio.storage import write_atomic
+
+# Cameras and trajectories of a run, written for other programs.
+
+
+def require_possible_files(settings: ExportSettings, model: TrainedModel) -> None:
+    """Raise UserError, before anything slow, for what a format cannot hold."""
+    if "colmap" in settings.cameras:
+        require_possible(posed_frames(model.scan, model.poses(), model.unplaced()), model.scan.root)
+
+
+def write_device_files(
+    settings: ExportSettings, model: TrainedModel, mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None
+) -> None:
+    """Write what the settings ask for; COLMAP gets points of `mesh`."""
+    scan, folder, poses = model.scan, settings.device_folder, model.poses()
+    frames, unit_m = posed_frames(scan, poses, model.unplaced()), UNITS[scan.units]
+    files: dict[str, bytes] = {}
+    if "colmap" in settings.cameras:
+        model_files = encode_colmap(frames, scan.root, surface_tracks(mesh, colour, scan, poses))
+        files |= {f"{COLMAP_FOLDER}/{name}": content for name, content in model_files.items()}
+    if "blender" in settings.cameras:
+        files[BLENDER_FILE] = encode_blender(frames, unit_m)
+    for name, devices in (("camera", frames.cameras), ("projector", frames.projectors)):
+        if "tum" in settings.trajectories:
+            files[f"{name}_tum.txt"] = encode_tum(devices, frames.placed, unit_m or 1.0)
+        if "kitti" in settings.trajectories:
+            files[f"{name}_kitti.txt"] = encode_kitti(devices, unit_m or 1.0)
+    for name, content in files.items():
+        write_atomic(folder / name, content)
+
+
+# pose_covariance.npz beside refined poses: the joint covariance of all poses and the intrinsics.
+
+COVARIANCE = "pose_covariance.npz"
+_AGAIN = "export again with sl-export --poses"
+
+
+def write_covariance(folder: Path, scan: Scan, joint: JointCovariance | None) -> None:
+    """Write the file, in the scan's world and unit; with None, remove that of an earlier export."""
+    path = folder / COVARIANCE
+    if joint is None:
+        path.unlink(missing_ok=True)
+        return
+    buffer = io.BytesIO()
+    names = np.array([frame.name for frame in scan.frames])
+    np.savez_compressed(buffer, factor=joint.factor, frames=names, units=np.array(scan.units))
+    write_atomic(path, buffer.getvalue())
+
+
+def read_covariance(folder: Path, scan: Scan) -> JointCovariance | None:
+    """The covariance in a folder of refined poses; None if there is none. Raises FileError for one that is not it."""
+    path = folder / COVARIANCE
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            factor, frames, units = archive["factor"], archive["frames"].tolist(), str(archive["units"])
+    except (*ARRAY_DAMAGE, KeyError) as error:
+        raise FileError(path, f"cannot be read ({error})", "it is damaged or another file", _AGAIN) from error
+    if frames != [frame.name for frame in scan.frames] or units != scan.units:
+        raise FileError(path, "is that of other frames or another unit", "the poses are those of another scan", _AGAIN)
+    size = 12 * len(frames) + UNKNOWNS
+    if factor.ndim != 2 or len(factor) != size or factor.dtype != np.float64 or not np.isfinite(factor).all():
+        raise FileError(path, f"factor: is {factor.dtype} {factor.shape}", "the file is damaged", _AGAIN)
+    return JointCovariance(factor)
+
+
+# What a person needs to repeat a run: settings, versions, convergence; as plain JSON values.
+
+_PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", "open3d")
+_SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
+
+
+def training_record(run: TrainedRun) -> dict[str, Any]:
+    """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
+
+    The last says how intrinsics were changed, and how well they agree with the captures.
+    """
+    return {
+        "settings": {"step": run.step, **run_settings(run.config)},
+        "versions": {
+            **package_versions(),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "device": _device(run.model.device),
+        },
+        "curves": {name: plain(values) for name, values in run.model.history().items()},
+        "intrinsics": {
+            "change": plain(run.model.scan.intrinsics_change),
+            "self_calibration": _self_calibration(run.model.self_calibration()),
+        },
+    }
+
+
+def _self_calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
+    """Which change of the intrinsics would agree better with the captures, with its uncertainty."""
+    if found is None:
+        return None
+    return {
+        "change": plain(IntrinsicsChange.of(found.change.tolist())),
+        "sigma": plain(IntrinsicsChange.of(found.sigma.tolist())),
+        "chi_square": found.chi_square,
+        "contradicts": found.contradicts(),
+    }
+
+
+def run_settings(config: Any) -> dict[str, Any]:
+    """The settings that determine the result of a run, from nerfstudio's trainer configuration."""
+    chosen = {name: plain(getattr(config, name)) for name in _SETTINGS if hasattr(config, name)}
+    return {
+        **chosen,
+        "recommended_steps": RECOMMENDED_STEPS.get(config.method_name),
+        "data": str(config.pipeline.datamanager.data),
+        "rays": config.pipeline.datamanager.train_num_rays_per_batch,
+        "intrinsics_change": plain(config.pipeline.datamanager.dataparser.intrinsics_change),
+        "model": plain(config.pipeline.model),
+    }
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that do the computation."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def _device(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{device.type} ({platform.machine()})"
+
+
+# The object cut out of a surface: what `sl-export --object-only` leaves of it.
+
+
+@dataclass(frozen=True)
+class ObjectCut:
+    """A mesh without surroundings; areas in the square of the scan's unit."""
+
+    kept: Bool[ndarray, "f"]  # triangles of the mesh that was cut
+    area_before: float
+    area_removed: float
+    planes: tuple[PlaneFinding, ...]  # all that were judged
+    removed: tuple[PlaneFinding, ...]  # those that were removed
+
+
+def separate_scan(scan: Scan, poses: DevicePoses) -> Separation:
+    """The object in the triangulated points of a scan, found as sl-process does. Raises UserError without points."""
+    return separate(_decoded_frames(scan, poses))
+
+
+def cut_object(mesh: Mesh, found: Separation) -> ObjectCut:
+    """Remove planes around the object and what is not connected to it. Raises UserError if nothing is left."""
+    return object_cut(mesh, found, found.keeps(mesh.vertices)[mesh.faces].all(1))
+
+
+def object_cut(mesh: Mesh, found: Separation, kept: Bool[ndarray, "f"]) -> ObjectCut:
+    """What it means to keep these triangles. Raises UserError if there are none."""
+    if not kept.any():
+        raise UserError(
+            "--object-only leaves nothing of the surface\n"
+            "    cause:  the surface is far from the scan's decoded points: wrong poses, or an unfinished training\n"
+            "    remedy: look at the run in ns-viewer, or leave --object-only out"
+        )
+    areas = mesh.face_areas()
+    removed = tuple(plane.finding for plane in found.surroundings)
+    return ObjectCut(kept, float(areas.sum()), float(areas[~kept].sum()), found.findings, removed)
+
+
+def planes_below(found: Separation, S_scene_world: Similarity) -> Planes:
+    """Normals and offsets, in the scene, of the planes above which the object is: what belongs to a plane is below."""
+    planes: Planes = []
+    for one in found.surroundings:
+        plane = one.finding.plane
+        normal = S_scene_world.R @ plane.normal
+        offset = S_scene_world.scale * (plane.offset + one.tolerance) + float(normal @ S_scene_world.t)
+        planes.append((normal, offset))
+    return planes
+
+
+def _decoded_frames(scan: Scan, poses: DevicePoses) -> list[DecodedFrame]:
+    """All frames that have coordinates, thinned as they are read."""
+    frames = []
+    for k, frame in enumerate(track(scan.frames, "object only")):
+        coords = frame.read_coords()
+        if np.isfinite(coords).all(-1).any():
+            whole = DecodedFrame(
+                frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k], coords,
+                frame.read_mask(),
+            )  # fmt: skip
+            frames.append(whole.thinned(SEPARATION_DEFAULTS.pixels_per_frame))
+    if not frames:
+        raise UserError(
+            f"{scan.root}: no frame has decoded coordinates, so --object-only cannot find the object\n"
+            "    cause:  the scan has images and poses only\n    remedy: leave --object-only out"
+        )
+    return frames
+
+
+# The surface of a trained run, as an export wants it: observed, filled, cut out, or closed.
+
+_SAME = 0.01  # of an edge: vertices of two extractions that are so near are the same one
+
+
+@dataclass(frozen=True)
+class ExtractedSurface:
+    """The surface in the scan's world and unit, and what became of the whole zero level."""
+
+    marked: MarkedMesh
+    trimmed: Trimmed | None  # None: nothing was compared with the frames
+    filled: FilledHoles | None  # None: holes were left open
+    cut: ObjectCut | None  # None: surroundings were not looked for
+    other_pieces: int  # that were removed for not being the largest one
+    extraction_seconds: float
+
+
+def build_surface(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
+    """Extract the zero level, and keep of it what the settings say.
+
+    Raises UserError if there is no surface, or if no part of it was observed.
+    """
+    surface = _solid(model, settings) if settings.watertight else _open_surface(model, settings)
+    if not settings.largest_component:
+        return surface
+    pieces = int(surface.marked.mesh.component_of_faces().max(initial=-1)) + 1
+    return replace(surface, marked=surface.marked.largest_component(), other_pieces=pieces - 1)
+
+
+def _open_surface(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
+    start, world = time.perf_counter(), model.S_scene_world.inverse()
+    whole = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(world)
+    seconds = time.perf_counter() - start
+    trimmed = filled = cut = None
+    marked = MarkedMesh(whole, np.zeros(len(whole.vertices), dtype=bool))
+    if not settings.keep_unobserved:
+        trimmed = trim_to_observed(whole, model.scan, model.poses())
+        if settings.largest_hole is not None:
+            filled = fill_holes(whole, trimmed, settings.largest_hole)
+        marked = MarkedMesh(whole, ~trimmed.observed).with_faces(trimmed.kept if filled is None else filled.kept)
+    if settings.object_only:
+        cut = cut_object(marked.mesh, separate_scan(model.scan, model.poses()))
+        marked = marked.with_faces(cut.kept)
+    return ExtractedSurface(marked, trimmed, filled, cut, 0, seconds)
+
+
+def _solid(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
+    """Closed pieces of the zero level, in each of which frames observed something.
+
+    What nobody observed is cut off flat where it leaves the convex hull of what was observed, the planes around the
+    object, or the box of the field: there the field knows nothing, and bulges.
+    """
+    scan, poses, world = model.scan, model.poses(), model.S_scene_world.inverse()
+    start = time.perf_counter()
+    whole = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(world)
+    first = time.perf_counter() - start
+    trimmed = trim_to_observed(whole, scan, poses)
+    real = trimmed.observed & whole.corners_of(trimmed.kept)
+    planes, found = [], separate_scan(scan, poses) if settings.object_only else None
+    if found is not None:
+        real &= found.keeps(whole.vertices)
+        planes = planes_below(found, model.S_scene_world)
+    planes += hull_planes(model.S_scene_world.points(whole.vertices[real]), 2 / settings.resolution)
+    start = time.perf_counter()
+    field = ClosedField(model.sdf, planes, model.device)
+    solid = extract_mesh(field, settings.resolution, device=model.device).mapped(world)
+    second = time.perf_counter() - start
+    observed = _same_vertices(solid, whole, real)
+    kept = _pieces_with(solid, observed[solid.faces].all(1))
+    cut = None if found is None else object_cut(solid, found, kept)
+    return ExtractedSurface(MarkedMesh(solid, ~observed).with_faces(kept), trimmed, None, cut, 0, first + second)
+
+
+def _same_vertices(mesh: Mesh, other: Mesh, chosen: Bool[ndarray, "w"]) -> Bool[ndarray, "v"]:
+    """Vertices of a mesh that are also chosen vertices of another one, extracted on the same grid."""
+    if not chosen.any():
+        return np.zeros(len(mesh.vertices), dtype=bool)
+    distance, _ = KDTree(other.vertices[chosen]).query(mesh.vertices)
+    return np.asarray(distance < _SAME * other.edge_length())
+
+
+def _pieces_with(mesh: Mesh, chosen: Bool[ndarray, "f"]) -> Bool[ndarray, "f"]:
+    """All triangles of the connected pieces that have some of the chosen ones."""
+    piece = mesh.component_of_faces()
+    return np.bincount(piece, chosen.astype(float))[piece] > 0
+
 
 _ROUNDING = 1e-6  # of single precision, relative to the largest number
 
@@ -40,7 +355,7 @@ class Exported:
 
     mesh: Mesh
     properties: VertexProperties  # of the mesh's vertices
-    surface: Surface  # before it was decimated
+    surface: ExtractedSurface  # before it was decimated
     decimated: Decimated | None
     colours: Colours | None  # of the surface before it was decimated; None: no picture without the pattern
     textured: Textured | None  # None: no texture was asked for

@@ -5,10 +5,22 @@ faults; or a folder on disk.
 """
 
 from sl_nerfstudio.errors import Fault, ScanError
-from sl_nerfstudio.scan.check.folder import check_scan, require_valid
-from sl_nerfstudio.scan.file_error import FileError
-from sl_nerfstudio.scan.measured_length import measured_length
-from sl_nerfstudio.scan.pose_files import (
+from sl_nerfstudio.scan.check import check_scan, require_valid
+from sl_nerfstudio.scan.document import FileError
+from sl_nerfstudio.scan.read import read_scan
+from sl_nerfstudio.scan.types import (
+    UNITS,
+    Frame,
+    GroundTruth,
+    PickedPixel,
+    PoseSigma,
+    Scale,
+    ScaleBar,
+    Scan,
+    measured_length,
+)
+from sl_nerfstudio.scan.write import (
+    ScanWriter,
     read_devices,
     read_ground_truth,
     read_pose_sigmas,
@@ -16,9 +28,6 @@ from sl_nerfstudio.scan.pose_files import (
     read_unplaced,
     write_transforms,
 )
-from sl_nerfstudio.scan.reading import read_scan
-from sl_nerfstudio.scan.types import UNITS, Frame, GroundTruth, PickedPixel, PoseSigma, Scale, ScaleBar, Scan
-from sl_nerfstudio.scan.writing import ScanWriter
 
 __all__ = [
     "UNITS",

@@ -2,13 +2,117 @@
 
 import json
 import math
+import os
+import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
-from sl_nerfstudio.scan.file_error import FileError, read_bytes
-from sl_nerfstudio.scan.problem import Faults, Problem
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.errors import Fault, UserError
+
+# The error for a file that cannot be used, and the functions that open files and raise it.
+
+MAX_FILE_BYTES = 4 << 30  # far larger than any image or coordinate file of a scan
+
+
+class FileError(UserError):
+    """A file that cannot be used; problem, likely cause and remedy are separate, so that a check can list them."""
+
+    def __init__(self, path: Path, problem: str, cause: str, remedy: str) -> None:
+        """All in plain words; `problem` continues a sentence that starts with the file's name."""
+        super().__init__(f"{path}: {problem}\n    cause:  {cause}\n    remedy: {remedy}")
+        self.path, self.problem, self.cause, self.remedy = path, problem, cause, remedy
+
+
+def check_file(path: Path) -> int:
+    """Size in bytes of a regular file that is not empty. Raises FileError for anything else."""
+    try:
+        status = os.stat(path)
+    except FileNotFoundError as error:
+        raise FileError(
+            path, "is missing", "it was moved, renamed or never written, or its name differs in upper and lower case",
+            "restore it or correct the path",
+        ) from error  # fmt: skip
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be opened ({error})", "a broken link or path", "correct the path") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise FileError(path, "is not a file", "there is a folder, a device or a pipe", "correct the path")
+    if status.st_size == 0:
+        raise FileError(
+            path,
+            "is empty (0 bytes)",
+            "writing it was interrupted, for example by a full disk",
+            "copy or export this file again",
+        )
+    if status.st_size > MAX_FILE_BYTES:
+        raise FileError(
+            path,
+            f"is {status.st_size >> 30} GiB large",
+            "it is not a file of a scan",
+            "correct the path or write the file again",
+        )
+    return status.st_size
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file. Raises FileError if it is missing, empty, not a regular file or not readable."""
+    check_file(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: Path, error: OSError) -> FileError:
+    """The FileError for a file that exists but cannot be opened."""
+    return FileError(
+        path,
+        f"cannot be read ({error.strerror})",
+        "missing permissions or a failing disk",
+        "change its permissions, or copy it from a backup",
+    )
+
+
+# What is wrong with a value, and the collection of everything that is wrong with a folder.
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong, the likely cause and the remedy; the caller knows the place."""
+
+    problem: str
+    cause: str
+    remedy: str
+
+
+@dataclass
+class Faults:
+    """Collects the faults of one folder."""
+
+    found: list[Fault] = field(default_factory=list)
+    _known: set[Fault] = field(default_factory=set)  # the same; a scan may have very many
+
+    def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
+        """Add a problem, once. `file` is relative to the folder; `key` is a field in it."""
+        self._add(Fault(file, frame, key, problem.problem, problem.cause, problem.remedy))
+
+    def take(self, others: "Faults") -> None:
+        """Add those of another collection, once."""
+        for fault in others.found:
+            self._add(fault)
+
+    def _add(self, fault: Fault) -> None:
+        if fault not in self._known:
+            self._known.add(fault)
+            self.found.append(fault)
+
 
 TRANSFORMS = "transforms.json"
 MAX_BYTES = 256 << 20
@@ -156,3 +260,219 @@ def _not_finite(number: float) -> Problem:
 def _name(value: Any) -> str:
     kinds = {list: "a list", str: "a text", bool: "true or false", type(None): "null"}
     return kinds.get(type(value), "a number")
+
+
+# Reads keys of a JSON object and checks their types; what is wrong goes to a collection of faults.
+
+_ALIKE = 0.85  # similarity of two words, as difflib counts it, from which one is the other misspelt
+
+
+@dataclass(frozen=True)
+class Fields:
+    """An object in transforms.json and where it is; `read_*` return None after adding a fault.
+
+    A number that is not finite gives None without a fault: `document_faults` lists it.
+    """
+
+    record: dict[str, Any]
+    faults: Faults
+    file: str
+    frame: str | None = None
+    prefix: str = ""
+
+    def fault(self, key: str, problem: str, cause: str, remedy: str) -> None:
+        """Add a fault at `key`."""
+        self.faults.add(Problem(problem, cause, remedy), self.file, self.frame, self.prefix + key)
+
+    def read_number(self, key: str, default: float | None = None) -> float | None:
+        """A finite number; `default` where the key is absent, a fault if there is no default."""
+        if key not in self.record and default is not None:
+            return default
+        value = self._get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return self._wrong_type(key, value, "a number")
+        try:
+            number = float(value)
+        except OverflowError:
+            return self._wrong_type(key, value, "a number of reasonable size")
+        return number if math.isfinite(number) else None
+
+    def read_count(self, key: str) -> int | None:
+        """A whole number greater than 0."""
+        number = self.read_number(key)
+        if number is None:
+            return None
+        if number < 1 or number != int(number):
+            self.fault(
+                key, f"is {number:g}, not a whole number greater than 0", "a typing error", "give the size in pixels"
+            )
+            return None
+        return int(number)
+
+    def read_text(self, key: str) -> str | None:
+        """A text that is not empty."""
+        value = self._get(key)
+        if value is None:
+            return None
+        if not isinstance(value, str) or not value:
+            return self._wrong_type(key, value, "a text")
+        return value
+
+    def read_optional_text(self, key: str) -> str | None:
+        """A text; None without a fault where the key is absent or null."""
+        return None if self.record.get(key) is None else self.read_text(key)
+
+    def read_flag(self, key: str) -> bool | None:
+        """True or false."""
+        value = self._get(key)
+        if value is None or isinstance(value, bool):
+            return value
+        return self._wrong_type(key, value, "true or false")
+
+    def read_choice(self, key: str, choices: Sequence[str], cause: str) -> str | None:
+        """One of the texts in `choices`."""
+        value = self.read_text(key)
+        if value is not None and value not in choices:
+            self.fault(key, f"is {value!r}", cause, f"give one of {', '.join(choices)}")
+            return None
+        return value
+
+    def read_section(self, key: str) -> "Fields | None":
+        """An object inside this one."""
+        value = self._get(key)
+        if value is None:
+            return None
+        if not isinstance(value, dict):
+            return self._wrong_type(key, value, "an object { .. }")
+        return Fields(value, self.faults, self.file, self.frame, f"{self.prefix}{key}.")
+
+    def read_numbers(self, key: str, count: int) -> list[float] | None:
+        """A list of `count` finite numbers."""
+        value = self._get(key)
+        if value is None:
+            return None
+        numbers = value if isinstance(value, list) else []
+        right = len(numbers) == count and all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+        if not right:
+            return self._wrong_type(key, value, f"a list of {count} numbers")
+        try:
+            found = [float(x) for x in numbers]
+        except OverflowError:
+            return self._wrong_type(key, value, f"a list of {count} numbers of reasonable size")
+        return found if all(map(math.isfinite, found)) else None
+
+    def read_matrix(self, key: str) -> Float64[ndarray, "rows columns"] | None:
+        """A list of rows of finite numbers."""
+        value = self._get(key)
+        if value is None:
+            return None
+        rows = value if isinstance(value, list) else []
+        numbers = [x for row in rows if isinstance(row, list) for x in row]
+        regular = rows and all(isinstance(row, list) and len(row) == len(rows[0]) > 0 for row in rows)
+        if not regular or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers):
+            return self._wrong_type(key, value, "a list of four rows of four numbers")
+        try:
+            matrix = np.array(rows, dtype=np.float64)
+        except OverflowError:
+            return self._wrong_type(key, value, "a list of four rows of four numbers of reasonable size")
+        return matrix if np.isfinite(matrix).all() else None
+
+    def check_spelling(self, known: Sequence[str]) -> None:
+        """Add a fault for each key that looks like a misspelt one of `known` that is absent."""
+        absent = [(key, set(key)) for key in known if key not in self.record]
+        for key in self.record:
+            similar = [] if key in known else [name for name, letters in absent if _may_be_close(key, name, letters)]
+            close = get_close_matches(key, similar, n=1, cutoff=_ALIKE) if similar else []
+            if close:
+                self.fault(key, "is not a key of a scan", "it is misspelt", f"did you mean {close[0]!r}?")
+
+    def _get(self, key: str) -> Any:
+        if key not in self.record:
+            self.fault(
+                key,
+                "is missing",
+                "it was removed, or the program that wrote the file does not know this format",
+                "add it",
+            )
+            return None
+        if self.record[key] is None:
+            self._wrong_type(key, None, "a value")
+        return self.record[key]
+
+    def _wrong_type(self, key: str, value: Any, wanted: str) -> None:
+        text = "null" if value is None else repr(value)
+        shown = text if len(text) <= 40 else text[:37] + "..."
+        self.fault(key, f"is {shown} instead of {wanted}", "wrong type", f"give {wanted}")
+
+
+def _may_be_close(key: str, name: str, letters: set[str]) -> bool:
+    """False where two words cannot be `_ALIKE`: sizes or letters differ too much. A file may have very many keys."""
+    fewest = _ALIKE * (len(key) + len(name)) / 2  # letters that both must have in the same order
+    return fewest <= min(len(key), len(name)) and len(letters.difference(key)) <= len(name) - fewest
+
+
+# Paths in transforms.json: relative, and inside the folder even after links are followed.
+
+
+def read_path(fields: Fields, key: str, root: Path) -> Path | None:
+    """The absolute path under `key`, inside `root`; None after adding a fault."""
+    text = fields.read_text(key)
+    if text is None:
+        return None
+    path = resolve_inside(root, text)
+    if isinstance(path, Path):
+        return path
+    fields.faults.add(path, fields.file, fields.frame, fields.prefix + key)
+    return None
+
+
+def resolve_inside(root: Path, text: str) -> Path | Problem:
+    """Absolute path of `text` below `root`, or why it must not be used. The file itself need not exist.
+
+    The returned path keeps links inside the folder as they are; it is not resolved.
+    """
+    windows = PureWindowsPath(text)
+    if "\0" in text or _not_encodable(text):
+        return Problem("contains characters that no file name can have", "the text is damaged", "correct the path")
+    if text.startswith("/") or windows.drive:
+        return Problem(
+            f"is absolute ({text})",
+            "it is valid on one machine only",
+            "give the path relative to the scan folder",
+        )
+    if ".." in windows.parts:
+        return Problem(
+            f"leaves the scan folder ({text})",
+            "the files are elsewhere, or the folder was made to read other people's files",
+            "put the files inside the folder and give the path without '..'",
+        )
+    path = root / text
+    if "\\" in text and not path.exists():
+        return Problem(f"has backslashes ({text})", "it was written on Windows", "use / between folders")
+    try:
+        real, real_root = os.path.realpath(path, strict=True), os.path.realpath(root)
+    except FileNotFoundError:
+        return path  # reading it says that it is missing
+    except OSError as error:
+        return Problem(
+            f"cannot be followed ({text}: {error.strerror})",
+            "a link to itself, a file where a folder should be, or missing permissions",
+            "put the file itself there",
+        )
+    if os.path.commonpath([real, real_root]) != real_root:
+        return Problem(
+            f"is a link out of the scan folder ({text})",
+            "the files are elsewhere and were linked instead of copied",
+            "copy the files into the folder",
+        )
+    return path
+
+
+def _not_encodable(text: str) -> bool:
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        return True
+    return False

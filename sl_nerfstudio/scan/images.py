@@ -1,21 +1,28 @@
 """Image files of a scan: grey or RGB, 8 or 16 bit, read exactly as stored or not at all."""
 
+import math
 import struct
 import warnings
+import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BufferedReader, BytesIO
+from io import BufferedIOBase, BufferedReader, BytesIO
+from numbers import Real
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
+from numpy.lib import format as npy
 from PIL import Image
 from PIL.ImageFile import ImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from sl_nerfstudio.scan.file_error import FileError, check_file, read_bytes, unreadable
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.scan.document import FileError, check_file, read_bytes, unreadable
 
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
@@ -229,3 +236,284 @@ def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
             "save it as PNG, grey or RGB, with 8 or 16 bits",
         )
     return np.ascontiguousarray(pixels[..., ::-1])
+
+
+# Photographs as cameras and phones write them: turned as their EXIF tag says, HEIC too; raw files are refused.
+#
+# A scan folder itself holds only images that need no turning (`images.py`).
+
+PHONE = (".heic", ".heif")
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", *PHONE)
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw", ".x3f", ".raw")
+Pixels = UInt8[ndarray, "..."] | UInt16[ndarray, "..."]  # (h, w) or (h, w, 3)
+_EXIF_IFD = 0x8769
+_TRANSPOSED = (5, 6, 7, 8)  # EXIF orientations that exchange rows and columns
+# Mosaics of a colour filter.
+_TILE = 16  # pixels
+_BRIGHT = 0.3  # of the bright tiles: darker ones are not looked at
+_LEAST_TILES = 20
+_CONTRAST = 0.08  # of the tile's mean: between the brightest and the darkest of its four pixel classes
+_GREENS = 0.3  # of that contrast: between the two green classes
+_SHARE = 0.7  # of the tiles
+
+
+def read_photograph(path: Path) -> Pixels:
+    """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit, turned as the EXIF tag says.
+
+    Raises FileError for what cannot be read, and for raw files, with the command that converts them.
+    """
+    if path.suffix.lower() in RAW:
+        raise raw_file(path)
+    if path.suffix.lower() in PHONE:
+        return np.asarray(_open_heif(path).to_pillow().convert("RGB"))
+    pixels, orientation = read_pixels_and_orientation(path)
+    return turned(pixels, orientation)
+
+
+def photograph_header(path: Path) -> ImageHeader:
+    """Size and kind after turning, without decoding the pixels. Raises FileError like `read_photograph`."""
+    if path.suffix.lower() in RAW:
+        raise raw_file(path)
+    if path.suffix.lower() in PHONE:
+        w, h = _open_heif(path).size
+        return ImageHeader(w, h, "RGB", 8)
+    header, orientation = read_header_and_orientation(path)
+    if orientation in _TRANSPOSED:
+        return ImageHeader(header.h, header.w, header.mode, header.bits)
+    return header
+
+
+def turned_by_tag(path: Path) -> bool:
+    """Whether an EXIF tag says that the pixels are stored turned or mirrored. Raises FileError if it is no image."""
+    return path.suffix.lower() not in PHONE and read_header_and_orientation(path)[1] != 1
+
+
+def turned(pixels: Pixels, orientation: int) -> Pixels:
+    """Pixels as they are to be shown, for an EXIF orientation from 1 to 8."""
+    if orientation in _TRANSPOSED:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
+
+
+def raw_file(path: Path) -> FileError:
+    """The error of a camera's raw file."""
+    return FileError(
+        path,
+        "is a raw file of a camera",
+        "it holds the sensor's values, which each program develops differently",
+        f'develop all of them in the same way, for example with LibRaw\'s "dcraw_emu -T -W {path.name}" (16-bit TIFF: '
+        "add -6), or save JPEG or PNG in the camera",
+    )
+
+
+def is_mosaic(pixels: Pixels) -> bool:
+    """Whether a grey image is the raw mosaic of a colour filter (Bayer).
+
+    Then the same two of the four pixels of every 2 x 2 square, on one diagonal, are equally bright (green), and the
+    others are not, in nearly all bright parts of the image.
+    """
+    if pixels.ndim != 2 or min(pixels.shape) < 2 * _TILE:
+        return False
+    grey = as_grey(pixels)
+    h, w = (size // _TILE * _TILE for size in grey.shape)
+    tiles = grey[:h, :w].reshape(h // _TILE, _TILE // 2, 2, w // _TILE, _TILE // 2, 2).mean((1, 4))
+    classes = tiles.transpose(0, 2, 1, 3).reshape(-1, 4)  # (0, 0), (0, 1), (1, 0), (1, 1) of every tile
+    mean = classes.mean(1)
+    classes = classes[(mean > _BRIGHT * np.percentile(mean, 95)) & (mean > 0)]
+    if len(classes) < _LEAST_TILES:
+        return False
+    contrast = np.ptp(classes, axis=1)
+    apart = contrast > _CONTRAST * classes.mean(1)
+    for a, b in ((0, 3), (1, 2)):
+        greens = np.abs(classes[:, a] - classes[:, b]) < _GREENS * contrast
+        others = [k for k in range(4) if k not in (a, b)]
+        brighter = np.sign(classes[:, [a, b]].mean(1) - classes[:, others].mean(1))
+        if (apart & greens).mean() > _SHARE and abs(brighter[apart].mean()) > _SHARE:
+            return True
+    return False
+
+
+def refuse_mosaic(path: Path) -> None:
+    """Raise FileError if an image is a raw mosaic; one that cannot be read is not looked at."""
+    try:
+        mosaic = path.suffix.lower() not in PHONE and is_mosaic(read_pixels_and_orientation(path)[0])
+    except FileError:
+        return
+    if mosaic:
+        raise FileError(
+            path,
+            "is the raw mosaic of a colour filter (Bayer), not a picture",
+            "the camera's program saved the sensor's values",
+            "convert all images, with the letters that the camera's maker states (RG, GR, BG or GB), by: python -c "
+            f"\"import cv2; cv2.imwrite('grey.png', cv2.cvtColor(cv2.imread('{path.name}', -1), "
+            'cv2.COLOR_BayerRG2GRAY))"; if it is none, --not-mosaic says so',
+        )
+
+
+def _open_heif(path: Path):
+    """A phone's picture, already turned. Raises FileError, and UserError if the reader is not installed."""
+    check_file(path)
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise UserError(
+            f"{path}: is a HEIC file, for which a reader is missing\n    cause:  pillow-heif is not installed\n"
+            "    remedy: pip install 'sl-nerfstudio[phone]', or set the phone to \"most compatible\" (JPEG)"
+        ) from error
+    try:
+        return pillow_heif.open_heif(str(path))
+    except (ValueError, OSError, EOFError, RuntimeError, SyntaxError) as error:
+        raise FileError(
+            path,
+            f"cannot be read as HEIC ({error})",
+            "it is truncated, damaged, or another kind of file",
+            "copy it again, or export it as JPEG",
+        ) from error
+
+
+def exif_numbers(path: Path) -> dict[int, float]:
+    """All tags of the EXIF data whose value is a number, by their codes; empty if there are none.
+
+    Raises FileError if the file is no photograph.
+    """
+    if path.suffix.lower() in RAW:
+        raise raw_file(path)
+    exif = Image.Exif()
+    try:
+        if path.suffix.lower() in PHONE:
+            exif.load(_open_heif(path).info.get("exif") or b"")
+        else:
+            photograph_header(path)
+            with Image.open(path) as image:
+                exif = image.getexif()
+        tags = {**exif, **exif.get_ifd(_EXIF_IFD)}
+        return {int(key): float(value) for key, value in tags.items() if _is_number(value)}
+    except (OSError, ValueError, SyntaxError, TypeError, KeyError, struct.error, ZeroDivisionError):
+        return {}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(float(value))
+
+
+# Coordinate files of a scan: float32 (H, W, 2), in an .npz under `coords` or as plain .npy, never pickled.
+
+KEY = "coords"
+_MAX_MEMBERS = 64
+_EXPORT_AGAIN = "write it with numpy.savez_compressed(file, coords=array) from a float32 array of shape (H, W, 2)"
+ARRAY_DAMAGE = (
+    OSError,
+    ValueError,
+    EOFError,
+    RuntimeError,
+    NotImplementedError,
+    KeyError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged .npy or .npz may raise."""
+
+
+def read_coords_size(path: Path) -> tuple[int, int]:
+    """(w, h) of a coordinate file, from its header alone. Raises FileError if it is not of the required kind."""
+    with _open_member(path) as (stream, size):
+        return _read_head(path, stream, size)
+
+
+def read_coords(path: Path) -> Float32[ndarray, "h w 2"]:
+    """Pattern coordinates (x_p, y_p) of every pixel, as stored.
+
+    Raises FileError if the file is missing, damaged, pickled, or not float32 of shape (H, W, 2); the header is
+    checked against the size of the file before any memory is allocated.
+    """
+    with _open_member(path) as (stream, size):
+        _read_head(path, stream, size)
+    with _open_member(path) as (stream, _):
+        coords = npy.read_array(stream, allow_pickle=False)
+    return np.ascontiguousarray(coords, dtype=np.float32)
+
+
+def encode_coords(coords: Float32[ndarray, "h w 2"]) -> bytes:
+    """A compressed .npz file of the coordinates."""
+    buffer = BytesIO()
+    np.savez_compressed(buffer, **{KEY: coords})
+    return buffer.getvalue()
+
+
+@contextmanager
+def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
+    """The .npy stream in `path` and its length in bytes; any damage becomes a FileError."""
+    size = check_file(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            with path.open("rb") as stream:
+                yield stream, size
+        elif path.suffix.lower() == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                member = _member(path, archive)
+                with archive.open(member) as stream:
+                    yield stream, member.file_size  # type: ignore[misc]
+        else:
+            raise FileError(path, "is neither .npz nor .npy", "it is an array in another format", _EXPORT_AGAIN)
+    except FileError:
+        raise
+    except ARRAY_DAMAGE as error:
+        raise FileError(
+            path,
+            f"cannot be read ({error})",
+            "the file is truncated, damaged or not what its name says",
+            _EXPORT_AGAIN,
+        ) from error
+
+
+def _member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+    members = archive.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise FileError(path, f"holds {len(members)} members", "it is not a coordinate file", _EXPORT_AGAIN)
+    found = [member for member in members if member.filename == f"{KEY}.npy"]
+    if len(found) != 1:
+        names = ", ".join(repr(member.filename.removesuffix(".npy")) for member in members[:5]) or "nothing"
+        raise FileError(
+            path,
+            f"must hold exactly one array called {KEY!r}, but holds {names}",
+            "it was saved under another key, or without a key (numpy then calls it 'arr_0')",
+            _EXPORT_AGAIN,
+        )
+    return found[0]
+
+
+def _read_head(path: Path, stream: BufferedIOBase, size: int) -> tuple[int, int]:
+    """Check the header of a .npy stream of `size` bytes in total; return (w, h)."""
+    version = npy.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise FileError(path, f"is of .npy version {version}", "it does not hold plain numbers", _EXPORT_AGAIN)
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    if dtype.hasobject:
+        raise FileError(
+            path,
+            "holds pickled Python objects, which are never loaded",
+            "it was saved from an array of dtype object; such a file can run code when it is loaded",
+            _EXPORT_AGAIN,
+        )
+    if dtype.kind != "f" or dtype.itemsize != 4:
+        raise FileError(
+            path, f"holds {dtype} instead of float32", "it was saved from an array of another type", _EXPORT_AGAIN
+        )
+    if len(shape) != 3 or shape[2] != 2 or 0 in shape:
+        cause = "the channels come first" if len(shape) == 3 and shape[0] == 2 else "it is another kind of array"
+        raise FileError(path, f"has the shape {shape} instead of (H, W, 2)", cause, _EXPORT_AGAIN)
+    expected = math.prod(shape) * dtype.itemsize + stream.tell()
+    if size != expected:
+        raise FileError(
+            path,
+            f"has {size} bytes, but its header says {expected}",
+            "the file is truncated, or its header is wrong",
+            _EXPORT_AGAIN,
+        )
+    return shape[1], shape[0]

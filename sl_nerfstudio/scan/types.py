@@ -1,16 +1,152 @@
 """What a scan folder holds, as frozen dataclasses; files are opened only by the `read_*` methods."""
 
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
-from sl_nerfstudio.scan.coordinates import read_coords
-from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.errors import Fault, ScanError
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
+from sl_nerfstudio.scan.document import TRANSFORMS, Faults, Fields, Problem
+from sl_nerfstudio.scan.images import MAX_PIXELS, as_grey, read_coords, read_image
+
+# Cameras and projectors in transforms.json, and whether their numbers can be right.
+
+REQUIRED = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+DISTORTION = ("k1", "k2", "p1", "p2")
+CAMERA_KEYS = ("camera_model", *REQUIRED, *DISTORTION)
+PROJECTOR_KEYS = ("model", *REQUIRED, *DISTORTION, "pattern_path")
+_UNSUPPORTED = ("k3", "k4", "k5", "k6")
+_NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: fields of view of 0.57 and 157 degrees
+_ROUND_TRIP_PX = 1e-3
+_LEAST_STRETCH, _MOST_STRETCH = (
+    0.2,
+    2.0,
+)  # of distances from the principal point: fisheye lenses shrink them, none doubles
+
+
+def read_device(fields: Fields, kind: str) -> Device | None:
+    """The device that `fields` describes; `kind` is "camera" or "projector". None after adding faults."""
+    key = "camera_model" if kind == "camera" else "model"
+    choices = ("OPENCV",) if kind == "camera" else ("OPENCV", "DOE")
+    model = fields.read_choice(key, choices, "it is a lens model that this format does not have")
+    w, h = fields.read_count("w"), fields.read_count("h")
+    values = {k: fields.read_number(k) for k in REQUIRED[2:]}
+    values |= {k: fields.read_number(k, default=0.0) for k in DISTORTION}
+    for k in _UNSUPPORTED:
+        if fields.read_number(k, default=0.0):
+            fields.fault(
+                k, "is not 0", "the lens model has more terms than k1, k2, p1, p2",
+                "calibrate with these four, or undistort the images",
+            )  # fmt: skip
+    numbers = {k: v for k, v in values.items() if v is not None}
+    if model is None or w is None or h is None or len(numbers) != len(values):
+        return None
+    fl_x, fl_y, cx, cy, k1, k2, p1, p2 = numbers.values()
+    device = Device(w, h, fl_x, fl_y, cx, cy, k1, k2, p1, p2, "DOE" if model == "DOE" else "OPENCV")
+    problems = list(device_problems(device))
+    for field, problem in problems:
+        fields.faults.add(problem, fields.file, fields.frame, fields.prefix + field)
+    return None if problems else device
+
+
+def device_problems(device: Device) -> Iterator[tuple[str, Problem]]:
+    """(key, problem) of every number of a device that cannot be right."""
+    if device.w * device.h > MAX_PIXELS:
+        yield (
+            "w",
+            Problem(
+                f"times h is {device.w * device.h} pixels", "a typing error", "give the size of the image in pixels"
+            ),
+        )
+        return
+    focal_problems = list(_focal_problems(device))
+    yield from focal_problems
+    for key, size, centre in (("cx", device.w, device.cx), ("cy", device.h, device.cy)):
+        if not -2 * size <= centre <= 3 * size:  # lens shift moves it outside the image, but not that far
+            yield (
+                key,
+                Problem(
+                    f"is {centre:g}, far outside an image of {size} pixels",
+                    "the intrinsics are those of another resolution or in another unit",
+                    "give the principal point in pixels of this image",
+                ),
+            )
+    if not focal_problems and any(getattr(device, k) for k in DISTORTION):
+        yield from _distortion_problems(device)
+
+
+def _focal_problems(device: Device) -> Iterator[tuple[str, Problem]]:
+    for key, focal in (("fl_x", device.fl_x), ("fl_y", device.fl_y)):
+        size = max(device.w, device.h)
+        if focal <= 0:
+            yield (
+                key,
+                Problem(
+                    f"is {focal:g}",
+                    "it was not filled in, or has the sign of OpenGL's projection",
+                    "give the focal length in pixels, a number greater than 0",
+                ),
+            )
+        elif not _WIDEST * size <= focal <= _NARROWEST * size:
+            yield (
+                key,
+                Problem(
+                    f"is {focal:g} pixels, which is impossible for an image of {size} pixels",
+                    "it was given in millimetres, as a fraction of the image, or for another resolution",
+                    "give the focal length in pixels of this image",
+                ),
+            )
+
+
+def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
+    """Every pixel must return to its place when it is undistorted and distorted again, from a place not far away."""
+    x, y = torch.meshgrid(
+        torch.linspace(0, device.w, 33, dtype=torch.float64),
+        torch.linspace(0, device.h, 33, dtype=torch.float64),
+        indexing="xy",
+    )
+    uv = torch.stack([x, y], -1)
+    # The distortion does not depend on the model (pinhole or DOE); a pinhole has no limit at 90 degrees.
+    intrinsics = Intrinsics.of(replace(device, model="OPENCV"), torch.float64)
+    directions = unproject(intrinsics, uv)
+    again, in_front = project(intrinsics, directions)
+    if not (in_front.all() and ((again - uv).abs() < _ROUND_TRIP_PX).all()):
+        yield (
+            "k1",
+            Problem(
+                "and the other distortion terms fold the image over itself: two directions share a pixel",
+                "the terms are of another model, in another order, or were fitted without points near the corners",
+                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
+            ),
+        )
+        return
+    straight = directions[..., :2] / -directions[..., 2:]
+    bent = (uv - uv.new_tensor([device.cx, device.cy])) / uv.new_tensor([device.fl_x, device.fl_y])
+    stretch = (bent.norm(dim=-1) / straight.norm(dim=-1)).nan_to_num(1.0)
+    extreme = [value for value in (float(stretch.min()), float(stretch.max())) if not _plausible(value)]
+    if extreme:
+        yield (
+            "k1",
+            Problem(
+                f"and the other distortion terms multiply distances from the principal point by {extreme[0]:.2g}",
+                "a slip, terms of another model or in another order, or a fit to too few points; no lens does that",
+                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
+            ),
+        )
+
+
+def _plausible(stretch: float) -> bool:
+    return _LEAST_STRETCH <= stretch <= _MOST_STRETCH
+
 
 FORMAT = 1  # of the scan folder
 
@@ -158,3 +294,196 @@ class GroundTruth:
     mesh_path: Path | None
     poses: DevicePoses | None
     units: str | None  # of both; may be known where the scan's unit is not
+
+
+# The key `scale` of transforms.json: whether lengths are true, and which length was measured.
+
+_KEYS = ("known", "source", "baseline_of", "distance_between", "length")
+_OLD_SOURCE = re.compile(r"baseline of frame (\d+)(?: \((.+)\))?")
+
+
+def read_scale(top: Fields, frames: Sequence[str]) -> Scale | None:
+    """The scale of a scan whose frames have these names; None after adding a fault.
+
+    Scans written before `baseline_of` existed say "baseline of frame 3 (name)" or "baseline of frame 3" in `source`.
+    The name in brackets is used if it is there, else the number, if the names of the frames do not contradict it.
+    """
+    section = top.read_section("scale")
+    if section is None:
+        return None
+    section.check_spelling(_KEYS)
+    known = section.read_flag("known")
+    source = section.read_optional_text("source") if section.record.get("source") != "" else ""
+    baseline_of = section.read_optional_text("baseline_of")
+    bar = _read_bar(section)
+    if known is None:
+        return None
+    if not known and (baseline_of is not None or bar is not None):
+        section.fault(
+            "known", "is false, although a known length is given", "the two keys contradict each other",
+            "set known to true, or remove the length",
+        )  # fmt: skip
+        return None
+    if baseline_of is not None and bar is not None:
+        section.fault(
+            "baseline_of", "is given together with distance_between", "two known lengths can contradict each other",
+            "keep one of them",
+        )  # fmt: skip
+        return None
+    if known and baseline_of is None and bar is None:
+        baseline_of = _old_baseline(section, source or "", frames)
+    return Scale(known, source or "", baseline_of, bar)
+
+
+def check_scale_frames(scale: Scale, cameras: Mapping[str, Device | None], faults: Faults) -> None:
+    """Add a fault for each frame and pixel of the known length that the scan does not have.
+
+    `cameras` holds every frame's camera by name, None where it could not be read.
+    """
+    key = "scale.baseline_of" if scale.bar is None else "scale.distance_between"
+    for name in scale.frames:
+        if name not in cameras:
+            problem = Problem(
+                f"names frame {name!r}, which is not in the scan",
+                "the frame was removed or renamed after the scan was made",
+                f"put the frame back, or remove {key.removeprefix('scale.')}: then all lengths count alike",
+            )
+            faults.add(problem, TRANSFORMS, None, key)
+    for end in () if scale.bar is None else scale.bar.ends:
+        camera, (x, y) = cameras.get(end.frame), end.pixel
+        if camera is not None and not (0 <= x < camera.w and 0 <= y < camera.h):
+            problem = Problem(
+                f"has the pixel ({x:g}, {y:g}), outside the {camera.w} x {camera.h} pixels of frame {end.frame!r}",
+                "it was picked in an image of another size, or x and y are swapped",
+                "give x and y of a pixel of this image",
+            )
+            faults.add(problem, TRANSFORMS, None, key)
+
+
+def scale_record(scale: Scale) -> dict[str, Any]:
+    """The value of `scale`."""
+    record: dict[str, Any] = {"known": scale.known}
+    if scale.source:
+        record["source"] = scale.source
+    if scale.baseline_of is not None:
+        record["baseline_of"] = scale.baseline_of
+    if scale.bar is not None:
+        record["distance_between"] = [{"frame": e.frame, "pixel": [*map(float, e.pixel)]} for e in scale.bar.ends]
+        record["length"] = float(scale.bar.length)
+    return record
+
+
+def _old_baseline(section: Fields, source: str, frames: Sequence[str]) -> str | None:
+    """The frame of a scan that has only `source`; a name that is not among `frames` is returned all the same.
+
+    A number alone says nothing once frames were removed. That shows in names which have numbers of their own.
+    """
+    found = _OLD_SOURCE.search(source)
+    if found is None:
+        return None
+    number, name = int(found[1]), found[2]
+    if name is not None and (name in frames or found[0] == source):
+        return name
+    own = [_last_number(frame) for frame in frames]
+    if number < len(frames) and (own[number] == number or None in own):
+        return frames[number]
+    section.fault(
+        "source",
+        f"names frame number {number}, and it is not certain which one that is"
+        if number < len(frames)
+        else f"names frame number {number}, but there are only {len(frames)} frames",
+        "frames were removed or renamed after the scan was made",
+        "name the frame in baseline_of; if it was removed, take the sentence out: then all lengths count alike",
+    )
+    return None
+
+
+def _last_number(name: str) -> int | None:
+    """7 for frame_00007; None for a name that does not end in a number."""
+    digits = re.search(r"[0-9]{1,9}$", name)
+    return None if digits is None else int(digits[0])
+
+
+def _read_bar(section: Fields) -> ScaleBar | None:
+    """None where the scan has no scale bar, or after adding a fault."""
+    ends, length = section.record.get("distance_between"), section.record.get("length")
+    if ends is None and length is None:
+        return None
+    if ends is None or length is None:
+        section.fault(
+            "length" if length is None else "distance_between", "is missing",
+            "distance_between and length are only valid together", "give both or neither",
+        )  # fmt: skip
+        return None
+    number = section.read_number("length")
+    if number is not None and number <= 0:
+        section.fault("length", f"is {number:g}", "a typing error", "give a length greater than 0")
+        number = None
+    if not isinstance(ends, list) or len(ends) != 2:
+        section.fault("distance_between", "is not a list of two pixels", "wrong type", "see docs/scan-format.md")
+        return None
+    first, second = (_read_end(section, end, f"distance_between[{k}]") for k, end in enumerate(ends))
+    if first is None or second is None or number is None:
+        return None
+    if first == second:
+        section.fault("distance_between", "is twice the same pixel", "a copy", "give two different pixels")
+        return None
+    return ScaleBar((first, second), number)
+
+
+def _read_end(section: Fields, end: Any, key: str) -> PickedPixel | None:
+    if not isinstance(end, dict):
+        section.fault(key, "is not an object { .. }", "wrong type", "see docs/scan-format.md")
+        return None
+    fields = Fields(end, section.faults, section.file, section.frame, f"{section.prefix}{key}.")
+    fields.check_spelling(("frame", "pixel"))
+    name, pixel = fields.read_text("frame"), fields.read_numbers("pixel", 2)
+    return None if name is None or pixel is None else PickedPixel(name, (pixel[0], pixel[1]))
+
+
+# The length of a scale bar, measured by triangulation.
+
+NEAR_PX = 3.0  # how far from a picked pixel coordinates are used
+
+
+def measured_length(scan: Scan, bar: ScaleBar, poses: DevicePoses) -> float:
+    """Distance between the two picked surface points with these `poses` (of all frames), in the unit of the poses.
+
+    Each point lies on the ray through its pixel, at the median depth of what was decoded within NEAR_PX of it.
+    Reads the coordinates of the two frames. Raises ScanError where nothing near a pixel can be triangulated.
+    """
+    first, second = (_surface_point(scan, end, poses) for end in bar.ends)
+    return float(np.linalg.norm(first - second))
+
+
+def _surface_point(scan: Scan, end: PickedPixel, poses: DevicePoses) -> Float64[ndarray, "3"]:
+    index = scan.index_of(end.frame)
+    frame, coords = scan.frames[index], scan.frames[index].read_coords()
+    row, column = np.nonzero(np.isfinite(coords).all(-1))
+    uv = np.stack([column, row], 1) + 0.5
+    near = np.linalg.norm(uv - end.pixel, axis=1) < NEAR_PX
+    camera, projector = Intrinsics.of(frame.camera, torch.float64), Intrinsics.of(scan.projector, torch.float64)
+    T_camera, T_projector = (
+        torch.from_numpy(poses.T_world_camera[index]),
+        torch.from_numpy(poses.T_world_projector[index]),
+    )
+    uv_projector = torch.from_numpy(coords[row[near], column[near]].astype(np.float64))
+    points = triangulate(camera, T_camera, torch.from_numpy(uv[near]), projector, T_projector, uv_projector)
+    depth = points.depth_camera.numpy()
+    depth = depth[np.isfinite(depth)]
+    if not len(depth):
+        raise ScanError([_nothing_near(end)], str(scan.root))
+    origin, direction = pixel_rays(camera, T_camera, torch.tensor([end.pixel], dtype=torch.float64))
+    return (origin + float(np.median(depth)) * direction)[0].numpy()
+
+
+def _nothing_near(end: PickedPixel) -> Fault:
+    x, y = end.pixel
+    return Fault(
+        TRANSFORMS,
+        end.frame,
+        "scale.distance_between",
+        f"has no decoded coordinates within {NEAR_PX:g} pixels of ({x:g}, {y:g})",
+        "the pattern was not decoded there",
+        "pick a pixel on the object where coordinates were decoded",
+    )

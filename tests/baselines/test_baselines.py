@@ -9,11 +9,10 @@ from benchmarks.baselines.depth import drop_islands, triangulated_depth
 from benchmarks.baselines.icp_registration import register
 from benchmarks.baselines.tsdf import TsdfConfig, backprojected, fuse
 from sl_nerfstudio.evaluation.evaluate import score_alignments
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.evaluation.reference import mesh_reference
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise

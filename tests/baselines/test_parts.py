@@ -9,9 +9,9 @@ from benchmarks.baselines.depth import DepthMap, triangulated_depth
 from benchmarks.baselines.icp_registration import RegistrationConfig, register
 from benchmarks.baselines.tsdf import backprojected, depth_maps, fuse, object_size
 from benchmarks.baselines.window_matching import match_windows
-from sl_nerfstudio.decoding.grid.gcn import one_hot, turned_pattern
+from sl_nerfstudio.decoding.grid_graph import one_hot, turned_pattern
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.pattern.codes import code_array
 from sl_nerfstudio.scan import Scan, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -31,8 +31,8 @@ def distorted(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 
 def on_truth(scan: Scan, points: np.ndarray) -> np.ndarray:
     """Distance of points from the true surface."""
-    from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-    from sl_nerfstudio.meshing.mesh_io import read_mesh
+    from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+    from sl_nerfstudio.meshing.files import read_mesh
 
     return IndexedMesh(read_mesh(scan.root / "ground_truth/mesh.ply")).distance(points)
 

@@ -8,7 +8,7 @@ import torch
 from benchmarks.pose_conditioning.problem import Poses, Problem, of_devices, per_frame
 from benchmarks.pose_conditioning.steps import AdamChoice, adam, gauss_newton, normal_matrices, rate_at, whitening
 from sl_nerfstudio.dataparser.dataparser import load_scan
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_ground_truth
 
 

@@ -8,13 +8,16 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.residuals import Linearisation
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, by_kind
+from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, pose, transform
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    inverse,
+    pose,
+    transform,
+)
+from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
 
 BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
 DISK_HEIGHT, DISK_RADIUS = -0.3, 0.9

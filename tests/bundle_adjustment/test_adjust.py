@@ -10,14 +10,24 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
-from sl_nerfstudio.bundle_adjustment.free_parameters import constrained, free_parameters
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import joint_of_prior
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm, prior_equations
-from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.covariance import joint_of_prior
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    PosePrior,
+    PriorTerm,
+    by_kind,
+    constrained,
+    free_parameters,
+    prior_equations,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.bundle_adjustment.unknowns import by_kind
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
-from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    fit_similarity,
+    inverse,
+    log_se3,
+    log_so3,
+)
 
 from .analytic import ExactMaps, disturbed, images_of, matrix_by_kind, rig_of, static_rig
 

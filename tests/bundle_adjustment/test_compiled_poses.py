@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.loops.poses import departures, inverse_poses, moved_poses
+from sl_nerfstudio.geometry.lie import departures, inverse_poses, moved_poses
 
 ANGLES = [0.0, 1e-12, 1e-8, 1e-5, 1e-2, 0.2999, 0.3, 0.3001, 1.0, 2.0, 3.0, np.pi - 1e-3, np.pi - 1e-7]
 AXES = [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (1.0, -2.0, 0.5), (-0.3, 0.4, 5.0)]

@@ -6,11 +6,16 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.loops.pixel_index import is_known, known_pixels, place_of, words_of
-from sl_nerfstudio.bundle_adjustment.loops.windows import WindowMemory
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
+    CoordinateMaps,
+    WindowMemory,
+    is_known,
+    known_pixels,
+    place_of,
+    words_of,
+)
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.rays import pixel_centres
+from sl_nerfstudio.geometry.triangulation import pixel_centres
 
 SIZES = ((30, 20), (17, 25))
 SLOPES = torch.tensor([[[2.0, -0.5], [0.25, 1.5]], [[-1.0, 0.125], [0.5, 3.0]]], dtype=torch.float64)

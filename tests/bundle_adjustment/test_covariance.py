@@ -9,20 +9,33 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.covariance import gauge_free, pose_covariance
-from sl_nerfstudio.bundle_adjustment.free_parameters import FreeParameters, constrained, free_parameters
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.joint_covariance.cholesky import Cholesky
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import joint_of_prior
-from sl_nerfstudio.bundle_adjustment.joint_covariance.draws import DRAWS, as_stored, stored_columns, unit_columns
-from sl_nerfstudio.bundle_adjustment.joint_covariance.evidence import Evidence, block_gradients
+from sl_nerfstudio.bundle_adjustment.covariance import (
+    DRAWS,
+    Cholesky,
+    CovarianceEvidence,
+    as_stored,
+    block_gradients,
+    gauge_free,
+    joint_of_prior,
+    pose_covariance,
+    stored_columns,
+    unit_columns,
+)
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, prior_equations
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    UNKNOWNS,
+    FreeParameters,
+    PosePrior,
+    SelfCalibration,
+    by_frame,
+    constrained,
+    free_parameters,
+    gauge_directions,
+    prior_equations,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame
-from sl_nerfstudio.geometry.se3 import inverse, log_se3
+from sl_nerfstudio.geometry.lie import inverse, log_se3
 
 from .analytic import images_of, matrix_by_kind, rig_of, without_prior
 
@@ -77,7 +90,7 @@ def test_products_with_the_inverse(size):
         Cholesky.in_place(-torch.eye(3, dtype=torch.float64))
 
 
-Arguments = tuple[Evidence, FreeParameters, Rig, PosePrior, float]
+Arguments = tuple[CovarianceEvidence, FreeParameters, Rig, PosePrior, float]
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +111,7 @@ def at_results() -> dict[str, Arguments]:
 
 
 def by_inverses(
-    e: Evidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
+    e: CovarianceEvidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
 ) -> tuple[Tensor, SelfCalibration]:
     """The covariance with all matrices written out, and the self-calibration."""
     n, weights = e.rig.frames, e.kernel.weights(e.linear.residuals)
@@ -151,7 +164,7 @@ def test_factors_give_what_inverses_give(at_results, mode):
 def test_random_columns_state_the_same_covariance(at_results, monkeypatch, mode):
     """As for scans of many frames."""
     exact = pose_covariance(*at_results[mode]).factor
-    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.covariance.EXACT_UNKNOWNS", 0)
     found = pose_covariance(*at_results[mode]).factor
     assert found.shape == (len(exact), DRAWS + 1)
     moves = exact.norm(dim=1) > 1e-9
@@ -169,7 +182,7 @@ def test_a_stored_factor_has_the_same_covariance(monkeypatch):
         stored = as_stored(factor)
         assert stored.shape == (30, stored_columns(30)) == (30, 30)
         assert torch.allclose(stored @ stored.T, factor @ factor.T, rtol=0, atol=1e-12 * columns)
-    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.covariance.EXACT_UNKNOWNS", 0)
     factor = torch.randn(30, DRAWS + 3, dtype=torch.float64, generator=generator)
     assert torch.equal(as_stored(factor)[:, : DRAWS + 3], factor) and not as_stored(factor)[:, DRAWS + 3 :].any()
     with pytest.raises(ValueError, match=f"{DRAWS + 9} columns, at most {DRAWS + 8}"):
@@ -178,7 +191,7 @@ def test_a_stored_factor_has_the_same_covariance(monkeypatch):
 
 def test_random_columns_are_a_unit_matrix_on_average(monkeypatch):
     assert torch.equal(unit_columns(5, 100), torch.eye(5, dtype=torch.float64))
-    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.covariance.EXACT_UNKNOWNS", 0)
     drawn = unit_columns(300, 300)
     off = drawn @ drawn.T - torch.eye(300)
     assert float(off.diagonal().abs().max()) < 1e-12 and float(off.square().mean().sqrt()) < 1.1 / DRAWS**0.5
@@ -198,7 +211,7 @@ def test_captures_that_say_nothing_leave_the_prior(monkeypatch):
         wanted = matrix_by_kind(P @ B @ inner @ B.T @ P, FRAMES)
         factor = gauge_free(rig, free, H)
         assert torch.allclose(factor @ factor.T, wanted, rtol=0, atol=1e-9 * float(wanted.abs().max().clamp_min(1e-9)))
-    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.covariance.EXACT_UNKNOWNS", 0)
     exact, prior = PRIOR.sigma, joint_of_prior(PRIOR, rig)
     assert prior.shape[1] == DRAWS
     assert ((prior[: 6 * FRAMES].norm(dim=1).reshape(FRAMES, 6) / exact[:, :6]).log().abs() < 0.15).all()

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.cross_validation import (
+from sl_nerfstudio.bundle_adjustment.adjust import (
     CrossValidation,
     HeldOutPixels,
     cross_validate,
     mean_and_error,
 )
-from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 
 from .analytic import ExactMaps, decoded_at, disturbed, rig_of
 

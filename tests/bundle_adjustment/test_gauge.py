@@ -4,18 +4,17 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import (
+from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    PosePrior,
     agreeing_scale,
     baseline_scale,
     gauge_directions,
     gauge_projection,
     restore,
 )
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.residuals import residuals_of
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3
+from sl_nerfstudio.bundle_adjustment.residuals import Rig, residuals_of
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3
 
 from .analytic import disturbed, images_of, rig_of
 

@@ -7,16 +7,13 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment.adjust import adjust
-from sl_nerfstudio.bundle_adjustment.free_parameters import RefinePoses
-from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import departure_of
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.search import hops
-from sl_nerfstudio.bundle_adjustment.search.hops import Hopped, hopped, is_rough
-from sl_nerfstudio.bundle_adjustment.search.one_search import search
-from sl_nerfstudio.bundle_adjustment.search.problem import Problem, Progress, problem_of
+from sl_nerfstudio.bundle_adjustment import adjust as hops
+from sl_nerfstudio.bundle_adjustment.adjust import Hopped, adjust, hopped, is_rough
+from sl_nerfstudio.bundle_adjustment.covariance import departure_of
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, RefinePoses
+from sl_nerfstudio.bundle_adjustment.search import SearchProblem, SearchProgress, problem_of, search
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_so3
 
 from .analytic import ExactMaps, disturbed, rig_of, rough_prior
 
@@ -35,7 +32,7 @@ def without_surfaces(monkeypatch):
     monkeypatch.setattr(hops, "registered_start", lambda *_: None)
 
 
-def problem_from(start, true, degrees: float = 3.0, **changed) -> Problem:
+def problem_from(start, true, degrees: float = 3.0, **changed) -> SearchProblem:
     settings = replace(SETTINGS, hops=replace(HopSettings(), **changed))
     return problem_of(start, ExactMaps.around(true, SIZE), rough_prior(FRAMES, degrees), settings)
 
@@ -45,7 +42,7 @@ def searches(monkeypatch):
     """Where searches began."""
     begun = []
 
-    def counted(problem: Problem, refine: RefinePoses):
+    def counted(problem: SearchProblem, refine: RefinePoses):
         begun.append(problem.begin)
         return search(problem, refine)
 
@@ -88,7 +85,7 @@ def test_searches_that_end_elsewhere_and_explain_less_are_other_ends_until_patie
     first = search(problem, "known-rig")[0]
     ends = []
 
-    def nowhere(problem: Problem, refine: RefinePoses):
+    def nowhere(problem: SearchProblem, refine: RefinePoses):
         ends.append(replace(first, state=replace(first.state, rig=problem.begin)))
         return ends[-1], 1.0
 
@@ -104,7 +101,7 @@ def test_other_ends_that_fit_as_well_widen_the_covariance_by_what_they_differ(tr
     step = torch.zeros(2, FRAMES, 6, dtype=torch.float64)
     step[0, 2, 4] = 1e-3
 
-    def with_another(problem: Problem, refine: RefinePoses, found: Progress) -> Hopped:
+    def with_another(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -> Hopped:
         return Hopped(found, (replace(found, state=replace(found.state, rig=found.state.rig.moved(*step))),), True)
 
     limits = OtherMinimaSettings(most_left=1e9, worse=1.4 if worse else 1e30)  # residuals are 1e-9 px

@@ -6,16 +6,12 @@ from math import radians
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.damped_solution import damped_solver
-from sl_nerfstudio.bundle_adjustment.free_parameters import free_parameters
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, damped_solver, lm_step
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior, PriorTerm
+from sl_nerfstudio.bundle_adjustment.observations import Kernel, observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, PriorTerm, by_frame, by_kind, free_parameters
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
-from sl_nerfstudio.bundle_adjustment.robust_kernel import Kernel
 from sl_nerfstudio.bundle_adjustment.settings import StepSettings
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 from .analytic import ExactMaps, dense, disturbed, matrix_by_kind, rig_of
 

@@ -5,8 +5,8 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
+from sl_nerfstudio.bundle_adjustment.parameters import by_frame, by_kind
 from sl_nerfstudio.bundle_adjustment.residuals import linearise
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame, by_kind
 
 from .analytic import ExactMaps, columns_of, dense, disturbed, rig_of, without_prior
 

@@ -12,7 +12,7 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     partners,
     place_anchors,
 )
-from sl_nerfstudio.geometry.se3 import rotate, transform
+from sl_nerfstudio.geometry.lie import rotate, transform
 
 from .analytic import ExactMaps, cast, rig_of
 

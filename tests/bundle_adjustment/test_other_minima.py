@@ -10,7 +10,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
 from sl_nerfstudio.bundle_adjustment.adjust import adjust, find_minimum
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
+from sl_nerfstudio.bundle_adjustment.covariance import (
     departure_of,
     drawn_start,
     farthest_frame,
@@ -18,9 +18,14 @@ from sl_nerfstudio.bundle_adjustment.joint_covariance.other_minima import (
     widened,
     with_frames_of,
 )
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, OtherMinimaSettings
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_se3, log_so3
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    inverse,
+    log_se3,
+    log_so3,
+)
 
 from . import analytic
 from .analytic import disturbed, images_of, rig_of

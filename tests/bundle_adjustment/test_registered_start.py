@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.adjust import adjust
+from sl_nerfstudio.bundle_adjustment import adjust as hops
+from sl_nerfstudio.bundle_adjustment.adjust import adjust, registered_start
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.parameters import baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings
-from sl_nerfstudio.bundle_adjustment.search import hops
-from sl_nerfstudio.bundle_adjustment.search.one_search import search
-from sl_nerfstudio.bundle_adjustment.search.problem import problem_of
-from sl_nerfstudio.bundle_adjustment.search.registered_start import registered_start
+from sl_nerfstudio.bundle_adjustment.search import problem_of, search
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
-from sl_nerfstudio.geometry.se3 import inverse, log_so3
+from sl_nerfstudio.geometry.lie import inverse, log_so3
 
 from .analytic import disturbed, images_of, rig_of, rough_prior, turned
 

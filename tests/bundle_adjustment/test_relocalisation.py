@@ -6,18 +6,18 @@ from math import radians
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.relocalisation import (
+from sl_nerfstudio.bundle_adjustment import search
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior
+from sl_nerfstudio.bundle_adjustment.search import (
     Relocalised,
     find_lost_frames,
     frame_support,
+    problem_of,
     relocalise,
     unplaced_frames,
 )
-from sl_nerfstudio.bundle_adjustment.search import one_search
-from sl_nerfstudio.bundle_adjustment.search.problem import problem_of
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, log_so3
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_so3
 
 from .analytic import ExactMaps, rig_of, turned
 
@@ -95,7 +95,7 @@ def test_a_frame_that_was_searched_for_in_vain_is_searched_for_again_only_when_o
         moved = replace(rig, T_world_camera=exp_se3(torch.full((FRAMES, 6), 1e-3)).double() @ rig.T_world_camera)
         return Relocalised(moved if len(asked) < 3 else rig, found, in_vain)
 
-    monkeypatch.setattr(one_search, "relocalise", searched)
+    monkeypatch.setattr(search, "relocalise", searched)
     problem = problem_of(true, ExactMaps.around(true, SIZE), PRIOR, AdjustmentSettings())
-    one_search.search(problem, "known-rig")
+    search.search(problem, "known-rig")
     assert [skipped.nonzero().squeeze(-1).tolist() for skipped in asked] == [[], [1, 2], [4]]

@@ -4,13 +4,11 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, linearise, residuals_of
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.unknowns import by_frame
-from sl_nerfstudio.geometry.se3 import transform
+from sl_nerfstudio.bundle_adjustment.parameters import by_frame, gauge_directions
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Rig, linearise, residuals_of
+from sl_nerfstudio.geometry.lie import transform
 
 from .analytic import ExactMaps, cast, dense, disturbed, images_of, rig_of
 

@@ -5,8 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.bundle_adjustment.residuals import Residuals
-from sl_nerfstudio.bundle_adjustment.robust_kernel import (
+from sl_nerfstudio.bundle_adjustment.observations import (
     Kernel,
     frame_medians,
     narrowed,
@@ -14,6 +13,7 @@ from sl_nerfstudio.bundle_adjustment.robust_kernel import (
     noise_ratios,
     useful_distance,
 )
+from sl_nerfstudio.bundle_adjustment.residuals import Residuals
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 
 SETTINGS = KernelSettings()

@@ -6,15 +6,18 @@ import pytest
 import torch
 
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.priors import PosePrior
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, linearise, residuals_of
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.bundle_adjustment.self_calibration import linearise_with_intrinsics
+from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, gauge_directions, linearise_with_intrinsics
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
-from sl_nerfstudio.geometry.devices import UNCHANGED, Intrinsics, IntrinsicsChange, project, unproject
-from sl_nerfstudio.geometry.se3 import inverse, log_se3
+from sl_nerfstudio.geometry.devices import (
+    UNCHANGED,
+    Intrinsics,
+    IntrinsicsChange,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import inverse, log_se3
 
 from .analytic import ExactMaps, camera_of, disturbed, rig_of
 

@@ -9,9 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.calibration.device_files import read_device_file, read_entries
-from sl_nerfstudio.calibration.distortion_fit import reduce_distortion
-from sl_nerfstudio.calibration.stated_sigma import CERTAIN, read_stated_sigma
+from sl_nerfstudio.calibration.formats import read_device_file, read_entries, reduce_distortion
+from sl_nerfstudio.calibration.stated import CERTAIN, read_stated_sigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sl_nerfstudio.calibration.exif import camera_from_exif
+from sl_nerfstudio.calibration.stated import camera_from_exif
 from sl_nerfstudio.errors import UserError
 
 SIZE = (120, 90)

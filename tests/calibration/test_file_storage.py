@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sl_nerfstudio.calibration.device_files import read_device_file
-from sl_nerfstudio.calibration.formats.file_storage import read_file_storage
+from sl_nerfstudio.calibration.formats import read_device_file, read_file_storage
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.document import FileError
 
 SIZE = (640, 480)
 

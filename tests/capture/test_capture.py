@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.capture import camera as camera_module
-from sl_nerfstudio.capture.grid_view import GridReader
-from sl_nerfstudio.capture.windows import Window
+from sl_nerfstudio.capture.screen import Window
+from sl_nerfstudio.capture.selection import GridReader
 from sl_nerfstudio.cli.capture import main
-from sl_nerfstudio.decoding.graycode.decoder import GrayCodeDecoder
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.decoding.decoders import GrayCodeDecoder
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.scan.images import read_image
 from tests.capture.fake_camera import FakeCapture
 from tests.capture.photographs import PATTERN, SIZE, homography, photograph
@@ -109,9 +109,7 @@ def test_the_preview_shows_what_is_decoded_and_keys_keep_and_end(
     command, keyboard, video, pattern, tmp_path, monkeypatch
 ):
     pictures = []
-    monkeypatch.setattr(
-        "sl_nerfstudio.capture.windows.Window.show", _recording(pictures, keyboard.pygame), raising=True
-    )
+    monkeypatch.setattr("sl_nerfstudio.capture.screen.Window.show", _recording(pictures, keyboard.pygame), raising=True)
     keyboard.press("", "", "SPACE", "a", "")  # the third image is blurred
     command(main, "--camera", video, "--output", tmp_path / "c", "--pattern", pattern)
     kept = sorted(path.name for path in (tmp_path / "c").glob("*.png"))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.attacks.dying import dying
-from sl_nerfstudio.capture.folder import CaptureFolder
+from sl_nerfstudio.capture.camera import CaptureFolder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.scan.images import read_image
 
 PATTERN = GrayCode(64, 32, 8)
@@ -50,7 +50,7 @@ def test_frames_are_in_the_order_of_their_numbers(tmp_path):
 def test_a_sequence_appears_complete_or_not_at_all(tmp_path, monkeypatch):
     with folder(tmp_path) as captures:
         captures.add_sequence([IMAGE, 255 - IMAGE])
-        monkeypatch.setattr("sl_nerfstudio.capture.folder.encode_png", _full_disk_at_the_second())
+        monkeypatch.setattr("sl_nerfstudio.capture.camera.encode_png", _full_disk_at_the_second())
         with pytest.raises(OSError, match="full"):
             captures.add_sequence([IMAGE, IMAGE])
         assert [path.name for path in captures.frames] == ["frame_0000"]

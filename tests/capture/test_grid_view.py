@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.capture.grid_view import GridReader, GridView, PlainReader
-from sl_nerfstudio.capture.light import Light, measure_light
+from sl_nerfstudio.capture.selection import Exposure, GridReader, GridView, PlainReader, measure_light
 from tests.capture.photographs import PATTERN, SIZE, homography, photograph
 
 
@@ -46,7 +45,7 @@ def test_large_images_are_read_at_a_smaller_size_but_in_their_own_pixels(reader,
 
 def test_an_image_without_the_pattern_shows_no_nodes(reader):
     found = reader.read(np.full((300, 400, 3), 90, dtype=np.uint8))
-    assert not found.seen.any() and found.blur is None and found.light == Light(0.0, 0.0)
+    assert not found.seen.any() and found.blur is None and found.light == Exposure(0.0, 0.0)
 
 
 def test_defocus_is_measured_in_periods(reader, picture, view):
@@ -63,7 +62,7 @@ def test_the_difference_is_nothing_for_resting_devices_and_large_for_moved_ones(
 
 
 def _view(uv, period=10.0):
-    return GridView(np.array(uv, dtype=np.float32).reshape(1, -1, 2), period, 0.1, Light(0.0, 0.0))
+    return GridView(np.array(uv, dtype=np.float32).reshape(1, -1, 2), period, 0.1, Exposure(0.0, 0.0))
 
 
 def test_the_difference_counts_nodes():

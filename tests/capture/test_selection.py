@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.capture.grid_view import GridView
-from sl_nerfstudio.capture.light import Light
-from sl_nerfstudio.capture.selection import Selection, Verdict
+from sl_nerfstudio.capture.selection import Exposure, GridView, Selection, SelectionVerdict
 
-GOOD = Light(0.0, 0.0)
+GOOD = Exposure(0.0, 0.0)
 
 
 def view(shift=0.0, nodes=100, blur=0.1, light=GOOD, edge=None):
@@ -20,17 +18,17 @@ def view(shift=0.0, nodes=100, blur=0.1, light=GOOD, edge=None):
 @pytest.mark.parametrize(
     ("seen", "verdict"),
     [
-        (view(), Verdict.KEEP),
-        (view(nodes=47), Verdict.NO_PATTERN),
-        (view(nodes=0, light=Light(0.6, 0.0)), Verdict.SATURATED),
-        (view(nodes=0, light=Light(0.0, 0.95)), Verdict.DARK),
-        (view(nodes=0, edge=2.5), Verdict.BLURRED),
-        (view(nodes=0, edge=0.9), Verdict.NO_PATTERN),
-        (view(blur=0.16), Verdict.BLURRED),
-        (view(blur=None), Verdict.BLURRED),
-        (view(light=Light(0.2, 0.0)), Verdict.SATURATED),
-        (view(light=Light(0.0, 0.4)), Verdict.DARK),
-        (GridView(np.zeros((0, 0, 2), dtype=np.float32), 1.0, None, GOOD), Verdict.BY_KEY),
+        (view(), SelectionVerdict.KEEP),
+        (view(nodes=47), SelectionVerdict.NO_PATTERN),
+        (view(nodes=0, light=Exposure(0.6, 0.0)), SelectionVerdict.SATURATED),
+        (view(nodes=0, light=Exposure(0.0, 0.95)), SelectionVerdict.DARK),
+        (view(nodes=0, edge=2.5), SelectionVerdict.BLURRED),
+        (view(nodes=0, edge=0.9), SelectionVerdict.NO_PATTERN),
+        (view(blur=0.16), SelectionVerdict.BLURRED),
+        (view(blur=None), SelectionVerdict.BLURRED),
+        (view(light=Exposure(0.2, 0.0)), SelectionVerdict.SATURATED),
+        (view(light=Exposure(0.0, 0.4)), SelectionVerdict.DARK),
+        (GridView(np.zeros((0, 0, 2), dtype=np.float32), 1.0, None, GOOD), SelectionVerdict.BY_KEY),
     ],
 )
 def test_the_first_view(seen, verdict):
@@ -41,20 +39,23 @@ def test_views_that_are_known_are_not_kept_again_even_later():
     selection = Selection((10, 10))
     for shift in (0.0, 50.0):
         selection.add(view(shift), 0.0)
-    assert selection.judge(view(1.0), 60.0) is Verdict.KNOWN  # like the first, not the last
-    assert selection.judge(view(25.0), 60.0) is Verdict.KEEP
+    assert selection.judge(view(1.0), 60.0) is SelectionVerdict.KNOWN  # like the first, not the last
+    assert selection.judge(view(25.0), 60.0) is SelectionVerdict.KEEP
 
 
 def test_after_a_frame_there_is_a_pause():
     selection = Selection((10, 10))
     selection.add(view(), 5.0)
-    assert selection.judge(view(30.0), 5.9) is Verdict.WAIT and selection.judge(view(30.0), 6.0) is Verdict.KEEP
+    assert (
+        selection.judge(view(30.0), 5.9) is SelectionVerdict.WAIT
+        and selection.judge(view(30.0), 6.0) is SelectionVerdict.KEEP
+    )
 
 
 def test_frames_of_an_earlier_run_cause_no_pause():
     selection = Selection((10, 10))
     selection.add(view())
-    assert selection.judge(view(30.0), 0.0) is Verdict.KEEP
+    assert selection.judge(view(30.0), 0.0) is SelectionVerdict.KEEP
 
 
 def test_how_often_each_node_was_seen():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.cli.pattern import main
-from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.presets import MOST_NODES, longer_period
+from sl_nerfstudio.pattern.files import MOST_NODES, longer_period, read_layout
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.scan.images import read_image
 
 DISPLAY = (1024, 768)  # of SDL's dummy driver

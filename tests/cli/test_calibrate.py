@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.calibration.device_files import read_device_file
+from sl_nerfstudio.calibration.formats import read_device_file
 from sl_nerfstudio.cli.calibrate import main
 from sl_nerfstudio.cli.synth import main as synth
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.presets import make_grid
+from sl_nerfstudio.pattern.files import make_grid
+from sl_nerfstudio.pattern.gray_code import GrayCode
 
 FRAMES = 5
 BOARD = ["--corners", "9x6", "--square", "30 mm"]

@@ -14,11 +14,11 @@ import tyro
 
 from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan, main
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.results import held_results
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
 from sl_nerfstudio.scan import read_scan, write_transforms
+from sl_nerfstudio.storage import held_results
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 

@@ -13,14 +13,12 @@ import pytest
 import torch
 import tyro
 
-from sl_nerfstudio.cli.export import export_trained
-from sl_nerfstudio.cli.exporting.checks import check_outputs
-from sl_nerfstudio.cli.exporting.config import ExportConfig
+from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.model.training.fingerprints import plain
-from sl_nerfstudio.runs.trained_run import TrainedRun
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import read_mesh
+from sl_nerfstudio.model.run_files import plain
+from sl_nerfstudio.runs.run import TrainedRun
 from sl_nerfstudio.scan import Scan, read_poses
 from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of
 

@@ -19,10 +19,9 @@ from sl_nerfstudio.cli.export import main
 from sl_nerfstudio.cli.redecode import main as redecode
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.mesh_io import read_mesh
-from sl_nerfstudio.meshing.ply import read_quality
-from sl_nerfstudio.runs.trained_run import load_run
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.meshing.files import read_mesh, read_quality
+from sl_nerfstudio.runs.run import load_run
 from sl_nerfstudio.scan import read_devices, read_poses, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 from tests.test_ns_commands import train

@@ -10,11 +10,9 @@ import pycolmap
 import pytest
 import trimesh
 
-from sl_nerfstudio.cli.export import export_trained
-from sl_nerfstudio.cli.exporting.checks import check_outputs
-from sl_nerfstudio.cli.exporting.config import ExportConfig
+from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.inputs import read_inputs
+from sl_nerfstudio.evaluation.evaluate import read_inputs
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of

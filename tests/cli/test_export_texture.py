@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.cli.export import export_trained
-from sl_nerfstudio.cli.exporting.checks import check_outputs
-from sl_nerfstudio.cli.exporting.config import ExportConfig
+from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.meshing.mesh_io import read_mesh
+from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 from tests.runs.ball_run import CENTRE, RADIUS, ball_scan, run_of

@@ -10,8 +10,7 @@ from benchmarks.attacks.dying import dying
 from sl_nerfstudio.cli import pattern, process, synth
 from sl_nerfstudio.cli.export import ExportConfig, export
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.lock import locked, locked_file
-from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.storage import NewFolder, locked, locked_file
 
 COMMANDS = {
     "sl-pattern": (pattern.main, ["--width", "120", "--height", "120", "--period", "20"]),

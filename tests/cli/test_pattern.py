@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.cli.pattern import main
-from sl_nerfstudio.cli.pattern_folder import margin_warning
-from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.cli.pattern import main, margin_warning
+from sl_nerfstudio.pattern.files import PRESETS, make_grid, read_layout
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.pattern.presets import PRESETS, make_grid
 from sl_nerfstudio.scan.images import read_image
 
 

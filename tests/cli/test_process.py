@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.cli.process import main
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.geometry.lie import exp_se3, fit_similarity
 from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import make_gray_scan
@@ -185,7 +184,7 @@ def test_bad_flags(monkeypatch, captures, tmp_path, capsys, flags, message):
 
 
 def test_wrong_pattern_and_wrong_intrinsics(monkeypatch, captures, tmp_path, capsys):
-    from sl_nerfstudio.pattern.graycode import GrayCode
+    from sl_nerfstudio.pattern.gray_code import GrayCode
     from sl_nerfstudio.pattern.grid import GridPattern
 
     other = tmp_path / "other.json"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.cli import process, synth
-from sl_nerfstudio.geometry.similarity import fit_similarity
+from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
 

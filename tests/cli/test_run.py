@@ -10,7 +10,7 @@ _WAITING = """
 import sys, time
 from pathlib import Path
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.storage import NewFolder
 def main():
     with NewFolder(Path(sys.argv[1])) as folder:
         folder.write("inner/a", b"")

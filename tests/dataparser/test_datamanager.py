@@ -11,8 +11,15 @@ from PIL import Image
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.devices import (
+    UNCHANGED,
+    Device,
+    Intrinsics,
+    IntrinsicsChange,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
 # nerfstudio's Cameras use a way of indexing that torch has deprecated

@@ -10,10 +10,15 @@ from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.dataparser.normalise import enclosing_sphere, normalisation, upright, without_lonely
-from sl_nerfstudio.dataparser.samples import build_samples
+from sl_nerfstudio.dataparser.dataparser import (
+    build_samples,
+    enclosing_sphere,
+    normalisation,
+    upright,
+    without_lonely,
+)
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.scan import Scan, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from sl_nerfstudio.dataparser.held_out import held_out_pixels
-from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
+from sl_nerfstudio.dataparser.dataparser import PixelSamples, build_samples, held_out_pixels
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import Scan, read_scan
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
@@ -46,7 +45,7 @@ def test_memory_is_20_bytes_a_pixel_that_lie_together(samples: PixelSamples) -> 
 
 
 def test_the_decoded_share_is_that_of_all_pixels(samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sl_nerfstudio.dataparser.samples._AT_ONCE", 7)
+    monkeypatch.setattr("sl_nerfstudio.dataparser.dataparser._AT_ONCE", 7)
     assert 0 < samples.decoded_share < 1
     assert samples.decoded_share == pytest.approx(float(samples.coords[:, 0].isfinite().double().mean()), rel=1e-12)
 
@@ -117,7 +116,7 @@ def test_empty_masks_are_rejected(tmp_path: Path) -> None:
 
 
 def test_a_table_in_a_file_is_the_same(scan: Scan, samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sl_nerfstudio.dataparser.samples.largest_in_memory", lambda: 0)
+    monkeypatch.setattr("sl_nerfstudio.dataparser.dataparser.largest_in_memory", lambda: 0)
     mapped = build_samples(scan, show_progress=False)
     assert mapped.in_file and not samples.in_file
     for name in ("records", "first", "held_out_index"):
@@ -133,11 +132,13 @@ def test_a_table_in_a_file_says_how_it_is_read(
     """Else a system that reads megabytes ahead does so for each of a thousand pixels a step."""
     said: list[tuple[str, int, int]] = []
     for name in ("read_at_random", "read_in_order"):
-        monkeypatch.setattr(f"sl_nerfstudio.dataparser.samples.{name}", lambda *at, name=name: said.append((name, *at)))
+        monkeypatch.setattr(
+            f"sl_nerfstudio.dataparser.dataparser.{name}", lambda *at, name=name: said.append((name, *at))
+        )
     samples.draw(5)
     list(samples.in_order())
     assert said == []  # in memory
-    monkeypatch.setattr("sl_nerfstudio.dataparser.samples.largest_in_memory", lambda: 0)
+    monkeypatch.setattr("sl_nerfstudio.dataparser.dataparser.largest_in_memory", lambda: 0)
     mapped = build_samples(scan, show_progress=False)
     where = mapped.records.data_ptr(), mapped.records.nbytes
     mapped.draw(5)

@@ -10,9 +10,8 @@ from numpy import ndarray
 from PIL import Image
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, transform
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity, inverse, transform
+from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
 
 RADIUS = 40.0  # mm
 CAMERA = Device(w=48, h=40, fl_x=90.0, fl_y=92.0, cx=23.0, cy=21.0)

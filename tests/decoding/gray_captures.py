@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.image import sample_bilinear
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.pattern.grid import sample_bilinear
 
 LAYOUT = GrayCode(320, 240, 2)
 

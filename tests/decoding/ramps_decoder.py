@@ -6,8 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
-from sl_nerfstudio.decoding.decoder import Decoder
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder, DecodingError
 from sl_nerfstudio.scan.images import as_grey, read_image
 from tests.pattern.ramps import Ramps
 

@@ -5,8 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.decoding.grid.consensus import Assignment, agree, believe, choose_turn
-from sl_nerfstudio.decoding.grid.graph import GridGraph
+from sl_nerfstudio.decoding.grid_graph import (
+    Assignment,
+    GridGraph,
+    agree,
+    believe,
+    choose_turn,
+)
 from tests.decoding.test_graph import lattice
 
 CODES = np.random.default_rng(3).integers(0, 5, (14, 16)).astype(np.int8)

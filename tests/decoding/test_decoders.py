@@ -5,15 +5,15 @@ import pickle
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.decoded import DecodingError
+from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.decoders import DECODERS, choose_decoder
-from sl_nerfstudio.decoding.graycode.decode import decode_gray_code
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
+from sl_nerfstudio.decoding.gray_code import decode_gray_code
+from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import LAYOUTS
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
 from tests.decoding.ramps_decoder import RampsDecoder
@@ -100,7 +100,7 @@ def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_proce
     def load(*_):
         raise AssertionError("a network was loaded")
 
-    monkeypatch.setattr("sl_nerfstudio.decoding.grid.decoder.GridImageDecoder", load)
+    monkeypatch.setattr("sl_nerfstudio.decoding.grid.GridImageDecoder", load)
     decoder = DECODERS["network"](GRID)
     again = pickle.loads(pickle.dumps(decoder))
     assert again.key == decoder.key and np.array_equal(again.layout.codes, GRID.codes)

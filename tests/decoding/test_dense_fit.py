@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.dense_fit import fit_densely
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
+from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses, fit_densely
 from sl_nerfstudio.pattern.grid import GridPattern
 
 GRID = GridPattern(w=400, h=400, codes=np.random.default_rng(3).integers(0, 5, (20, 20)).astype(np.int8))

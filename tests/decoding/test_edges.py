@@ -6,18 +6,24 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
-from sl_nerfstudio.decoding.grid.edges.channels import CHANNELS, EdgeView
-from sl_nerfstudio.decoding.grid.edges.chooser import EdgeChooser
-from sl_nerfstudio.decoding.grid.edges.continuation import continued, slopes, steps
-from sl_nerfstudio.decoding.grid.edges.network import MARGIN, EdgeNetwork
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.decoding.grid.turned import from_pattern, to_pattern
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.decoding.grid_edges import (
+    CHANNELS,
+    MARGIN,
+    EdgeChooser,
+    EdgeNetwork,
+    EdgeView,
+    continued,
+    slopes,
+    steps,
+)
+from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
+from sl_nerfstudio.decoding.grid_phases import from_pattern, to_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import as_grey
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import disturb_image
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import make_setup
 from training.edge_errors import continuation_errors
 from training.mirrored import mirrored
 

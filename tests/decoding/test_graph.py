@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.graph import OFFSETS, STEPS, build_graph, neighbourhoods, phase_maps
+from sl_nerfstudio.decoding.grid_graph import (
+    OFFSETS,
+    STEPS,
+    build_graph,
+    neighbourhoods,
+    phase_maps,
+)
 
 H, W = 60, 80
 

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.graycode.decode import decode_gray_code
-from sl_nerfstudio.decoding.regions import drop_small_regions
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.decoding.decoder import DecodingError, drop_small_regions
+from sl_nerfstudio.decoding.gray_code import decode_gray_code
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
 
 COORDS = exact_coords()
@@ -40,7 +39,7 @@ def test_mask_and_pattern_image(decoded):
     assert not (decoded.decoded & ~decoded.mask).any()
     assert decoded.pattern.min() >= 0 and decoded.pattern.max() <= 1 and not decoded.pattern[~decoded.mask].any()
     inside = decoded.decoded & LIT
-    from sl_nerfstudio.pattern.image import sample_bilinear
+    from sl_nerfstudio.pattern.grid import sample_bilinear
 
     expected = sample_bilinear(LAYOUT.render(), COORDS)[inside]
     assert np.corrcoef(expected, decoded.pattern[inside])[0, 1] > 0.9

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 import sl_nerfstudio.decoding
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.pattern.light import projected_light
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.pattern.grid import GridPattern, projected_light
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import disturb_image
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import make_setup
 
 PIXELS_A_PERIOD = 7.0
 

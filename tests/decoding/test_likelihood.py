@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.decoding.grid.likelihood import symbol_log_likelihood, symbol_log_ratio
+from sl_nerfstudio.decoding.grid_graph import symbol_log_likelihood, symbol_log_ratio
 
 CODES = np.random.default_rng(0).integers(0, 5, (12, 14)).astype(np.int8)
 PERIOD = 10

@@ -5,20 +5,21 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD
-from sl_nerfstudio.decoding.grid.graph import PhaseMaps, build_graph, phase_maps
-from sl_nerfstudio.decoding.grid.phase_reader import (
+from sl_nerfstudio.decoding.grid_edges import load_unet
+from sl_nerfstudio.decoding.grid_graph import PhaseMaps, build_graph, phase_maps
+from sl_nerfstudio.decoding.grid_phases import (
+    RECTIFIED_PERIOD,
+    STRIDE,
+    GridAppearance,
     clear_places,
     map_from_pixels,
     measure_appearance,
     node_places,
     predict_maps,
+    rectify,
     sample_pixels,
     to_pixel_coordinates,
 )
-from sl_nerfstudio.decoding.grid.rectify import GridAppearance, rectify
-from sl_nerfstudio.decoding.grid.trained import load_unet
-from sl_nerfstudio.decoding.grid.unet import STRIDE
 from sl_nerfstudio.pattern.grid import GridPattern
 from tests.decoding.test_rectify import capture
 

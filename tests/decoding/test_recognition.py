@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 
 from benchmarks.baselines.window_matching import match_windows
-from sl_nerfstudio.decoding.grid.consensus import agree, believe
-from sl_nerfstudio.decoding.grid.gcn import one_hot, turned_pattern
-from sl_nerfstudio.decoding.grid.graph import OFFSETS, GridGraph, neighbourhoods
-from sl_nerfstudio.decoding.grid.recognition import NodeRecogniser
+from sl_nerfstudio.decoding.grid_detection import NodeRecogniser
+from sl_nerfstudio.decoding.grid_graph import (
+    OFFSETS,
+    GridGraph,
+    agree,
+    believe,
+    neighbourhoods,
+    one_hot,
+    turned_pattern,
+)
 from sl_nerfstudio.pattern.codes import code_array, rotate_codes
 from sl_nerfstudio.pattern.grid import GridPattern
 from training.graphs import Damage, damage_graph

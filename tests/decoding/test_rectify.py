@@ -4,9 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.channels import RECTIFIED_PERIOD, network_channels
-from sl_nerfstudio.decoding.grid.rectify import GridAppearance, guess_appearances, rectify
-from sl_nerfstudio.decoding.grid.unet import MULTIPLE
+from sl_nerfstudio.decoding.grid_phases import (
+    MULTIPLE,
+    RECTIFIED_PERIOD,
+    GridAppearance,
+    guess_appearances,
+    network_channels,
+    rectify,
+)
 from sl_nerfstudio.pattern.grid import GridPattern
 
 GRID = GridPattern(codes=np.random.default_rng(1).integers(0, 5, (40, 40)).astype(np.int8))

@@ -4,17 +4,23 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.grid.graph import GridGraph
-from sl_nerfstudio.decoding.grid.image_decoder import GridImageDecoder
-from sl_nerfstudio.decoding.grid.rectify import GridAppearance, rectify
-from sl_nerfstudio.decoding.grid.refusal.exposure import measure_exposure, measure_noise
-from sl_nerfstudio.decoding.grid.refusal.sharpness import edge_width, line_blur
-from sl_nerfstudio.decoding.grid.refusal.symbols import MIRRORED_SYMBOL, mirrored, shows_readable_symbols
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.decoding.grid_detection import (
+    MIRRORED_SYMBOL,
+    edge_width,
+    line_blur,
+    measure_exposure,
+    measure_noise,
+    mirrored,
+    shows_readable_symbols,
+)
+from sl_nerfstudio.decoding.grid_graph import GridGraph
+from sl_nerfstudio.decoding.grid_phases import GridAppearance, rectify
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.noise import disturb_image
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import make_setup
 from tests.decoding.test_graph import lattice
 from tests.decoding.test_phase_reader import maps_of
 

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.graycode.decode import decode_gray_code
-from sl_nerfstudio.decoding.graycode.order_check import check_order
-from sl_nerfstudio.decoding.graycode.recognition import layout_of_images
-from sl_nerfstudio.decoding.graycode.samples import take_samples
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.gray_code import decode_gray_code, take_samples
+from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from tests.decoding.gray_captures import exact_coords, photographs
 
 COORDS = exact_coords()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sl_nerfstudio.decoding.grid.unwrap import spread
+from sl_nerfstudio.decoding.grid_phases import spread
 
 
 def field(h=40, w=50, period=10.0):

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.files import write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import write_mesh
 from sl_nerfstudio.scan import Scale, ScanWriter
 
 from .shapes import blob, turn

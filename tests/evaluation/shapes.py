@@ -3,7 +3,7 @@
 import numpy as np
 import open3d as o3d
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 
 

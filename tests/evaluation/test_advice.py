@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.advice import capture_next, disagreeing_frames
-from sl_nerfstudio.evaluation.completeness.completeness import assess_completeness
-from sl_nerfstudio.evaluation.completeness.next_view import NextView
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.judgement import judge
-from sl_nerfstudio.evaluation.training_steps import TrainedSteps, trained_steps
+from sl_nerfstudio.evaluation.completeness import NextView, assess_completeness
+from sl_nerfstudio.evaluation.judgement import TrainedSteps, capture_next, disagreeing_frames, judge, trained_steps
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 
 from .completeness.test_openings import cut_sphere
 from .test_judgement import AGREEMENT, FRAME, GOOD

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sl_nerfstudio.evaluation.alignment import align_poses, icp
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import align_poses, icp
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 
 from .shapes import blob, known_similarity, turn

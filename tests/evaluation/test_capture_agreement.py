@@ -3,13 +3,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement
+from sl_nerfstudio.evaluation.agreement import (
+    MAX_PIXELS,
+    CaptureAgreement,
+    frame_pixels,
+    look_up,
+    most_pixels,
+)
 from sl_nerfstudio.evaluation.evaluate import evaluate
-from sl_nerfstudio.evaluation.frame_pixels import MAX_PIXELS, frame_pixels, look_up, most_pixels
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.geometry.device_poses import DevicePoses
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
 
@@ -121,7 +125,7 @@ def test_many_frames_are_evaluated_at_fewer_pixels_of_each(clean_scan: Path, mon
     assert [most_pixels(frames) for frames in (1, 120, 1000)] == [MAX_PIXELS, MAX_PIXELS, 30_000]
     scan, mesh, counts = read_scan(clean_scan), FacetedScan().truth(), []
     every = evaluate(mesh, scan, scan.poses).agreement
-    monkeypatch.setattr("sl_nerfstudio.evaluation.frame_pixels._ALL_PIXELS", 1500)
+    monkeypatch.setattr("sl_nerfstudio.evaluation.agreement._ALL_PIXELS", 1500)
     few = evaluate(
         mesh, scan, scan.poses, on_frame=lambda frame, figures, pixels: counts.append(len(pixels.row))
     ).agreement

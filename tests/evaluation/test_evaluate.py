@@ -7,12 +7,10 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import Evaluation, evaluate
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.judgement import judge
+from sl_nerfstudio.evaluation.judgement import judge, to_json
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
-from sl_nerfstudio.evaluation.result_json import to_json
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
 

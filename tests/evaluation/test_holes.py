@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.frame_pixels import FramePixels, frame_pixels
-from sl_nerfstudio.evaluation.holes import find_holes
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.agreement import FramePixels, find_holes, frame_pixels
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
 

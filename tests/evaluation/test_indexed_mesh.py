@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.mesh import Mesh
 
 from .shapes import blob, sphere

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
+from sl_nerfstudio.evaluation.report.scan_report import intrinsics_hint
 from sl_nerfstudio.geometry.devices import UNCHANGED, DeviceChange, IntrinsicsChange
 from sl_nerfstudio.scan import Scan, read_scan
 from tests.dataparser.tiny_scan import TinyScan

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.judgement import judge
-from sl_nerfstudio.verdict.departed_frames import DepartedFrame
+from sl_nerfstudio.review.verdict import DepartedFrame
 from tests.verdict.cases import ring
 
 FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)

@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.lengths import PointPair, measure_lengths, parse_pair, read_pairs, typical_sigma
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.meshing.length_uncertainty import point_changes
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
-from sl_nerfstudio.meshing.vertex_views import collect_views
+from sl_nerfstudio.evaluation.evaluate import (
+    PointPair,
+    measure_lengths,
+    parse_pair,
+    read_pairs,
+    typical_sigma,
+)
+from sl_nerfstudio.geometry.lie import exp_se3
+from sl_nerfstudio.meshing.mesh import VertexQuality
+from sl_nerfstudio.meshing.uncertainty import collect_views, point_changes
 from sl_nerfstudio.scan import Scan, read_scan
 
 from .faceted_scan import FacetedScan

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.metrics import DistanceStats, default_f_distances, score_surface
+from sl_nerfstudio.evaluation.evaluate import DistanceStats, default_f_distances, score_surface
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import MeshReference, PointReference
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 
 from .shapes import blob, known_similarity, sphere
 

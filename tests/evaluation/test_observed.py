@@ -1,7 +1,6 @@
 import numpy as np
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.observed import observable
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, observable
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.pose_errors import compare_poses
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.evaluation.reference import compare_poses
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 
 from .shapes import turn
 from .test_alignment import random_poses

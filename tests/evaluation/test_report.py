@@ -5,20 +5,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.evaluate import evaluate
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.inputs import EvaluationInputs
+from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, Length, evaluate
 from sl_nerfstudio.evaluation.judgement import judge
-from sl_nerfstudio.evaluation.lengths import Length
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
-from sl_nerfstudio.evaluation.report.charts import nice_limit
-from sl_nerfstudio.evaluation.report.intrinsics_hint import intrinsics_hint
-from sl_nerfstudio.evaluation.report.pictures import ColourScale, OrthographicView, camera_views, pixel_map, render
-from sl_nerfstudio.evaluation.report.plot3d import decimated
-from sl_nerfstudio.evaluation.report.report import ReportInput, render_report
-from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.evaluation.report.charts import (
+    ColourScale,
+    OrthographicView,
+    camera_views,
+    nice_limit,
+    pixel_map,
+    render,
+)
+from sl_nerfstudio.evaluation.report.scan_report import ReportInput, ResidualThumbnails, intrinsics_hint, render_report
+from sl_nerfstudio.evaluation.report.view3d import decimated
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.mesh import VertexQuality
 from sl_nerfstudio.scan import PoseSigma, read_scan
 
 from .faceted_scan import CAMERA, FacetedScan
@@ -218,7 +220,7 @@ def test_report_with_reference_points_shows_signed_offsets(clean_scan: Path) -> 
 def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
     truth, result = IndexedMesh(sphere(10.0, 100)), IndexedMesh(sphere(10.25, 100))
     reference = PointReference(truth.sample(3000, 0)[0], "")
-    from sl_nerfstudio.geometry.similarity import Similarity
+    from sl_nerfstudio.geometry.lie import Similarity
 
     errors = reference.surface_errors(result, Similarity.identity(), result.sample(500, 1)[0])
     np.testing.assert_allclose(errors, 0.25, atol=0.02)

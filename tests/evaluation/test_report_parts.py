@@ -12,14 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.evaluation.capture_agreement import CaptureAgreement, FrameAgreement
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels
 from sl_nerfstudio.evaluation.evaluate import evaluate
-from sl_nerfstudio.evaluation.frame_pixels import FramePixels
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.report.comparisons import compare_frames
-from sl_nerfstudio.evaluation.report.overlap_graph import draw_overlaps
-from sl_nerfstudio.evaluation.report.pages import page
-from sl_nerfstudio.evaluation.report.thumbnails import ResidualThumbnails, brightness_ratio
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.report.charts import draw_overlaps, page
+from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, brightness_ratio, compare_frames
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
 from sl_nerfstudio.scan import read_scan
 

@@ -1,8 +1,7 @@
 import numpy as np
 import trimesh
 
-from sl_nerfstudio.evaluation.indexed_mesh import IndexedMesh
-from sl_nerfstudio.evaluation.triangles import nearest_on_triangle, neighbours, thin
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, nearest_on_triangle, neighbours, thin
 from sl_nerfstudio.meshing.mesh import Mesh
 
 from .shapes import blob

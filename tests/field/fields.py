@@ -5,9 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.field.hash_grid_torch import encode
-from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
-from sl_nerfstudio.field.torch_backend import knee
+from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.torch_backend import encode, knee
 
 
 def make_field(backend: str, dtype: torch.dtype = torch.float32, seed: int = 0, **options: Any) -> SDFField:

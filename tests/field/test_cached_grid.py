@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from sl_nerfstudio.field.cached_grid import CachedGrid
-from sl_nerfstudio.field.sdf_field import SDFField
+from sl_nerfstudio.field.field import CachedGrid, SDFField
 
 
 class PlaneField(SDFField):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.field.hash_grid import PRIMES, GridLayout, HashGrid
-from sl_nerfstudio.field.hash_grid_torch import corner_rows, corner_weights, encode
+from sl_nerfstudio.field.torch_backend import corner_rows, corner_weights, encode
 
 LAYOUT = GridLayout.build(5, 16, 256, 8, 19, smooth=False)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from sl_nerfstudio.field.row_adam import RowAdam
+from sl_nerfstudio.field.optimiser import RowAdam
 from tests.field.fields import make_field, points_around
 
 

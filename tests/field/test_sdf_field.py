@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
-from sl_nerfstudio.field.table_gradient import TableGradient
+from sl_nerfstudio.field.backend import TableGradient
+from sl_nerfstudio.field.field import FieldConfig, SDFField
 from sl_nerfstudio.field.torch_backend import knee
 from tests.field.fields import make_field, plain_sdf, points_around, relative
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sl_nerfstudio.device_kernels import launches
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.field import backend as backend_module
-from sl_nerfstudio.field.row_adam import _corrections, _step_any, _step_device
+from sl_nerfstudio.field.device_kernels import launches
+from sl_nerfstudio.field.optimiser import _corrections, _step_any, _step_device
 from tests.field.fields import make_field, points_around, relative
 
 

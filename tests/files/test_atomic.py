@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import PARTIAL, remove_partial, write_atomic
-from sl_nerfstudio.files.paths import beside
+from sl_nerfstudio.storage import PARTIAL, beside, remove_partial, write_atomic
 from tests.files.holding import another_process
 
 
@@ -84,7 +83,7 @@ def test_what_a_killed_process_left_is_replaced(tmp_path: Path) -> None:
 
 
 def test_two_processes_do_not_write_into_the_same_file(tmp_path: Path) -> None:
-    hold = "from sl_nerfstudio.files.lock_file import open_alone\nopen_alone(Path(sys.argv[1]))"
+    hold = "from sl_nerfstudio.storage import open_alone\nopen_alone(Path(sys.argv[1]))"
     with (
         another_process(hold, beside(tmp_path / "a", PARTIAL)),
         pytest.raises(UserError, match="a: is in use by another process"),

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sl_nerfstudio import storage
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files import large_arrays
-from sl_nerfstudio.files.large_arrays import GrowingArray, in_file, largest_in_memory, usable_memory
+from sl_nerfstudio.storage import (
+    GrowingArray,
+    in_file,
+    largest_in_memory,
+    usable_memory,
+)
 
 
 @pytest.mark.parametrize("most", [0, 100, 10**6])
@@ -69,8 +74,8 @@ def test_memory_is_as_much_as_control_groups_allow(own, group, text, expected, t
     (tmp_path / "own").write_text(own)
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     assert usable_memory(tmp_path, tmp_path / "own") == (expected or machine)
-    monkeypatch.setattr(large_arrays, "ROOT", tmp_path)
-    monkeypatch.setattr(large_arrays, "OWN", tmp_path / "own")
+    monkeypatch.setattr(storage, "ROOT", tmp_path)
+    monkeypatch.setattr(storage, "OWN", tmp_path / "own")
     assert largest_in_memory() == (expected or machine) // 8
 
 

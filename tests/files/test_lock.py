@@ -9,10 +9,10 @@ import socket
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.lock import LOCK, locked, locked_file
+from sl_nerfstudio.storage import LOCK, locked, locked_file
 from tests.files.holding import another_process, kill
 
-_HOLD = "from sl_nerfstudio.files.lock import locked\nheld = locked(Path(sys.argv[1]))\nheld.__enter__()"
+_HOLD = "from sl_nerfstudio.storage import locked\nheld = locked(Path(sys.argv[1]))\nheld.__enter__()"
 _HOLD_FILE = _HOLD.replace("locked", "locked_file")
 
 

@@ -9,15 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.atomic import PARTIAL
-from sl_nerfstudio.files.lock import LOCK, locked
-from sl_nerfstudio.files.lock_file import Holder
-from sl_nerfstudio.files.new_folder import NewFolder
-from sl_nerfstudio.files.paths import beside
+from sl_nerfstudio.storage import LOCK, PARTIAL, Holder, NewFolder, beside, locked
 from tests.files.holding import another_process, kill
 
 _FILL = """
-from sl_nerfstudio.files.new_folder import NewFolder
+from sl_nerfstudio.storage import NewFolder
 folder = NewFolder(Path(sys.argv[1]))
 for path in sys.argv[2:]:
     folder.write(path, b"old")

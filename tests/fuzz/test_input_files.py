@@ -10,17 +10,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sl_nerfstudio.calibration.device_files import read_device_file
+from sl_nerfstudio.calibration.formats import read_device_file
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.inputs import read_points
+from sl_nerfstudio.evaluation.evaluate import read_points
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
 from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.pattern.layout import PatternLayout
-from sl_nerfstudio.processing.given_poses import GivenPoses, read_given_poses
+from sl_nerfstudio.processing.inputs import GivenPoses, read_given_poses
 from tests.fuzz.damage import IMPOSSIBLE, damaged, places, removed, replaced
 
 SIZE = (640, 480)

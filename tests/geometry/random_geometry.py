@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.se3 import exp_se3
+from sl_nerfstudio.geometry.lie import exp_se3
 
 BATCHES = [(), (1,), (3, 1, 2)]
 seeds = st.integers(0, 2**31 - 1)

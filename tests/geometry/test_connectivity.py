@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.geometry.connectivity import component_labels
+from sl_nerfstudio.geometry.numerics import component_labels
 
 
 def _flooded(a, b, nodes):

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import generator, motions, seeds
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 
 
 def poses_of(seed: int, count: int = 5) -> DevicePoses:

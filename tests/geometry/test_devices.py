@@ -8,9 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import BATCHES, DEVICES, batches, generator, motions, points_in_view, seeds
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian, unproject
-from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    project_jacobian,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import inverse, transform
+from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
 
 names = st.sampled_from(sorted(DEVICES))
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.frustum import OUTLINE, frustum
-from sl_nerfstudio.geometry.viewpoint import beside, far_enough
+from sl_nerfstudio.geometry.triangulation import OUTLINE, beside, far_enough, frustum
 
 DEVICE = Device(w=640, h=400, fl_x=700.0, fl_y=650.0, cx=300.0, cy=210.0)
 TURNED = np.array([[0.0, -1.0, 0.0, 3.0], [0.0, 0.0, -1.0, 4.0], [1.0, 0.0, 0.0, 5.0], [0.0, 0.0, 0.0, 1.0]])

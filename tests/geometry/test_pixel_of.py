@@ -7,9 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_geometry import DEVICES, generator, points_in_view, seeds
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian, unproject
-from sl_nerfstudio.geometry.devices.compiled_view import ray_of, view_of
-from sl_nerfstudio.geometry.devices.models import MODELS, pixel_of
+from sl_nerfstudio.geometry.devices import (
+    MODELS,
+    Device,
+    Intrinsics,
+    pixel_of,
+    project,
+    project_jacobian,
+    ray_of,
+    unproject,
+    view_of,
+)
 
 
 def compiled_pixel(device: Device, p: np.ndarray) -> tuple[float, float, bool]:

@@ -4,8 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.compiled import compiled
-from sl_nerfstudio.geometry.robust import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.parallel import compiled
 
 
 def test_the_factor_turns_a_median_deviation_into_a_standard_deviation():

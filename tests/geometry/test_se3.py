@@ -8,7 +8,7 @@ from random_geometry import BATCHES, angles, batches, directions, generator, mot
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from sl_nerfstudio.geometry.se3 import (
+from sl_nerfstudio.geometry.lie import (
     adjoint,
     exp_se3,
     exp_so3,

@@ -6,7 +6,7 @@ from numpy import ndarray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
+from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
 
 seeds = st.integers(0, 2**31 - 1)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.geometry.spacing import evenly_spaced
+from sl_nerfstudio.geometry.numerics import evenly_spaced
 
 
 @given(st.integers(1, 2**40), st.integers(1, 300))

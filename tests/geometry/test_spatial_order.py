@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sl_nerfstudio.geometry.spatial_order import spatial_order
+from sl_nerfstudio.model.exporters import spatial_order
 
 
 def test_points_are_ordered_by_the_interleaved_bits_of_their_cells() -> None:

@@ -10,9 +10,13 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.geometry.epipolar import epipolar_residual
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
-from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    inverse,
+    rotate,
+    transform,
+)
+from sl_nerfstudio.geometry.triangulation import closest_approach, epipolar_residual, triangulate
 
 names = st.sampled_from(sorted(DEVICES))
 

@@ -9,8 +9,8 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
+from sl_nerfstudio.geometry.lie import exp_se3
+from sl_nerfstudio.matching.lines import EpipolarLines
 from sl_nerfstudio.pattern.grid import GridPattern
 
 PATTERN = GridPattern(w=500, h=500, codes=np.random.default_rng(5).integers(0, 5, (25, 25)).astype(np.int8))

@@ -2,8 +2,13 @@
 
 import numpy as np
 
-from sl_nerfstudio.matching.confidence import FEATURES, RIGHT, Logistic, features_of
-from sl_nerfstudio.matching.semi_global import Matches
+from sl_nerfstudio.matching.costs import StereoMatches
+from sl_nerfstudio.matching.matcher import (
+    FEATURES,
+    RIGHT,
+    Logistic,
+    features_of,
+)
 
 COUNT = len(FEATURES)
 
@@ -11,7 +16,7 @@ COUNT = len(FEATURES)
 def flat_matches(shape=(40, 50)):
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     coords = np.stack([1.4 * x, 1.4 * y], -1)
-    return Matches(
+    return StereoMatches(
         np.full(shape, 7.0, np.float32), np.full(shape, 20, np.uint8), np.full(shape, 99, np.float32)
     ), coords
 
@@ -46,7 +51,7 @@ def test_features_are_what_their_names_say():
 def test_matches_on_a_steep_plane_lie_between_their_neighbours():
     matches, coords = flat_matches()
     y, x = np.mgrid[:40, :50].astype(np.float32)
-    steep = Matches((3 * x - 2 * y + 90).astype(np.float32), matches.cost, matches.margin)
+    steep = StereoMatches((3 * x - 2 * y + 90).astype(np.float32), matches.cost, matches.margin)
     assert (features(steep, coords)[4:-4, 4:-4, -1] == 1).all()
 
 
@@ -55,7 +60,9 @@ def test_a_match_at_the_decoded_place_far_from_jumps_is_right_and_a_lonely_one_b
     p = RIGHT.probability(features(matches, coords))
     assert p.min() > 0.95
     rng = np.random.default_rng(0)
-    wild = Matches(rng.uniform(0, 60, (40, 50)).astype(np.float32), np.full((40, 50), 90, np.uint8), matches.margin * 0)
+    wild = StereoMatches(
+        rng.uniform(0, 60, (40, 50)).astype(np.float32), np.full((40, 50), 90, np.uint8), matches.margin * 0
+    )
     nowhere = np.full_like(coords, np.nan)
     p = RIGHT.probability(features(wild, coords * 20, nowhere, np.zeros((40, 50), bool)))
     assert p.max() < 0.2

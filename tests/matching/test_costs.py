@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
-from sl_nerfstudio.matching.cost_loops import OUTSIDE
-from sl_nerfstudio.matching.costs import correlations, image_statistics, matching_costs
-from sl_nerfstudio.matching.hypotheses import hypotheses, with_offset
-from sl_nerfstudio.matching.settings import CostSettings, HypothesisSettings
+from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
+from sl_nerfstudio.matching.costs import (
+    OUTSIDE,
+    correlations,
+    hypotheses,
+    image_statistics,
+    matching_costs,
+    with_offset,
+)
+from sl_nerfstudio.matching.lines import CostSettings, HypothesisSettings
 from tests.matching.scene import PATTERN, PERIOD, step_scene
 
 SIGMA = 2.0

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, transform
-from sl_nerfstudio.matching.epipolar_lines import EpipolarLines
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
+from sl_nerfstudio.matching.lines import EpipolarLines
 
 CAMERA = Device(w=40, h=30, fl_x=90.0, fl_y=92.0, cx=19.0, cy=16.0, k1=-0.1, k2=0.02, p1=0.002, p2=-0.001)
 PROJECTORS = {

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.drawn_grid import draw_sharpnesses
-from sl_nerfstudio.matching.line_fit import LineFit
-from sl_nerfstudio.matching.settings import LineFitSettings
+from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
+from sl_nerfstudio.matching.lines import LineFitSettings
+from sl_nerfstudio.matching.matcher import LineFit
 from tests.matching.scene import PATTERN, PERIOD, step_scene
 
 SIZE = 200 / 15

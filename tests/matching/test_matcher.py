@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.matching.lines import MATCHING_DEFAULTS, enlarged, pixels_a_period
 from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from sl_nerfstudio.matching.resolution import enlarged, pixels_a_period
-from sl_nerfstudio.matching.settings import MATCHING_DEFAULTS
 from tests.matching.scene import PATTERN, PERIOD, step_scene
 
 

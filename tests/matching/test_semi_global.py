@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.matching.semi_global import UNKNOWN, Matches, match_semi_globally
-from sl_nerfstudio.matching.settings import SmoothnessSettings
+from sl_nerfstudio.matching.costs import UNKNOWN, StereoMatches, match_semi_globally
+from sl_nerfstudio.matching.lines import SmoothnessSettings
 
 SMOOTHNESS = SmoothnessSettings(small=20, large=90, steepest=2, apart=1)
 WAYS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
@@ -93,6 +93,6 @@ def test_a_steep_surface_is_followed_where_it_was_decoded():
 def test_strips_are_joined_in_order():
     costs = np.random.default_rng(0).integers(0, 256, (9, 5, 6)).astype(np.uint8)
     whole = match_semi_globally(costs, nothing_decoded(costs), SMOOTHNESS)
-    joined = Matches.joined([whole.part(slice(0, 4)), whole.part(slice(4, 9))])
+    joined = StereoMatches.joined([whole.part(slice(0, 4)), whole.part(slice(4, 9))])
     np.testing.assert_array_equal(joined.index, whole.index)
     np.testing.assert_array_equal(joined.margin, whole.margin)

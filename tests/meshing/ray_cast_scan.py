@@ -10,7 +10,12 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan import Frame, Scale, Scan, ScanWriter
+from sl_nerfstudio.scan import (
+    Frame,
+    Scale,
+    Scan,
+    ScanWriter,
+)
 
 CAMERA = Device(w=96, h=96, fl_x=160.0, fl_y=160.0, cx=48.0, cy=48.0)
 PROJECTOR = Device(w=400, h=400, fl_x=800.0, fl_y=800.0, cx=200.0, cy=200.0)

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.rays import pixel_rays, world_pixels
-from sl_nerfstudio.meshing.lit_vertices import packed_device
-from sl_nerfstudio.meshing.loops.decoded_offset import compare_decoded
+from sl_nerfstudio.geometry.triangulation import pixel_rays, world_pixels
+from sl_nerfstudio.meshing.visibility import compare_decoded, packed_device
 from tests.meshing.ray_cast_scan import look_at
 
 MOST_PX = 16.0

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.meshing import sparse_grid
+from sl_nerfstudio.meshing import extract
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 
@@ -177,7 +177,7 @@ def test_not_a_number_says_so():
 
 
 def test_a_field_that_is_zero_everywhere_is_refused_before_memory_runs_out(monkeypatch):
-    monkeypatch.setattr(sparse_grid, "MAX_LEAVES", 100_000)
+    monkeypatch.setattr(extract, "MAX_LEAVES", 100_000)
     with pytest.raises(UserError, match=r"is not a surface yet.*--resolution"):
         extract_mesh(lambda p: 1e-3 * torch.sin(500 * p).prod(-1), 256)
 

@@ -8,14 +8,9 @@ import torch
 import trimesh
 
 from sl_nerfstudio.meshing.extract import extract_mesh
-from sl_nerfstudio.meshing.finishing.closed_field import ClosedField
-from sl_nerfstudio.meshing.finishing.decimate import decimate
-from sl_nerfstudio.meshing.finishing.fill_holes import fill_holes
-from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.trim import Trimmed
-from sl_nerfstudio.meshing.vertex_properties import VertexProperties
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.finish import ClosedField, MarkedMesh, decimate, fill_holes
+from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
+from sl_nerfstudio.meshing.visibility import Trimmed
 
 BALL = trimesh.creation.icosphere(4, 10.0)
 MESH = Mesh(np.asarray(BALL.vertices, dtype=np.float64), np.asarray(BALL.faces, dtype=np.int64))

@@ -10,11 +10,8 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from sl_nerfstudio.meshing.formats.point_files import observed_points, write_points
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
-from sl_nerfstudio.meshing.vertex_properties import VertexProperties
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.files import observed_points, read_mesh, write_mesh, write_points
+from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
 
 # A corner with three unequal legs along the axes: no turn or mirror image of it is the same. It is 82 mm long.
 VERTICES = np.array([[0.0, 0, 0], [82, 0, 0], [0, 30, 0], [0, 0, 11]]) + [5.0, -3.0, 2.0]

@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 
-from sl_nerfstudio.meshing.marching_table import EDGE_CORNERS, FACE_CORNERS, triangle_table
+from sl_nerfstudio.meshing.extract import EDGE_CORNERS, FACE_CORNERS, triangle_table
 
 POSITION = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)], dtype=float)
 MIDDLE = np.array([POSITION[list(pair)].mean(0) for pair in EDGE_CORNERS])

@@ -7,8 +7,13 @@ import pytest
 import trimesh
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.meshing.files import (
+    SUFFIXES,
+    files_of,
+    read_mesh,
+    write_mesh,
+)
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import SUFFIXES, files_of, read_mesh, write_mesh
 
 SOLID = trimesh.creation.icosphere(subdivisions=2)
 MESH = Mesh(

@@ -7,10 +7,8 @@ import open3d as o3d
 import pytest
 import trimesh
 
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
-from sl_nerfstudio.meshing.ply import encode_ply, read_quality
-from sl_nerfstudio.meshing.vertex_properties import VertexProperties
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.meshing.files import encode_ply, read_mesh, read_quality, write_mesh
+from sl_nerfstudio.meshing.mesh import VertexProperties, VertexQuality
 
 from .test_visibility import plate
 

@@ -7,15 +7,25 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, rotate, transform
-from sl_nerfstudio.meshing.loops.derivatives import VIEW, derive_residual, view_point
-from sl_nerfstudio.meshing.surface_derivatives import (
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    inverse,
+    rotate,
+    transform,
+)
+from sl_nerfstudio.meshing.uncertainty import (
     FrameDevices,
     packed_devices,
     point_equations,
     view_surface,
 )
+from sl_nerfstudio.meshing.visibility import VIEW, derive_residual, view_point
 from tests.bundle_adjustment.analytic import look_at
 
 CAMERA = Device(300, 300, 410.0, 400.0, 148.0, 152.0, k1=-0.1, p1=0.002)

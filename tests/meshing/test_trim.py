@@ -8,12 +8,10 @@ import pytest
 import torch
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.trim import trim_to_observed
+from sl_nerfstudio.meshing.visibility import trim_to_observed
 
 from .ray_cast_scan import CAMERA, look_at, pairs_around, scan_of
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.vertex_colour import vertex_colours
-from sl_nerfstudio.meshing.vertex_properties import GREY
+from sl_nerfstudio.meshing.mesh import GREY, Mesh
+from sl_nerfstudio.meshing.texture import vertex_colours
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 

@@ -7,17 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.surface_derivatives import view_surface
-from sl_nerfstudio.meshing.vertex_noise import AVERAGED_CELLS, Smoothing, independent_variance
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
-from sl_nerfstudio.meshing.vertex_sums import VertexSums, sum_views
-from sl_nerfstudio.meshing.vertex_uncertainty import surface_rows, vertex_uncertainty
-from sl_nerfstudio.meshing.vertex_views import FrameViews, VertexViews, collect_views, devices_of, views_by_frame
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
+from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
+from sl_nerfstudio.meshing.uncertainty import (
+    AVERAGED_CELLS,
+    FrameViews,
+    Smoothing,
+    VertexSums,
+    VertexViews,
+    collect_views,
+    devices_of,
+    independent_variance,
+    sum_views,
+    surface_rows,
+    vertex_uncertainty,
+    view_surface,
+    views_by_frame,
+)
 from sl_nerfstudio.scan import Scan
 
 from .ray_cast_scan import pairs_around, scan_of
@@ -101,7 +108,7 @@ def test_frames_that_confirm_too_little_have_the_noise_of_the_others():
 
 def test_random_draws_are_multiplied_with_fewer_digits(scan: Scan, monkeypatch: pytest.MonkeyPatch):
     exact = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
-    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.joint_covariance.draws.EXACT_UNKNOWNS", 0)
+    monkeypatch.setattr("sl_nerfstudio.bundle_adjustment.covariance.EXACT_UNKNOWNS", 0)
     found = vertex_uncertainty(hill(), scan, scan.poses, random_joint(), CELL)
     assert not np.array_equal(found.sigma, exact.sigma, equal_nan=True)
     np.testing.assert_allclose(found.sigma, exact.sigma, rtol=1e-4)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from sl_nerfstudio.model.history import History
+from sl_nerfstudio.model.outputs import History
 
 
 def row(loss: float, rmse: float) -> dict[str, torch.Tensor]:

@@ -9,13 +9,12 @@ import torch
 from nerfstudio.data.scene_box import SceneBox
 from scipy.spatial import KDTree
 
+from sl_nerfstudio.dataparser.datamanager import SceneRays
 from sl_nerfstudio.dataparser.dataparser import load_scan
-from sl_nerfstudio.dataparser.scene_rays import SceneRays
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.trim import trim_to_observed
-from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.meshing.visibility import trim_to_observed
+from sl_nerfstudio.model.model import SLModel, SLModelConfig
 from sl_nerfstudio.scan import read_ground_truth
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.rays import pixel_centres, pixel_rays
-from sl_nerfstudio.geometry.se3 import inverse
-from sl_nerfstudio.model.measured_coordinates import MeasuredCoordinates
+from sl_nerfstudio.geometry.lie import inverse
+from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
+from sl_nerfstudio.model.outputs import MeasuredCoordinates
 from sl_nerfstudio.scan import Frame, read_scan
 from tests.dataparser.tiny_scan import TinyScan
 

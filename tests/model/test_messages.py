@@ -2,12 +2,17 @@
 
 import torch
 
-from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
+from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
-from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
+from sl_nerfstudio.model.messages import (
+    contradiction_message,
+    departed_message,
+    poses_message,
+    unplaced_message,
+)
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment
-from sl_nerfstudio.verdict.departed_frames import DepartedFrame
+from sl_nerfstudio.review.verdict import DepartedFrame
 
 from ..bundle_adjustment.analytic import rig_of
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse
-from sl_nerfstudio.model.config import SLModelConfig
-from sl_nerfstudio.model.pose_parameters import (
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
+from sl_nerfstudio.geometry.lie import exp_se3, inverse
+from sl_nerfstudio.model.model import SLModelConfig
+from sl_nerfstudio.model.poses import (
     CoupledPoseParameters,
     IndependentPoseParameters,
     PoseParameters,

@@ -9,21 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.gauge import gauge_directions
-from sl_nerfstudio.bundle_adjustment.joint_covariance.known_length import with_known_length
-from sl_nerfstudio.bundle_adjustment.rig import Rig
+from sl_nerfstudio.bundle_adjustment.covariance import with_known_length
+from sl_nerfstudio.bundle_adjustment.parameters import gauge_directions
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
-from sl_nerfstudio.dataparser.dataparser import LoadedScan
-from sl_nerfstudio.dataparser.fingerprint import scan_fingerprint
-from sl_nerfstudio.dataparser.samples import PixelSamples, build_samples
+from sl_nerfstudio.dataparser.dataparser import LoadedScan, PixelSamples, build_samples, scan_fingerprint
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.methods import sl_neus
-from sl_nerfstudio.model import intrinsics_refinement
-from sl_nerfstudio.model.intrinsics_refinement import RefinedIntrinsics, refine_intrinsics
-from sl_nerfstudio.model.messages import poses_message, refined_intrinsics_message
+from sl_nerfstudio.model import messages
+from sl_nerfstudio.model.messages import RefinedIntrinsics, poses_message, refine_intrinsics, refined_intrinsics_message
 from sl_nerfstudio.model.pose_refinement import (
     Found,
     PriorConfig,
@@ -35,8 +31,8 @@ from sl_nerfstudio.model.pose_refinement import (
     scene_rig,
     sigmas_in_scan_units,
 )
+from sl_nerfstudio.model.run_files import as_tensor
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training.fingerprints import as_tensor
 from sl_nerfstudio.scan import (
     PickedPixel,
     PoseSigma,
@@ -272,8 +268,8 @@ def test_refinement_starts_from_a_stated_change(scan, corrected):
 def test_held_out_pixels_decide_once_about_intrinsics(scan, corrected, monkeypatch):
     """With repeated decisions on the same pixels, one would be positive by chance."""
     calls = []
-    real = intrinsics_refinement.cross_validate
-    monkeypatch.setattr(intrinsics_refinement, "cross_validate", lambda *a: calls.append(a) or real(*a))
+    real = messages.cross_validate
+    monkeypatch.setattr(messages, "cross_validate", lambda *a: calls.append(a) or real(*a))
     refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
     assert len(calls) == 1
 

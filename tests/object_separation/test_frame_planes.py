@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.object_separation.frame_planes import FramePlane, find_bare_places, on_plane, plane_in_frame
-from sl_nerfstudio.object_separation.frame_points import FramePoints
-from sl_nerfstudio.object_separation.plane import Plane
-from sl_nerfstudio.object_separation.settings import SEPARATION_DEFAULTS
+from sl_nerfstudio.object_separation.planes import (
+    SEPARATION_DEFAULTS,
+    FramePlane,
+    FramePoints,
+    Plane,
+    find_bare_places,
+    on_plane,
+    plane_in_frame,
+)
 
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 SIGMA = 0.1

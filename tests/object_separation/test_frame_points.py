@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sl_nerfstudio.object_separation.frame_points import cross_frame_noise, normals_of, points_of
+from sl_nerfstudio.object_separation.planes import cross_frame_noise, normals_of, points_of
 
 
 def test_points_of_the_table_scatter_about_it_by_their_stated_sigma(cases):

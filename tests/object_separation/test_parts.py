@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.object_separation.parts import find_object
-from sl_nerfstudio.object_separation.plane import Plane
-from sl_nerfstudio.object_separation.settings import SEPARATION_DEFAULTS
-from sl_nerfstudio.object_separation.viewed_region import ViewedRegion
+from sl_nerfstudio.object_separation.planes import SEPARATION_DEFAULTS, Plane, ViewedRegion
+from sl_nerfstudio.object_separation.separate import find_object
 
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 REGION = ViewedRegion(np.array([0.0, 0.0, 50.0]), 80.0)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.object_separation.plane import Plane, fit_plane
+from sl_nerfstudio.object_separation.planes import Plane, fit_plane
 
 
 @given(st.integers(0, 2**31 - 1))

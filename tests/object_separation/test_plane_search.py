@@ -3,11 +3,16 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.object_separation.frame_points import FramePoints, normals_of
-from sl_nerfstudio.object_separation.plane import Plane, fit_plane
-from sl_nerfstudio.object_separation.plane_growth import grown_planes
-from sl_nerfstudio.object_separation.plane_search import PointPool, find_planes
-from sl_nerfstudio.object_separation.settings import SEPARATION_DEFAULTS
+from sl_nerfstudio.object_separation.planes import (
+    SEPARATION_DEFAULTS,
+    FramePoints,
+    Plane,
+    PointPool,
+    find_planes,
+    fit_plane,
+    grown_planes,
+    normals_of,
+)
 
 
 def _frame(p, camera=(20.0, -30.0, 400.0)):

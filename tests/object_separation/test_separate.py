@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.object_separation.frame_points import points_of
+from sl_nerfstudio.object_separation.planes import points_of
 from sl_nerfstudio.object_separation.separate import Part, separate
 
 pytestmark = pytest.mark.long

@@ -3,8 +3,8 @@
 import numpy as np
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.object_separation.frame_points import DecodedFrame
-from sl_nerfstudio.object_separation.silhouette import silhouette
+from sl_nerfstudio.object_separation.planes import DecodedFrame
+from sl_nerfstudio.object_separation.separate import silhouette
 
 CAMERA = Device(120, 100, 200.0, 200.0, 60.0, 50.0)
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.object_separation.frame_points import DecodedFrame
-from sl_nerfstudio.object_separation.viewed_region import viewed_region
-from sl_nerfstudio.synthesis.paths import look_at
+from sl_nerfstudio.object_separation.planes import DecodedFrame, viewed_region
+from sl_nerfstudio.synthesis.devices import look_at
 
 CENTRE = np.array([10.0, -20.0, 30.0])
 

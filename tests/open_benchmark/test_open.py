@@ -15,7 +15,7 @@ from benchmarks.open import scoring
 from benchmarks.open.results import read_handed_poses
 from benchmarks.open.scans import SCANS, OpenScan, checksum
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.meshing.mesh_io import read_mesh, write_mesh
+from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 
 TINY = {"frames": 3, "resolution": 72, "supersampling": 1}
 NAMES = ("rough-cone", "photographs-head")

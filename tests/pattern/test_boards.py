@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.board_values import counts, millimetres
-from sl_nerfstudio.pattern.boards import CharucoBoard, Chessboard, draw_board
+from sl_nerfstudio.pattern.boards import CharucoBoard, Chessboard, counts, draw_board, millimetres
 
 CHARUCO = [
     CharucoBoard(6, 5, 7.5, 5.6, "5X5_1000"),

@@ -5,7 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from sl_nerfstudio.pattern.codes import code_array, hamming_margins, is_generated, rotate_codes, windows
+from sl_nerfstudio.pattern.codes import (
+    code_array,
+    hamming_margins,
+    is_generated,
+    rotate_codes,
+    windows,
+)
 
 _AFTER_A_QUARTER_TURN = {0: 0, 1: 3, 2: 4, 3: 1, 4: 2}
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.pattern.gaussian_window import gaussian_window
+from sl_nerfstudio.pattern.grid import gaussian_window
 
 
 def direct(values, sigma):

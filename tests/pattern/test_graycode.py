@@ -8,8 +8,8 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout, read_pattern
-from sl_nerfstudio.pattern.graycode import GrayCode, gray, ungray
-from sl_nerfstudio.pattern.sequence import SequenceName, Shown
+from sl_nerfstudio.pattern.gray_code import GrayCode, gray, ungray
+from sl_nerfstudio.pattern.layout import SequenceName, ShownImage
 
 
 def test_neighbours_differ_in_one_bit_and_indices_are_recovered():
@@ -71,7 +71,7 @@ def test_the_orders_of_other_programs_are_written_and_read_back(tmp_path, name):
     assert read_layout(path) == layout and name in layout.order.split(", ")
     images = list(layout.sequence())
     assert len(images) == layout.images and all(image.shape == (48, 64) for image in images)
-    assert [str(Shown.of(str(shown))) for shown in layout.shown] == json.loads(layout.encode())["sequence"]
+    assert [str(ShownImage.of(str(shown))) for shown in layout.shown] == json.loads(layout.encode())["sequence"]
 
 
 def test_the_orders_are_those_of_the_programs():

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.pattern.image import sample_bilinear
+from sl_nerfstudio.pattern.grid import sample_bilinear
 
 
 @given(st.integers(0, 10_000))

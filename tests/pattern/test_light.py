@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.pattern.light import projected_light
+from sl_nerfstudio.pattern.grid import GridPattern, projected_light
 
 GRID = GridPattern(w=800, h=800)
 PICTURE = GRID.render()

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.pattern.normalise import normalise_locally
+from sl_nerfstudio.pattern.grid import GridPattern, normalise_locally
 
 
 @pytest.fixture(scope="module")

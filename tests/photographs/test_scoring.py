@@ -12,7 +12,7 @@ from benchmarks.photographs.scoring import decoding_figures, pose_errors
 from benchmarks.photographs.sets import SETS, CaptureSet, captures_of, frame_names
 from benchmarks.photographs.truth import read_truth
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.scan.types import PoseSigma

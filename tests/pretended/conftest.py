@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks.common.training import Training, settings
-from sl_nerfstudio.field.cached_grid import CachedGrid
+from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from tests.dataparser.tiny_scan import TinyScan
 from tests.model.training.small_runs import own_signals

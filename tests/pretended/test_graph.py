@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.pretended.gpu import PretendedGpu
 from benchmarks.pretended.recorder import PretendedRecorder
-from sl_nerfstudio.model.training.step_graph import WARM_UP, NotRecordedError, StepGraph
+from sl_nerfstudio.model.loop import WARM_UP, NotRecordedError, StepGraph
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from benchmarks.pretended.gpu import MixedDevicesError, PretendedGpu
-from sl_nerfstudio.bundle_adjustment.cross_validation import CrossValidation
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import joint_of_prior
+from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation
+from sl_nerfstudio.bundle_adjustment.covariance import joint_of_prior
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment, pose_prior, scene_rig
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely

@@ -8,10 +8,10 @@ import torch
 
 from benchmarks.pretended.gpu import PretendedGpu
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.training.checkpoints import checkpoints_in
-from sl_nerfstudio.model.viewer.surface import MODES, RENDERED, Surface
+from sl_nerfstudio.model.run_files import checkpoints_in
+from sl_nerfstudio.model.viewer import MODES, RENDERED, ViewerSurface
+from sl_nerfstudio.runs.export import build_surface
 from sl_nerfstudio.runs.export_settings import ExportSettings
-from sl_nerfstudio.runs.surface import build_surface
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -74,7 +74,7 @@ def _shows(model):
     camera = Cameras(camera_to_worlds=pose, fx=focal, fy=focal, cx=focal / 4, cy=focal / 4, width=size, height=size)
     picture = model.get_outputs_for_camera(camera)
     assert picture["rgb"].shape == (12, 12, 3) and picture["rgb"].device.type == "cuda"
-    surface = Surface(model, resolution=16)
+    surface = ViewerSurface(model, resolution=16)
     for mode in MODES:
         if mode != RENDERED and mode != "views":
             assert surface.coloured(mode, 0).rgb.shape == (len(surface.mesh.vertices), 3)

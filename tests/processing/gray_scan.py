@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.pattern.image import sample_bilinear
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.pattern.grid import sample_bilinear
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.writing import device_fields
+from sl_nerfstudio.scan.write import device_fields
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.synthesise import make_setup
 
 LAYOUT = GrayCode(800, 800, 4)
 

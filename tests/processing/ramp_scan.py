@@ -10,11 +10,11 @@ import numpy as np
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frame_worker import FrameJob
+from sl_nerfstudio.processing.frames import FrameJob
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.writing import device_fields
+from sl_nerfstudio.scan.write import device_fields
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.pattern.ramps import Ramps
 

@@ -1,7 +1,6 @@
 """What to capture again, with the reason."""
 
-from sl_nerfstudio.processing.advice import unconnected_neighbours, what_to_recapture
-from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, unconnected_neighbours, what_to_recapture
 
 
 def _frame(name, **values):

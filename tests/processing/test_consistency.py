@@ -18,8 +18,7 @@ from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
 from sl_nerfstudio.registration.assembly import Assembly
-from sl_nerfstudio.registration.frame_cloud import frame_cloud
-from sl_nerfstudio.registration.reinclusion import include_left_out
+from sl_nerfstudio.registration.register import include_left_out
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Edge,
@@ -29,7 +28,8 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+from sl_nerfstudio.registration.surfaces import frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from tests.bundle_adjustment import analytic
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of

@@ -15,14 +15,13 @@ import pytest
 
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.large_arrays import in_file
+from sl_nerfstudio.processing import records
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frame_stage import describe_frame_stage, run_frame_stage, run_frames
-from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
-from sl_nerfstudio.processing.kept import large_clouds
-from sl_nerfstudio.processing.kept.records import digest
+from sl_nerfstudio.processing.frames import FrameWorker, clouds_of, describe_frame_stage, run_frame_stage, run_frames
+from sl_nerfstudio.processing.records import digest
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.storage import in_file
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
@@ -53,8 +52,8 @@ def _run_command(scan, out, most_in_memory):
     written, said = [], io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
         register_ramps(patch)
-        patch.setattr(large_clouds, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
-        patch.setattr(large_clouds, "largest_in_memory", lambda: most_in_memory)
+        patch.setattr(records, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
+        patch.setattr(records, "largest_in_memory", lambda: most_in_memory)
         patch.setattr(sys, "argv", ["sl-process", *scan.flags(out)])
         main()
     return said.getvalue(), bool(written)
@@ -204,7 +203,7 @@ def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path))
     clouds = clouds_of([worker(frame) for frame in _captures(ramp_scan).frames])
     size = sum(array.nbytes for array in (clouds[0].points, clouds[0].coords))
-    kept = large_clouds.LargeClouds(6 * size)
+    kept = records.LargeClouds(6 * size)
     same = [kept.kept(cloud) for cloud in clouds]
     assert digest(tuple(same)) == digest(tuple(clouds))
     assert not _mapped(same[0].points) and _mapped(same[-1].points) and _mapped(same[-1].pose.noise_px)

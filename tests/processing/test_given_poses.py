@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.given_poses import GivenPoses, align_to, read_given_poses
+from sl_nerfstudio.processing.inputs import GivenPoses, align_to, read_given_poses
 
 AT_PLACE, TURNED = np.eye(4).tolist(), np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
 

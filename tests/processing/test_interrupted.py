@@ -11,14 +11,13 @@ import pytest
 
 from benchmarks.attacks.dying import dying
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
-from sl_nerfstudio.files.lock import LOCK, locked
-from sl_nerfstudio.files.new_folder import NewFolder
-from sl_nerfstudio.processing import frame_stage, frame_worker
+from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
+from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.kept.records import digest
 from sl_nerfstudio.processing.process import process
+from sl_nerfstudio.processing.records import digest
+from sl_nerfstudio.storage import LOCK, NewFolder, locked
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
 
@@ -83,7 +82,7 @@ def test_killed_at_any_moment_the_next_run_ends_with_the_same_bytes(whole, confi
 
 
 def test_nothing_is_computed_again(whole, resumed, monkeypatch):
-    for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frame_worker, "estimate_relative_pose")):
+    for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frames, "estimate_relative_pose")):
         monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called again"))
     run(resumed)
     assert content(resumed.output) == content(whole / "s")
@@ -104,14 +103,14 @@ def test_with_other_settings_frames_are_registered_again(ramp_scan, resumed, cha
 
 def test_results_in_another_order_are_the_same_and_in_the_order_of_the_captures(ramp_scan, resumed, monkeypatch):
     job, captures = ramp_scan.job(resumed.work_folder), find_captures(ramp_scan.root / "images", True)
-    usual = frame_stage.run_frame_stage(resumed, job, captures)
-    real = frame_stage.run_frames
+    usual = frames.run_frame_stage(resumed, job, captures)
+    real = frames.run_frames
 
     def reversed_frames(*arguments):
         yield from reversed(list(real(*arguments)))
 
-    monkeypatch.setattr(frame_stage, "run_frames", reversed_frames)
-    turned = frame_stage.run_frame_stage(resumed, job, captures)
+    monkeypatch.setattr(frames, "run_frames", reversed_frames)
+    turned = frames.run_frame_stage(resumed, job, captures)
     assert [result.name for result in turned] == list(NAMES)
     assert digest([result.cloud for result in turned]) == digest([result.cloud for result in usual])
 

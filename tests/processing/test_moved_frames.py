@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.geometry.similarity import angle_deg
+from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import _doubtful, adjust_consistent
 from sl_nerfstudio.registration.result import Registration
-from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 from tests.registration.shaped_clouds import rendered

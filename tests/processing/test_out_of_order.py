@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.registration.projector_choice import ProjectorChoice
+from sl_nerfstudio.registration.register import ProjectorChoice
 from sl_nerfstudio.registration.result import Registration, UndecidedProjector
 
 NAMES = ("a", "b", "c")

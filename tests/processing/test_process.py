@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import fit_similarity
-from sl_nerfstudio.processing import consistency, failures
+from sl_nerfstudio.geometry.lie import fit_similarity
+from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.processing.failures import require_given_poses
-from sl_nerfstudio.processing.given_poses import GivenPoses
-from sl_nerfstudio.processing.inputs import frames_by_name, read_inputs
-from sl_nerfstudio.processing.process import process
-from sl_nerfstudio.registration.known_length import parse_known_length
-from sl_nerfstudio.registration.result import NoCommonSurface
+from sl_nerfstudio.processing.inputs import GivenPoses, frames_by_name, read_inputs
+from sl_nerfstudio.processing.process import process, require_given_poses
+from sl_nerfstudio.registration.result import NoCommonSurface, parse_known_length
 from sl_nerfstudio.scan import check_scan, read_scan
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
@@ -208,7 +205,7 @@ def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_pa
     T = ramp_scan.T_world_camera.copy()
     T[:3, :3, 3] = (1, 2, 3)
     lost = SimpleNamespace(stage="registering", reason="alone")
-    monkeypatch.setattr(failures, "left_out", lambda result, _: lost if result.name == NAMES[3] else None)
+    monkeypatch.setattr(stages, "left_out", lambda result, _: lost if result.name == NAMES[3] else None)
     results = [SimpleNamespace(name=name) for name in NAMES]
     config = ramp_scan.config(tmp_path / "s", poses=tmp_path / "r.json")
     with pytest.raises(UserError, match=r"registered frames are all at the same place\n.*frames with other positions"):

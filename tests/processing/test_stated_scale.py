@@ -3,7 +3,7 @@
 import pytest
 
 from sl_nerfstudio.processing.scan_poses import stated_scale
-from sl_nerfstudio.registration.known_length import KnownLength
+from sl_nerfstudio.registration.result import KnownLength
 from sl_nerfstudio.scan import PickedPixel, Scale
 
 

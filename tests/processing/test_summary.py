@@ -9,13 +9,12 @@ import pytest
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
 from sl_nerfstudio.processing.consistency import compare_registered
-from sl_nerfstudio.processing.frame_worker import FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.result import exclusion_sentence, left_out, summarise
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.processing.summary import left_out, summarise
-from sl_nerfstudio.processing.words import exclusion_sentence
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import NoCommonSurface, SeparatePoses, UncertainRotation
-from sl_nerfstudio.verdict.shared_surface import SurfaceShares
+from sl_nerfstudio.review.coverage import SurfaceShares
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 

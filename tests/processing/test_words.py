@@ -4,7 +4,7 @@ import typing
 
 import pytest
 
-from sl_nerfstudio.processing.words import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
+from sl_nerfstudio.processing.result import degeneracy_sentence, exclusion_sentence, uncertainty_sentence
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
@@ -16,8 +16,7 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
-from sl_nerfstudio.relative_pose.degeneracy import Degeneracy, DegeneracyKind
-from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
+from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind, estimate_relative_pose
 from tests.relative_pose.two_views import view
 
 DEGENERACIES: dict[str, tuple[Degeneracy, str]] = {

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from sl_nerfstudio.processing import workers
+from sl_nerfstudio.processing import frames
 
 _PARENT = """
 import os, time
 from concurrent.futures import as_completed
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.processing.workers import no_interrupts, worker_pool
+from sl_nerfstudio.processing.frames import no_interrupts, worker_pool
 
 def begin(word):
     print(word, os.getpid(), flush=True)
@@ -89,7 +89,7 @@ def test_a_signal_ends_the_workers_and_only_the_parent_speaks(busy, number, to_a
     [(0.36, 64, 16), (0.36, 8, 3), (12.2, 16, 3), (12.2, 64, 13), (24, 32, 4), (0.36, 2, 1), (50, 4, 1)],
 )
 def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, megapixels, gigabytes, expected):
-    monkeypatch.setattr(workers, "cores", lambda: 16)
-    found = workers.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
+    monkeypatch.setattr(frames, "cores", lambda: 16)
+    found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
     assert found == expected
     assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes

@@ -7,15 +7,15 @@ import pytest
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.files.new_folder import NewFolder
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frame_worker import FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
+from sl_nerfstudio.processing.process import write_scan
+from sl_nerfstudio.processing.result import summarise
 from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.processing.summary import summarise
-from sl_nerfstudio.processing.writing import write_scan
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.storage import NewFolder
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import LAYOUT, NAMES
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.redecoding.acceptance import FALSE, learn
-from sl_nerfstudio.redecoding.measure import Measured
+from sl_nerfstudio.redecoding.measure import FALSE, Measured, learn
 
 RNG = np.random.default_rng(0)
 

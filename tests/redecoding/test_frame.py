@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.redecoding.ambiguity import Ambiguity
-from sl_nerfstudio.redecoding.frame import redecode_frame
-from sl_nerfstudio.redecoding.prediction import Surface
+from sl_nerfstudio.redecoding.measure import Ambiguity
+from sl_nerfstudio.redecoding.redecode import PredictedSurface, redecode_frame
 from tests.redecoding.lit_ball import (
     CAMERA,
     PROJECTOR,
@@ -25,7 +24,7 @@ MASK = np.isfinite(truth()).all(-1)
 
 @pytest.fixture(scope="module")
 def predicted():
-    return Surface(ball()).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
+    return PredictedSurface(ball()).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
 
 
 def again(decoded, predicted, image=None, mask=MASK):
@@ -51,7 +50,7 @@ def test_cells_that_were_removed_come_back(predicted, share):
 
 
 def test_of_many_decoded_pixels_a_part_is_enough_to_learn_from(predicted, monkeypatch):
-    monkeypatch.setattr("sl_nerfstudio.redecoding.frame._MANY", 3000)
+    monkeypatch.setattr("sl_nerfstudio.redecoding.redecode._MANY", 3000)
     decoded = with_holes(truth(), 0.6)
     found, facts = again(decoded, predicted)
     assert facts.checked < 0.15 * facts.decoded_before and facts.decoded_after > 0.75 * MASK.sum()

@@ -4,20 +4,25 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from sl_nerfstudio.redecoding.ambiguity import Ambiguity
-from sl_nerfstudio.redecoding.correlation import View, Window, correlations, fit_shifts
+from sl_nerfstudio.redecoding.measure import (
+    Ambiguity,
+    CorrelationWindow,
+    PatternView,
+    correlations,
+    fit_shifts,
+)
 from tests.redecoding.lit_ball import grid
 
 RNG = np.random.default_rng(1)
 DOTS = gaussian_filter(RNG.random((120, 140)).astype(np.float32), 2.0)
 
 
-def flat_view(image: np.ndarray, depth: np.ndarray | None = None) -> View:
+def flat_view(image: np.ndarray, depth: np.ndarray | None = None) -> PatternView:
     """A camera that looks at the pattern itself."""
     h, w = image.shape
     coords = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).astype(np.float32)
     depth = np.ones_like(image) if depth is None else depth
-    return View(image, coords, depth, np.ones(image.shape, dtype=bool))
+    return PatternView(image, coords, depth, np.ones(image.shape, dtype=bool))
 
 
 def test_a_grid_resembles_itself_at_whole_periods():
@@ -42,7 +47,7 @@ def test_a_flat_or_a_striped_pattern_is_no_special_case(pattern):
 
 def test_correlation_is_that_of_numpy_whatever_the_gain():
     image = (0.2 + 0.5 * shift(DOTS, (0.5, -1.0), order=1, mode="nearest")).astype(np.float32)
-    window = Window.gaussian(4.0)
+    window = CorrelationWindow.gaussian(4.0)
     candidates = np.dstack([DOTS, np.roll(DOTS, 3, 0)])
     found = correlations(flat_view(image), candidates, np.array([[50, 60], [2, 3]]), window)
     for n, (row, column) in enumerate([(50, 60), (2, 3)]):
@@ -58,7 +63,9 @@ def test_correlation_is_that_of_numpy_whatever_the_gain():
 def test_a_displacement_is_found_to_a_hundredth_of_a_pixel():
     image = 0.1 + 0.3 * shift(DOTS, (-0.37, 0.81), order=3)
     places = np.argwhere(np.pad(np.ones((60, 60), dtype=bool), 30)[:120, :140])[::37]
-    fit = fit_shifts(flat_view(image), DOTS, places, np.zeros((len(places), 2), dtype=np.float32), Window.gaussian(5.0))
+    fit = fit_shifts(
+        flat_view(image), DOTS, places, np.zeros((len(places), 2), dtype=np.float32), CorrelationWindow.gaussian(5.0)
+    )
     np.testing.assert_allclose(np.median(fit.shift, 0), [-0.81, 0.37], atol=0.02)
     assert np.abs(fit.shift - [-0.81, 0.37]).max() < 0.15 and fit.correlation.min() > 0.99
     assert fit.covered.min() == pytest.approx(1, abs=1e-5) and fit.step.max() < 0.05
@@ -71,13 +78,22 @@ def test_a_window_stays_on_its_surface():
     image = DOTS.copy()
     image[:, 70:] = RNG.random((120, 70))
     fit = fit_shifts(
-        flat_view(image, depth), DOTS, np.array([[60, 67]]), np.zeros((1, 2), np.float32), Window.gaussian(5.0)
+        flat_view(image, depth),
+        DOTS,
+        np.array([[60, 67]]),
+        np.zeros((1, 2), np.float32),
+        CorrelationWindow.gaussian(5.0),
     )
     assert fit.correlation[0] > 0.999 and np.abs(fit.shift).max() < 0.01 and 0.5 < fit.covered[0] < 0.9
 
 
 def test_a_blank_image_has_no_place():
     blank = np.full_like(DOTS, 0.4)
-    fit = fit_shifts(flat_view(blank), DOTS, np.array([[60, 60]]), np.zeros((1, 2), np.float32), Window.gaussian(5.0))
+    fit = fit_shifts(
+        flat_view(blank), DOTS, np.array([[60, 60]]), np.zeros((1, 2), np.float32), CorrelationWindow.gaussian(5.0)
+    )
     assert fit.correlation[0] == 0 and fit.sigma[0] == np.inf
-    assert correlations(flat_view(blank), DOTS[..., None], np.array([[60, 60]]), Window.gaussian(5.0)).item() == 0
+    assert (
+        correlations(flat_view(blank), DOTS[..., None], np.array([[60, 60]]), CorrelationWindow.gaussian(5.0)).item()
+        == 0
+    )

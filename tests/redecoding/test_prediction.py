@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.redecoding.prediction import Surface
+from sl_nerfstudio.redecoding.redecode import PredictedSurface
 from tests.redecoding.lit_ball import CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR, ball, seen_at, truth
 
 
 @pytest.fixture(scope="module")
 def predicted():
-    return Surface(ball()).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
+    return PredictedSurface(ball()).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
 
 
 def test_coordinates_are_those_of_the_ball(predicted):
@@ -38,7 +38,7 @@ def test_there_is_no_prediction_in_the_shadow_of_something_else():
     corners = 150 * way + 20 * np.array([side, [0, 0, 1], -side, [0, 0, -1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(ball().vertices)
     shaded = Mesh(np.concatenate([ball().vertices, corners]), np.concatenate([ball().faces, faces]))
-    found = Surface(shaded).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
+    found = PredictedSurface(shaded).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
     light = np.abs(truth() - 200).max(-1)  # the plate is about the middle of the light
     assert not found.known[light < 60].any() and found.known[(light > 155) & (light < 170)].mean() > 0.9
 
@@ -49,7 +49,7 @@ def test_a_far_away_origin_changes_nothing(predicted):
     T_camera[:3, 3] += shift
     T_projector[:3, 3] += shift
     moved = Mesh(ball().vertices + shift, ball().faces)
-    found = Surface(moved).predict(CAMERA, PROJECTOR, T_camera, T_projector)
+    found = PredictedSurface(moved).predict(CAMERA, PROJECTOR, T_camera, T_projector)
     same = found.known & predicted.known
     assert (found.known == predicted.known).mean() > 0.999
     np.testing.assert_allclose(found.coords[same], predicted.coords[same], atol=0.02)

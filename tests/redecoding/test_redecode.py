@@ -9,11 +9,23 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.cli.redecode import RedecodeArguments, check, main, redecode_trained
+from sl_nerfstudio.cli.redecode import (
+    RedecodeArguments,
+    check,
+    main,
+    redecode_trained,
+)
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.redecoding.redecode import RedecodeSettings, redecode_run
-from sl_nerfstudio.runs.trained_run import TrainedRun
-from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, check_scan, read_scan
+from sl_nerfstudio.runs.run import TrainedRun
+from sl_nerfstudio.scan import (
+    PoseSigma,
+    Scale,
+    Scan,
+    ScanWriter,
+    check_scan,
+    read_scan,
+)
 from tests.redecoding.lit_ball import (
     CAMERA,
     PROJECTOR,

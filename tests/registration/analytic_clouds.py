@@ -7,10 +7,10 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.rig import Rig
-from sl_nerfstudio.geometry.similarity import Similarity, fit_similarity
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of
+from sl_nerfstudio.bundle_adjustment.residuals import Rig
+from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of
 from tests.relative_pose.known_pose import known_pose
 

@@ -3,10 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.graph_residuals import Pivots
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
-from sl_nerfstudio.registration.similarities import exps_at
+from sl_nerfstudio.geometry.lie import Similarity, exps_at
+from sl_nerfstudio.registration.assembly import Pivots
+from sl_nerfstudio.registration.pairs import PairMatch, Rival
 
 NO_SLIP = np.array([0.0, 0, 0, 0, 0, 1, 0])  # the direction of a slip: about the line of sight
 

@@ -8,13 +8,13 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.pattern.light import projected_light
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.pattern.grid import projected_light
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.render import RenderedCapture
-from sl_nerfstudio.synthesis.setup import Setup, make_setup
+from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 from tests.relative_pose.known_pose import known_pose

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.acceptance import _doubtful
-from sl_nerfstudio.registration.pairs.pair_match import Rival
-from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.pairs import Rival
+from sl_nerfstudio.registration.register import _doubtful, register
 from sl_nerfstudio.registration.result import (
     NoCommonSurface,
     PairsContradict,

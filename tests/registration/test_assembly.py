@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.assembly import Assembly
-from sl_nerfstudio.registration.graph_residuals import Pivots
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
-from sl_nerfstudio.registration.pairs.surface_agreement import Side
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.agreement import Side
+from sl_nerfstudio.registration.assembly import Assembly, Pivots
+from sl_nerfstudio.registration.pairs import PairMatch, Rival
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, difference, part_of, similarities_of
 from tests.registration.graph_edges import edge, turned

@@ -9,17 +9,17 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
-from sl_nerfstudio.registration.capture_order import (
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.pairs import Rival
+from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
+from sl_nerfstudio.registration.surfaces import build_surface_map
+from sl_nerfstudio.registration.symmetry import (
     _longest_run,
     chain_of_small_steps,
     sides_are_open,
     typical_step_deg,
 )
-from sl_nerfstudio.registration.pairs.pair_match import Rival
-from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
 from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import RenderedClouds, rendered
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.surface_agreement import Tolerance, agreement_at
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.agreement import Tolerance, agreement_at
+from sl_nerfstudio.registration.pairs import register_pair
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.registration.shaped_clouds import rendered
 
 FRAMES = (0, 2, 6, 8)

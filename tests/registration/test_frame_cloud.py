@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.geometry.rays import pixel_centres
-from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.registration.frame_cloud import frame_cloud, motion_by_pose_errors, reliable_points
-from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.relative_pose import agreement, ray_pairs
+from sl_nerfstudio.geometry.triangulation import closest_approach, pixel_centres
+from sl_nerfstudio.registration.surfaces import build_surface_map, frame_cloud, motion_by_pose_errors, reliable_points
+from sl_nerfstudio.relative_pose import epipolar, estimation
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions, moved
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions
-from sl_nerfstudio.relative_pose.sampson import moved
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, cast, rig_of, seen
 from tests.registration.analytic_clouds import clouds_of
 from tests.relative_pose.known_pose import known_pose
@@ -103,7 +100,7 @@ def test_of_large_images_points_are_on_a_lattice_and_coordinates_are_judged_ever
     devices = camera_of(SIZE), PROJECTORS["pinhole"]
     every = estimate_relative_pose(*correspondences_of(coords), *devices)
     whole = frame_cloud("a", coords, *devices, every)
-    for module in (ray_pairs, agreement):
+    for module in (epipolar, estimation):
         monkeypatch.setattr(module, "lattice_step", lambda h, w: step)
     uv = correspondences_of(coords)
     assert (np.floor(uv[0]) % step == 0).all() and len(uv[0]) == np.isfinite(coords[::step, ::step]).all(-1).sum()

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.registration.increments import log_at
-from sl_nerfstudio.registration.similarities import Similarities, exps_at, logs_at
+from sl_nerfstudio.geometry.lie import Similarities, exps_at, log_at, logs_at
 from tests.registration.graph_edges import exp_at
 
 increments = arrays(np.float64, 7, elements=st.floats(-1, 1))

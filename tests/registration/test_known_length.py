@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.registration.known_length import KnownLength, parse_known_length, scale_to
+from sl_nerfstudio.registration.result import KnownLength, parse_known_length, scale_to
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.edge_weights import edge_weights
-from sl_nerfstudio.registration.pose_graph import optimise_pose_graph
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.assembly import optimise_pose_graph
+from sl_nerfstudio.registration.pairs import edge_weights
 from tests.registration.graph_edges import edge, exp_at, pivots_of
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.registration.frame_cloud import FrameCloud, frame_cloud
-from sl_nerfstudio.registration.projector_choice import choose_projectors, chosen_clouds
+from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds
 from sl_nerfstudio.registration.result import UndecidedProjector
-from sl_nerfstudio.relative_pose.plane_starts import plane_starts
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, ray_pairs
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.candidates import plane_starts
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of, ray_pairs
 from tests.bundle_adjustment.analytic import DISK_HEIGHT, PROJECTORS, camera_of, images_of, rig_of
 from tests.registration.analytic_clouds import clouds_of, part_of
 from tests.relative_pose.known_pose import known_pose

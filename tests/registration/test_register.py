@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
+from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    RegisteredFramesSettings,
+    adjust_registered,
+)
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.intrinsics_words import contradiction
+from sl_nerfstudio.processing.result import contradiction
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import NoCommonSurface, PoorPair, SeparateComponent
 from tests.bundle_adjustment.analytic import rig_of

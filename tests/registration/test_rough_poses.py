@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.registration.rough_poses import starting_similarities, with_common_centre
 from sl_nerfstudio.registration.settings import StartSettings
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
+from sl_nerfstudio.registration.view_graph import starting_similarities, with_common_centre
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 

@@ -12,13 +12,13 @@ import pytest
 
 from sl_nerfstudio import registration, relative_pose
 from sl_nerfstudio.registration import settings as registration_settings
-from sl_nerfstudio.registration.frame_cloud import frame_cloud
+from sl_nerfstudio.registration import settings as symmetry_settings
+from sl_nerfstudio.registration import settings as tone_settings
 from sl_nerfstudio.registration.settings import FrameCloudSettings
-from sl_nerfstudio.registration.symmetry import settings as symmetry_settings
-from sl_nerfstudio.registration.tone import settings as tone_settings
-from sl_nerfstudio.relative_pose import settings as relative_pose_settings
+from sl_nerfstudio.registration.surfaces import frame_cloud
+from sl_nerfstudio.relative_pose import epipolar as relative_pose_settings
+from sl_nerfstudio.relative_pose.epipolar import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
 from tests.relative_pose.known_pose import known_pose
 from tests.relative_pose.two_views import view
 

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.registration.frame_cloud import FrameCloud
 from sl_nerfstudio.registration.settings import SurfaceMapSettings
-from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.relative_pose.ray_pairs import directions
+from sl_nerfstudio.registration.surfaces import FrameCloud, build_surface_map
+from sl_nerfstudio.relative_pose.epipolar import directions
 from tests.bundle_adjustment.analytic import PROJECTORS, rig_of
 from tests.registration.analytic_clouds import clouds_of
 from tests.registration.shaped_clouds import cloud_of_depth, with_wall

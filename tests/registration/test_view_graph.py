@@ -4,8 +4,8 @@ from itertools import combinations
 
 import numpy as np
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.pairs import PairMatch
 from sl_nerfstudio.registration.view_graph import compared_pairs, without_slipping
 
 

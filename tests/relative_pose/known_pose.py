@@ -5,11 +5,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit, covariance, noise_of
+from sl_nerfstudio.relative_pose.epipolar import (
+    RELATIVE_POSE_DEFAULTS,
+    EpipolarFit,
+    covariance,
+    noise_of,
+    ray_pairs,
+    sampson,
+)
 from sl_nerfstudio.relative_pose.estimation import RelativePose
-from sl_nerfstudio.relative_pose.ray_pairs import ray_pairs
-from sl_nerfstudio.relative_pose.sampson import sampson
-from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS
 
 
 def known_pose(

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.relative_pose.camera_depth import camera_depth, camera_depth_by_pose
-from sl_nerfstudio.relative_pose.sampson import moved
+from sl_nerfstudio.relative_pose.epipolar import moved
+from sl_nerfstudio.relative_pose.intrinsics import camera_depth, camera_depth_by_pose
 
 
 def _rays(seed: int):

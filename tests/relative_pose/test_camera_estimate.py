@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from sl_nerfstudio.relative_pose.camera_estimate import FrameOfCamera, estimate_camera
+from sl_nerfstudio.relative_pose.epipolar import CAMERA_ESTIMATE_DEFAULTS
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.settings import CAMERA_ESTIMATE_DEFAULTS
+from sl_nerfstudio.relative_pose.intrinsics import FrameOfCamera, estimate_camera
 from tests.relative_pose.two_views import PROJECTORS, view
 
 OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2))

@@ -7,14 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sl_nerfstudio.relative_pose.candidates import ranked, relative_pose_candidates
-from sl_nerfstudio.relative_pose.epipolar_fit import distinct, fit_epipolar
+from sl_nerfstudio.relative_pose.candidates import in_front, plane_starts, ranked, relative_pose_candidates
+from sl_nerfstudio.relative_pose.epipolar import (
+    RELATIVE_POSE_DEFAULTS,
+    RayPairs,
+    distinct,
+    fit_epipolar,
+    ray_pairs,
+    sampson,
+)
 from sl_nerfstudio.relative_pose.estimation import RelativePose, estimate_relative_pose
-from sl_nerfstudio.relative_pose.five_point import in_front
-from sl_nerfstudio.relative_pose.plane_starts import plane_starts
-from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs
-from sl_nerfstudio.relative_pose.sampson import sampson
-from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS
 from tests.relative_pose.table_views import DISTANCE, NORMAL, table_view, twin_of
 from tests.relative_pose.two_views import PROJECTORS, View, errors_deg, view
 

@@ -8,13 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.relative_pose.degeneracy import find_degeneracies
-from sl_nerfstudio.relative_pose.epipolar_fit import EpipolarFit
-from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.pattern_blocks import block_count, blocks_of
-from sl_nerfstudio.relative_pose.ray_pairs import ray_pairs
-from sl_nerfstudio.relative_pose.relief import plane_relief, rotation_relief
-from sl_nerfstudio.relative_pose.settings import DegeneracyLimits, PatternBlocks, RelativePoseSettings
+from sl_nerfstudio.relative_pose.candidates import plane_relief, rotation_relief
+from sl_nerfstudio.relative_pose.epipolar import (
+    DegeneracyLimits,
+    EpipolarFit,
+    PatternBlocks,
+    RelativePoseSettings,
+    block_count,
+    blocks_of,
+    ray_pairs,
+)
+from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose, find_degeneracies
 from tests.relative_pose.two_views import PROJECTORS, View, pose_of, view
 
 NOISE = 0.3

@@ -8,11 +8,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.epipolar import epipolar_residual
-from sl_nerfstudio.relative_pose.epipolar_fit import covariance, fit_epipolar
+from sl_nerfstudio.geometry.triangulation import epipolar_residual
+from sl_nerfstudio.relative_pose.epipolar import (
+    covariance,
+    direction_basis,
+    fit_epipolar,
+    moved,
+    ray_pairs,
+    sampson,
+    sampson_jacobian,
+)
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.relative_pose.ray_pairs import ray_pairs
-from sl_nerfstudio.relative_pose.sampson import direction_basis, moved, sampson, sampson_jacobian
 from tests.relative_pose.two_views import PROJECTORS, errors_deg, view
 
 

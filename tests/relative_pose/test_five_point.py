@@ -8,10 +8,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.relative_pose.epipolar_fit import distinct
-from sl_nerfstudio.relative_pose.five_point import essential_matrices, five_point_starts, in_front, poses_of
-from sl_nerfstudio.relative_pose.ray_pairs import RayPairs, ray_pairs
-from sl_nerfstudio.relative_pose.settings import RELATIVE_POSE_DEFAULTS, Separation
+from sl_nerfstudio.relative_pose.candidates import (
+    essential_matrices,
+    five_point_starts,
+    in_front,
+    poses_of,
+)
+from sl_nerfstudio.relative_pose.epipolar import (
+    RELATIVE_POSE_DEFAULTS,
+    RayPairs,
+    SeparationSettings,
+    distinct,
+    ray_pairs,
+)
 from tests.relative_pose.two_views import PROJECTORS, View, view
 
 
@@ -98,7 +107,7 @@ def test_starts_differ_from_each_other():
     assert len(found) >= RELATIVE_POSE_DEFAULTS.five_point.starts
     for i, a in enumerate(found):
         assert all(distinct(a, b, RELATIVE_POSE_DEFAULTS.five_point.separation) for b in found[:i])
-    wide = replace(RELATIVE_POSE_DEFAULTS.five_point, separation=Separation(10.0, 10.0))
+    wide = replace(RELATIVE_POSE_DEFAULTS.five_point, separation=SeparationSettings(10.0, 10.0))
     assert len(five_point_starts(rays, np.random.default_rng(0), replace(RELATIVE_POSE_DEFAULTS, five_point=wide))) == 1
 
 
@@ -124,6 +133,6 @@ def test_poses_are_distinct_by_rotation_or_by_direction(angle, shift, seed):
     turned = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     across = np.cross(t, axis)
     moved = Rotation.from_rotvec(shift * np.cross(t, across) / np.linalg.norm(np.cross(t, across))).apply(t)
-    limit = Separation(0.05, 0.1)
+    limit = SeparationSettings(0.05, 0.1)
     assume(abs(angle - 0.05) > 1e-3 and abs(shift - 0.1) > 1e-3)
     assert distinct((np.eye(3), t), (turned, moved), limit) is (angle > 0.05 or shift > 0.1)

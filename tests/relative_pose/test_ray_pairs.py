@@ -9,9 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.relative_pose.pattern_blocks import blocks_of
-from sl_nerfstudio.relative_pose.ray_pairs import correspondences_of, directions, lattice_step, ray_pairs, subsample
-from sl_nerfstudio.relative_pose.settings import PatternBlocks
+from sl_nerfstudio.relative_pose.epipolar import (
+    PatternBlocks,
+    blocks_of,
+    correspondences_of,
+    directions,
+    lattice_step,
+    ray_pairs,
+    subsample,
+)
 from tests.relative_pose.two_views import CAMERA, PROJECTORS, view
 
 

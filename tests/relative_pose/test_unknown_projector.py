@@ -5,14 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.calibration.stated_sigma import StatedSigma
+from sl_nerfstudio.calibration.stated import StatedSigma
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
-from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, estimate_projector
-from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
-from sl_nerfstudio.relative_pose.unknown_projector.parameters import LOG_ASPECT, device_with, values_of
-from sl_nerfstudio.relative_pose.unknown_projector.settings import UNKNOWN_PROJECTOR_DEFAULTS
-from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import check_intrinsics
+from sl_nerfstudio.relative_pose.intrinsics import check_intrinsics
+from sl_nerfstudio.relative_pose.unknown_projector import (
+    LOG_ASPECT,
+    UNKNOWN_PROJECTOR_DEFAULTS,
+    FrameMatches,
+    NoProjector,
+    device_with,
+    estimate_projector,
+    values_of,
+)
 from tests.relative_pose.two_views import CAMERA, PROJECTORS
 from tests.relative_pose.unknown_views import SHIFTED, frames_of
 

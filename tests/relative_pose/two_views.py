@@ -7,7 +7,12 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
 
 CAMERA = Device(640, 480, 800.0, 790.0, 322.0, 238.0)
 PROJECTORS = {

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.relative_pose.unknown_projector.matches import FrameMatches
+from sl_nerfstudio.relative_pose.unknown_projector import FrameMatches
 from tests.relative_pose.two_views import CAMERA, pose_of, view
 
 SHIFTED = Device(1280, 800, 2000.0, 2000.0, 630.0, 1360.0)

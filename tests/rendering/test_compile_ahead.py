@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from sl_nerfstudio.rendering import compile_ahead
-from sl_nerfstudio.rendering.compile_ahead import finish, start
+from sl_nerfstudio.model import loop
+from sl_nerfstudio.model.loop import finish, start
 
 STEP = """
 import torch
 from sl_nerfstudio.field.kernels import fused, grid, rows
-from sl_nerfstudio.field.row_adam import RowAdam
-from sl_nerfstudio.field.sdf_field import FieldConfig, SDFField
+from sl_nerfstudio.field.optimiser import RowAdam
+from sl_nerfstudio.field.field import FieldConfig, SDFField
 
 field = SDFField(FieldConfig(log2_table_size=10))
 optimizer = RowAdam([field.encoding.table])
@@ -32,7 +32,7 @@ print([sum(kernel.stats.cache_hits.values()) for kernel in kernels])
 def test_a_step_finds_all_its_loops_compiled(tmp_path, monkeypatch):
     """In a folder of its own, so that nothing is compiled before."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    for code in (compile_ahead._CODE, STEP):
+    for code in (loop._CODE, STEP):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ)
     assert done.stdout.splitlines() == ["[0, 0, 0, 0, 0, 0]", "[1, 1, 1, 1, 1, 1]"]
 
@@ -49,8 +49,8 @@ def test_another_process_is_started_only_where_it_helps(monkeypatch, cores, miss
             waited.append(seconds)
             raise subprocess.TimeoutExpired("compile_step", seconds)
 
-    monkeypatch.setattr(compile_ahead, "threads", lambda: cores)
-    monkeypatch.setattr(compile_ahead, "needs_compiling", lambda _: missing)
+    monkeypatch.setattr(loop, "threads", lambda: cores)
+    monkeypatch.setattr(loop, "needs_compiling", lambda _: missing)
     monkeypatch.setattr(subprocess, "Popen", Process)
     start()
     finish()

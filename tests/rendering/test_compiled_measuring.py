@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, transform
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
 from sl_nerfstudio.rendering import direct_losses
 from sl_nerfstudio.rendering.direct_losses import DecodingNoise, MeasuredRays, _measured
 

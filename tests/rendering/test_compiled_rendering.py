@@ -4,12 +4,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.field.cached_grid import CachedGrid
+from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.rendering.compiled_rendering import comes_below, first_crossings
-from sl_nerfstudio.rendering.ray_samples import first_crossing, uniform_samples
-from sl_nerfstudio.rendering.volume_rendering import Rendered, render
+from sl_nerfstudio.geometry.lie import exp_se3
+from sl_nerfstudio.rendering.volume_rendering import (
+    Rendered,
+    comes_below,
+    first_crossing,
+    first_crossings,
+    render,
+    uniform_samples,
+)
 
 RAYS = 300
 

@@ -8,16 +8,27 @@ import pytest
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.device_kernels import launches
-from sl_nerfstudio.field.cached_grid import CachedGrid
+from sl_nerfstudio.field.device_kernels import launches
+from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.rays import pixel_rays
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, transform
-from sl_nerfstudio.rendering.device_step import Current, Devices, Pixels, Step, StepLosses, step_losses
-from sl_nerfstudio.rendering.direct_losses import DecodingNoise, MeasuredRays, direct_losses, field_losses
-from sl_nerfstudio.rendering.losses import coordinate_loss, pattern_loss
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
+from sl_nerfstudio.geometry.triangulation import pixel_rays
+from sl_nerfstudio.rendering.direct_losses import (
+    DecodingNoise,
+    MeasuredRays,
+    direct_losses,
+    field_losses,
+)
+from sl_nerfstudio.rendering.losses import LossConfig, SamplingConfig, coordinate_loss, pattern_loss
 from sl_nerfstudio.rendering.renderer import Renderer
-from sl_nerfstudio.rendering.settings import LossConfig, SamplingConfig
+from sl_nerfstudio.rendering.warp_step import (
+    Current,
+    Devices,
+    Pixels,
+    Step,
+    StepLosses,
+    step_losses,
+)
 
 PINHOLE = Device(64, 48, 80.0, 82.0, 32.0, 24.0)
 PROJECTORS = {

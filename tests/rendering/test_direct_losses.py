@@ -7,7 +7,12 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.se3 import exp_se3, inverse, pose, transform
+from sl_nerfstudio.geometry.lie import (
+    exp_se3,
+    inverse,
+    pose,
+    transform,
+)
 from sl_nerfstudio.rendering.direct_losses import (
     DecodingNoise,
     MeasuredRays,
@@ -15,8 +20,7 @@ from sl_nerfstudio.rendering.direct_losses import (
     field_losses,
     random_points,
 )
-from sl_nerfstudio.rendering.schedule import surface_width_at
-from sl_nerfstudio.rendering.settings import LossConfig
+from sl_nerfstudio.rendering.losses import LossConfig, surface_width_at
 
 RADIUS = 0.5
 NOISE = DecodingNoise(px=0.3, px_per_length=150.0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sl_nerfstudio.rendering.ray_samples import first_crossing, sphere_interval, uniform_samples
+from sl_nerfstudio.rendering.volume_rendering import first_crossing, sphere_interval, uniform_samples
 
 
 def random_rays(count: int = 400) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from sl_nerfstudio.rendering.schedule import AnnealingConfig, kappa_at, level_weights_at
+from sl_nerfstudio.rendering.losses import AnnealingConfig, kappa_at, level_weights_at
 
 TOTAL, LEVELS = 1000, 8
 

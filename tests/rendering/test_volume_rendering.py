@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.se3 import inverse, transform
+from sl_nerfstudio.geometry.lie import inverse, transform
 from sl_nerfstudio.rendering.volume_rendering import interval_weights, look_up, render
 
 PROJECTOR = Intrinsics.of(Device(64, 48, 100.0, 100.0, 32.0, 24.0), torch.float64)

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.self_calibration import SelfCalibration
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.extract import extract_mesh
-from sl_nerfstudio.runs.trained_run import TrainedRun
+from sl_nerfstudio.runs.run import TrainedRun
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
 

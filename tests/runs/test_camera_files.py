@@ -13,11 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.runs.cameras.blender import encode_blender
-from sl_nerfstudio.runs.cameras.colmap import encode_colmap, require_possible
-from sl_nerfstudio.runs.cameras.posed_device import PosedDevice, PosedFrames
-from sl_nerfstudio.runs.cameras.tracks import SurfaceTracks
-from sl_nerfstudio.runs.cameras.trajectory import encode_kitti, encode_tum
+from sl_nerfstudio.runs.cameras import (
+    PosedDevice,
+    PosedFrames,
+    SurfaceTracks,
+    encode_blender,
+    encode_colmap,
+    encode_kitti,
+    encode_tum,
+    require_possible,
+)
 
 CAMERA = Device(w=640, h=480, fl_x=700.0, fl_y=720.0, cx=300.0, cy=260.0, k1=-0.1, k2=0.02, p1=1e-3, p2=-2e-3)
 PINHOLE = Device(w=640, h=480, fl_x=700.0, fl_y=720.0, cx=300.0, cy=260.0)

@@ -15,7 +15,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.runs.config_file import read_config
+from sl_nerfstudio.runs.run import read_config
 
 TEXT = yaml.dump(sl_neus.config)
 ATTACK = '!!python/object/apply:os.system ["touch {ran}"]'

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.bundle_adjustment.joint_covariance.covariance import JointCovariance
-from sl_nerfstudio.runs.covariance_file import COVARIANCE, read_covariance, write_covariance
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.runs.export import COVARIANCE, read_covariance, write_covariance
 from sl_nerfstudio.scan import FileError, Scan
 
 from .ball_run import ball_scan

@@ -9,19 +9,14 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.cli.exporting.config import ExportConfig
-from sl_nerfstudio.cli.exporting.words import summary
+from sl_nerfstudio.cli.export import ExportConfig, summary
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.meshing.finishing.marked import MarkedMesh
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.vertex_properties import VertexProperties
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.meshing.finish import MarkedMesh
+from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
 from sl_nerfstudio.object_separation.separate import Separation
-from sl_nerfstudio.runs.export import Exported
+from sl_nerfstudio.runs.export import Exported, ExtractedSurface, build_surface, cut_object, planes_below, separate_scan
 from sl_nerfstudio.runs.export_settings import ExportSettings
-from sl_nerfstudio.runs.object_cut import cut_object, planes_below, separate_scan
-from sl_nerfstudio.runs.surface import Surface, build_surface
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
 
@@ -95,7 +90,7 @@ class BallOnTable(BallModel):
 
 
 def test_a_closed_solid_of_the_object_alone_stands_flat_where_the_table_was(scan, found, monkeypatch):
-    monkeypatch.setattr("sl_nerfstudio.runs.surface.separate_scan", lambda *_: found)
+    monkeypatch.setattr("sl_nerfstudio.runs.export.separate_scan", lambda *_: found)
     model = BallOnTable(scan, S_scene_world=Similarity.scaling(1 / 60))
     surface = build_surface(model, ExportSettings(Path("m.stl"), resolution=64, watertight=True, object_only=True))
     mesh, observed = surface.marked.mesh, ~surface.marked.invented
@@ -112,7 +107,7 @@ def test_the_summary_says_what_was_removed_and_why(scan, found):
     mesh = _mesh(BALL, TABLE)
     cut = cut_object(mesh, found)
     marked = MarkedMesh(mesh, np.zeros(len(mesh.vertices), dtype=bool)).with_faces(cut.kept)
-    surface = Surface(marked, None, None, cut, 0, 1.0)
+    surface = ExtractedSurface(marked, None, None, cut, 0, 1.0)
     exported = Exported(
         marked.mesh, VertexProperties(NO_QUALITY, marked.invented), surface, *3 * [None], 0, None, False, 1.0
     )

@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
 
 from sl_nerfstudio.scan import check_scan
-from sl_nerfstudio.scan.check.conventions import convention_problems
-from sl_nerfstudio.scan.check.correspondences import Correspondences, sample_pixels
-from sl_nerfstudio.scan.check.interpretations import (
+from sl_nerfstudio.scan.check_conventions import (
+    Correspondences,
     Interpretation,
     apply_interpretation,
+    convention_problems,
     fit_geometry,
     other_interpretations,
+    sample_pixels,
 )
 
 pytestmark = pytest.mark.long

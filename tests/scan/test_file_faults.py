@@ -14,7 +14,12 @@ from PIL import Image
 from sphere_scan import CAMERA, NAMES, edit, only_fault
 
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
-from sl_nerfstudio.scan.images import as_grey, encode_png, read_header, read_image
+from sl_nerfstudio.scan.images import (
+    as_grey,
+    encode_png,
+    read_header,
+    read_image,
+)
 
 IMAGE = f"images/{NAMES[1]}.png"
 

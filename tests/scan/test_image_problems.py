@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter
 from sphere_scan import NAMES, edit, edit_coords, only_fault, pattern_image, write_sphere
 
 from sl_nerfstudio.scan import check_scan
-from sl_nerfstudio.scan.check.image_match import match_image
-from sl_nerfstudio.scan.check.other_clouds import OtherClouds
+from sl_nerfstudio.scan.check_conventions import OtherClouds
+from sl_nerfstudio.scan.check_images import match_image
 
 NAME = NAMES[1]
 PATTERN = pattern_image().astype(np.float32) / 255

@@ -9,8 +9,7 @@ from sphere_scan import NAMES, edit, only_fault
 
 from sl_nerfstudio.errors import ScanError
 from sl_nerfstudio.scan import check_scan, read_scan
-from sl_nerfstudio.scan.document import MAX_DEPTH, read_document
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.document import MAX_DEPTH, FileError, read_document
 
 
 def ordinary(document: dict[str, Any]) -> None:

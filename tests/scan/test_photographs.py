@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.scan.photographs import (
+from sl_nerfstudio.scan.images import (
     is_mosaic,
     photograph_header,
     read_photograph,

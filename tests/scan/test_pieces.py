@@ -11,12 +11,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from sphere_scan import PROJECTOR, look_up, pattern_image
 
-from sl_nerfstudio.scan.check.coordinate_problems import coordinate_problems
-from sl_nerfstudio.scan.check.pattern_shift import pattern_shift, shift_problems
-from sl_nerfstudio.scan.fields import Fields
-from sl_nerfstudio.scan.paths import resolve_inside
-from sl_nerfstudio.scan.pose_problem import pose_problem
-from sl_nerfstudio.scan.problem import Faults, Problem
+from sl_nerfstudio.scan.check import coordinate_problems
+from sl_nerfstudio.scan.check_images import pattern_shift, shift_problems
+from sl_nerfstudio.scan.document import Faults, Fields, Problem, resolve_inside
+from sl_nerfstudio.scan.read import pose_problem
 
 rotations = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01)
 positions = st.tuples(*[st.floats(-1e6, 1e6)] * 3)

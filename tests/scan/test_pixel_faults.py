@@ -15,8 +15,8 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, edit_co
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
-from sl_nerfstudio.scan.check.folder import check_folder
-from sl_nerfstudio.scan.coordinates import read_coords, read_coords_size
+from sl_nerfstudio.scan.check import check_folder
+from sl_nerfstudio.scan.images import read_coords, read_coords_size
 
 NAME = NAMES[1]
 COORDS = f"coords/{NAME}.npz"

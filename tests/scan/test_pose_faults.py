@@ -11,7 +11,7 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, only_fault, poses, write
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import PoseSigma, check_scan, read_scan
-from sl_nerfstudio.scan.intrinsics import device_problems
+from sl_nerfstudio.scan.types import device_problems
 
 
 def change_pose(

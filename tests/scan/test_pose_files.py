@@ -9,15 +9,15 @@ import pytest
 from sphere_scan import NAMES, edit
 
 from sl_nerfstudio.errors import ScanError
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.scan import (
     FileError,
     check_scan,
     read_poses,
     read_scan,
 )
-from sl_nerfstudio.scan.pose_files import read_devices, write_transforms
+from sl_nerfstudio.scan.write import read_devices, write_transforms
 
 
 def moved(T: np.ndarray) -> np.ndarray:

@@ -11,9 +11,8 @@ from sphere_scan import edit
 from test_conventions import disturbed, undo
 
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.check.conventions import convention_problems
-from sl_nerfstudio.scan.check.folder import FolderCheck, check_folder
-from sl_nerfstudio.scan.check.interpretations import Interpretation
+from sl_nerfstudio.scan.check import FolderCheck, check_folder
+from sl_nerfstudio.scan.check_conventions import Interpretation, convention_problems
 
 DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sphere_scan import CAMERA, NAMES, RADIUS, edit, only_fault, poses, write_sphere
 
 from sl_nerfstudio.errors import ScanError
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.scan import (
     PickedPixel,
     Scale,

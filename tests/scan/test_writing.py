@@ -9,7 +9,6 @@ import pytest
 from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, pattern_image, poses, write_sphere
 
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.files.lock import LOCK
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import (
     PoseSigma,
@@ -19,6 +18,7 @@ from sl_nerfstudio.scan import (
     read_ground_truth,
     read_scan,
 )
+from sl_nerfstudio.storage import LOCK
 
 
 def files(root: Path) -> set[str]:

@@ -6,15 +6,24 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.synthesis.appearance.interreflection import SmallLamps, interpolate_vectors, light_vectors
-from sl_nerfstudio.synthesis.appearance.lens import Lens, moved
-from sl_nerfstudio.synthesis.appearance.light import Lamp, Room, make_pattern
-from sl_nerfstudio.synthesis.appearance.material import LUMA, Material, make_material, tint
-from sl_nerfstudio.synthesis.appearance.ranges import HARD, RANGES, REALISTIC
-from sl_nerfstudio.synthesis.appearance.sensor import Sensor, decode_jpeg
-from sl_nerfstudio.synthesis.appearance.textures import TEXTURES
-from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.appearance import (
+    HARD,
+    LUMA,
+    RANGES,
+    REALISTIC,
+    TEXTURES,
+    Lamp,
+    Lens,
+    Material,
+    Room,
+    make_material,
+    make_pattern,
+    moved,
+    tint,
+)
+from sl_nerfstudio.synthesis.photograph import Sensor, SmallLamps, decode_jpeg, interpolate_vectors, light_vectors
+from sl_nerfstudio.synthesis.render import RayCaster
+from sl_nerfstudio.synthesis.sdf import Scene
 
 
 @pytest.mark.parametrize("name", TEXTURES)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.calibration.board.detection import find_corners
+from sl_nerfstudio.calibration.board_adjustment import find_corners
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.synthesis.boards.captures import BOARDS, write_board_captures
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 

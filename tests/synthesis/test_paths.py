@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.synthesis.paths import look_at, make_paths
-from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.synthesis.devices import look_at, make_paths
+from sl_nerfstudio.synthesis.scenes import cone_and_cylinder
 
 _SCENE = cone_and_cylinder()
 _SEEDS = range(8)

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.check.folder import check_scan
+from sl_nerfstudio.scan.check import check_scan
 from sl_nerfstudio.scan.images import as_grey, read_image
-from sl_nerfstudio.synthesis.appearance.ranges import HARD, REALISTIC
-from sl_nerfstudio.synthesis.capture_plan import Shot, choose_useless, plan_shots, turn_away
+from sl_nerfstudio.synthesis.appearance import HARD, REALISTIC
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.devices import pixels
-from sl_nerfstudio.synthesis.noise import disturb_image
+from sl_nerfstudio.synthesis.devices import disturb_image, pixels
+from sl_nerfstudio.synthesis.photograph import (
+    Shot,
+    choose_useless,
+    plan_shots,
+    turn_away,
+)
 from sl_nerfstudio.synthesis.render import render_capture
-from sl_nerfstudio.synthesis.setup import Stream, make_setup
-from sl_nerfstudio.synthesis.synthesise import synthesise
+from sl_nerfstudio.synthesis.synthesise import Stream, make_setup, synthesise
 
 _CONFIG = SynthConfig(frames=8, resolution=90, seed=6, images_only=True, supersampling=1)
 

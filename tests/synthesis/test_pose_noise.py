@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.synthesis.devices import DeviceOptions, make_devices
-from sl_nerfstudio.synthesis.paths import make_paths
-from sl_nerfstudio.synthesis.pose_noise import ExactMatches, PoseNoise, disturb_poses, disturb_relative, pose_sigma
-from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.synthesis.devices import (
+    DeviceOptions,
+    ExactMatches,
+    PoseNoise,
+    disturb_poses,
+    disturb_relative,
+    make_devices,
+    make_paths,
+    pose_sigma,
+)
+from sl_nerfstudio.synthesis.scenes import cone_and_cylinder
 
 _FRAMES = 24
 

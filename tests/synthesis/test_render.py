@@ -5,11 +5,10 @@ import pytest
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.synthesis.appearance.plain import Appearance, make_appearance
+from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.devices import DevicePair
-from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.render import render_capture, visible_points
-from sl_nerfstudio.synthesis.scenes.scene import Scene
+from sl_nerfstudio.synthesis.render import RayCaster, render_capture, visible_points
+from sl_nerfstudio.synthesis.sdf import Scene
 
 CAMERA = Device(64, 48, 100.0, 100.0, 32.0, 24.0)
 PROJECTOR = Device(200, 160, 300.0, 300.0, 100.0, 80.0)

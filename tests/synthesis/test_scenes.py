@@ -5,18 +5,35 @@ import pytest
 import trimesh
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.synthesis.scenes.chair import chair
-from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
-from sl_nerfstudio.synthesis.scenes.dog import dog
-from sl_nerfstudio.synthesis.scenes.frog import frog
-from sl_nerfstudio.synthesis.scenes.head import head
-from sl_nerfstudio.synthesis.scenes.leaf import leaf
-from sl_nerfstudio.synthesis.scenes.library import BUILT_IN, make_scene
-from sl_nerfstudio.synthesis.scenes.medal import medal
-from sl_nerfstudio.synthesis.scenes.mesh_file import encode_ply
-from sl_nerfstudio.synthesis.scenes.sdf import capsule, carve, cylinder, ellipsoid, half_space, mesh_of, mirrored, union
-from sl_nerfstudio.synthesis.scenes.vase import vase
-from sl_nerfstudio.synthesis.scenes.weak_geometry import bottle, bump, relief, rod, spheres, staircase
+from sl_nerfstudio.synthesis.scenes import (
+    BUILT_IN,
+    bottle,
+    bump,
+    chair,
+    cone_and_cylinder,
+    dog,
+    encode_ply,
+    frog,
+    head,
+    leaf,
+    make_scene,
+    medal,
+    relief,
+    rod,
+    spheres,
+    staircase,
+    vase,
+)
+from sl_nerfstudio.synthesis.sdf import (
+    capsule,
+    carve,
+    cylinder,
+    ellipsoid,
+    half_space,
+    mesh_of,
+    mirrored,
+    union,
+)
 
 
 def _mesh(scene):

@@ -7,12 +7,9 @@ import trimesh
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.ray_casting import RayCaster
-from sl_nerfstudio.synthesis.scenes.cone_and_cylinder import cone_and_cylinder
-from sl_nerfstudio.synthesis.scenes.library import BUILT_IN
-from sl_nerfstudio.synthesis.scenes.surroundings import above_the_table, joined, make_surroundings
-from sl_nerfstudio.synthesis.setup import make_setup
-from sl_nerfstudio.synthesis.synthesise import synthesise
+from sl_nerfstudio.synthesis.render import RayCaster, above_the_table, joined, make_surroundings
+from sl_nerfstudio.synthesis.scenes import BUILT_IN, cone_and_cylinder
+from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 SCENES = {name: BUILT_IN[name]() for name in ("cone-and-cylinder", "leaf", "vase")}
 

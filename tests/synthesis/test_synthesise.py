@@ -9,7 +9,7 @@ import trimesh
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import Scale, read_ground_truth, read_scan
-from sl_nerfstudio.scan.check.folder import check_scan
+from sl_nerfstudio.scan.check import check_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
 

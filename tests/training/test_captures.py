@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.graph import STEPS, neighbourhoods
+from sl_nerfstudio.decoding.grid_graph import STEPS, neighbourhoods
 from sl_nerfstudio.pattern.codes import rotate_codes
 from training.captures import random_capture
 from training.graphs import Damage, damage_graph, soft_scores

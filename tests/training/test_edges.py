@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from sl_nerfstudio.decoding.grid.edges.network import EdgeOutput
+from sl_nerfstudio.decoding.grid_edges import EdgeOutput
 from training import edges
 from training.edge_errors import losses
 from training.edges import Config, train

@@ -4,9 +4,8 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.se3 import exp_so3
-from sl_nerfstudio.verdict.agreement import CrossFrameAgreement, FrameCrossAgreement, PairAgreement
+from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement, PairAgreement
 
 AXIS = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
 

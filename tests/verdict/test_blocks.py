@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.verdict.blocks import agreeing_groups, bridges, components
+from sl_nerfstudio.review.agreement import agreeing_groups, bridges, components
 from tests.verdict.cases import ring
 
 edges_of_eight = st.lists(

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.verdict.facts import FrameFacts, PairFacts, ScanFacts
-from sl_nerfstudio.verdict.judge import judge_scan
-from sl_nerfstudio.verdict.verdict import Reason, listed, worst
+from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
 from tests.verdict.cases import ring
 
 N = 12

@@ -5,12 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.review.coverage import missing_shares, shared_surface
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from sl_nerfstudio.verdict.missing_surface import missing_shares
-from sl_nerfstudio.verdict.shared_surface import shared_surface
 
 FRAMES, ODD = 12, 5
 EXACT = {"pose_error": (0.0, 0.0), "autocalibration_error": (0.0, 0.0, 0.0), "missing": 0.0, "wrong": 0.0}

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.review.agreement import compare_scan_frames
+from sl_nerfstudio.review.verdict import (
+    FrameFacts,
+    ScanFacts,
+    departed_frames,
+    departed_reasons,
+    describe_departed,
+    judge_scan,
+)
 from sl_nerfstudio.scan import PoseSigma, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from sl_nerfstudio.verdict.departed_frames import departed_frames, departed_reasons, describe_departed
-from sl_nerfstudio.verdict.facts import FrameFacts, ScanFacts
-from sl_nerfstudio.verdict.judge import judge_scan
-from sl_nerfstudio.verdict.scan_agreement import compare_scan_frames
 from tests.verdict.cases import turned
 
 FRAMES = 16

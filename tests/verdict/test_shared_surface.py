@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.geometry.similarity import Similarity
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.review.coverage import shared_surface, shared_surface_of_scan
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from sl_nerfstudio.verdict.shared_surface import shared_surface, shared_surface_of_scan
 
 FRAMES, EMPTIED = 12, 5
 

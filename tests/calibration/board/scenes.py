@@ -7,10 +7,20 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.calibration.board.detection import Corners
-from sl_nerfstudio.calibration.board.residuals import sightings
-from sl_nerfstudio.calibration.board.rig import BoardRig, BoardView, FreeIntrinsics, board_points
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.calibration.board_adjustment import (
+    BoardRig,
+    BoardView,
+    Corners,
+    FreeIntrinsics,
+    board_points,
+    sightings,
+)
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
 from sl_nerfstudio.pattern.boards import Chessboard
 
 BOARD = Chessboard(7, 5, 30.0)

@@ -7,17 +7,23 @@ import pytest
 import torch
 from scipy.optimize import approx_fprime
 
-from sl_nerfstudio.calibration.board.adjustment import adjust, covariance, kernel, normal_equations
-from sl_nerfstudio.calibration.board.detection import Corners
-from sl_nerfstudio.calibration.board.residuals import linearised, residuals, sightings
-from sl_nerfstudio.calibration.board.rig import (
+from sl_nerfstudio.calibration.board_adjustment import (
     BoardRig,
     BoardView,
+    Corners,
     FreeIntrinsics,
+    adjust,
+    camera_start,
+    covariance,
+    kernel,
+    linearised,
+    normal_equations,
+    projector_start,
+    residuals,
+    sightings,
     with_numbers,
 )
-from sl_nerfstudio.calibration.board.start import camera_start, projector_start
-from sl_nerfstudio.geometry.se3 import exp_se3
+from sl_nerfstudio.geometry.lie import exp_se3
 from tests.calibration.board.scenes import (
     CAMERA,
     DOE,

@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.calibration.board.calibrate import calibrate
-from sl_nerfstudio.calibration.board.coverage import next_pose
-from sl_nerfstudio.cli.calibrating.words import next_pose_words, require_determined
+from sl_nerfstudio.calibration.board import calibrate, next_pose
+from sl_nerfstudio.cli.calibrate import next_pose_words, require_determined
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.verdict.calibration import CalibrationLimits, judge_calibration, shortcomings, undetermined
+from sl_nerfstudio.review.verdict import (
+    CalibrationLimits,
+    judge_calibration,
+    shortcomings,
+    undetermined,
+)
 from tests.calibration.board.scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
 
 pytestmark = pytest.mark.long

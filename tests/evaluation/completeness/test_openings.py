@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.completeness.openings import find_openings
+from sl_nerfstudio.evaluation.completeness import find_openings
 from sl_nerfstudio.meshing.mesh import Mesh
 
 from ..shapes import sphere

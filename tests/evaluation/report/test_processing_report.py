@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
+from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.placed import PlacedFrame, PlacedGroup
-from sl_nerfstudio.processing.preview import Preview, make_preview
+from sl_nerfstudio.processing.object_only import Preview, make_preview
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
-from sl_nerfstudio.verdict.verdict import Verdict
+from sl_nerfstudio.processing.scan_poses import PlacedFrame, PlacedGroup
+from sl_nerfstudio.review.verdict import Verdict
 
 from .pages import Page, figure_of, unpacked
 

@@ -5,11 +5,10 @@ import pytest
 import trimesh
 from scipy.ndimage import distance_transform_edt
 
-from sl_nerfstudio.geometry.connectivity import component_labels
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.texture import charts as module
-from sl_nerfstudio.meshing.texture.charts import square_charts
-from sl_nerfstudio.meshing.texture.texture import Charts
+from sl_nerfstudio.geometry.numerics import component_labels
+from sl_nerfstudio.meshing import texture as module
+from sl_nerfstudio.meshing.mesh import Charts, Mesh
+from sl_nerfstudio.meshing.texture import square_charts
 
 KNOT = trimesh.creation.torus(30.0, 11.0, major_sections=64, minor_sections=32)
 BOX = trimesh.creation.box((30, 20, 10)).subdivide_to_size(4.0)

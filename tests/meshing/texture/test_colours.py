@@ -8,12 +8,11 @@ import trimesh
 from PIL import Image
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.meshing.finishing.decimate import decimate
-from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.mesh_io import files_of, read_mesh, write_mesh
-from sl_nerfstudio.meshing.texture import colours as module
-from sl_nerfstudio.meshing.texture.colours import Textured, surface_texture
-from sl_nerfstudio.meshing.vertex_properties import GREY
+from sl_nerfstudio.meshing import texture as module
+from sl_nerfstudio.meshing.files import files_of, read_mesh, write_mesh
+from sl_nerfstudio.meshing.finish import decimate
+from sl_nerfstudio.meshing.mesh import GREY, Mesh
+from sl_nerfstudio.meshing.texture import Textured, surface_texture
 from sl_nerfstudio.scan import Scan
 from tests.meshing.coloured_ball import BALL, RADIUS, angle_cosines, coloured_scan
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.meshing.texture.drawing import draw_triangles
+from sl_nerfstudio.meshing.texture import draw_triangles
 
 
 def weights_of(corners, p):

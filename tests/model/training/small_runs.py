@@ -20,8 +20,8 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     from nerfstudio.scripts import train as ns_train
 
 from sl_nerfstudio.methods import sl_neus
+from sl_nerfstudio.model.run_files import INTERRUPTION
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training.interruption import INTERRUPTION
 
 STEPS = 12
 

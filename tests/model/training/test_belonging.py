@@ -18,10 +18,10 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     from nerfstudio.scripts.viewer import run_viewer
     from nerfstudio.utils.eval_utils import eval_setup
 
-from sl_nerfstudio.cli.check_run import check_run_folder
-from sl_nerfstudio.dataparser.fingerprint import scan_fingerprint
+from sl_nerfstudio.cli.check import check_run_folder
+from sl_nerfstudio.dataparser.dataparser import scan_fingerprint
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.runs.trained_run import load_run
+from sl_nerfstudio.runs.run import load_run
 from sl_nerfstudio.scan import read_scan
 from tests.model.training.small_runs import folder_of, send, settings, status, train
 

@@ -10,7 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.training.checkpoints import (
+from sl_nerfstudio.model.run_files import (
     checkpoints_in,
     find_checkpoint,
     read_checkpoint,

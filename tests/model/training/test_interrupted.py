@@ -21,10 +21,9 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.model.run_files import Interrupted, Interruption, checkpoints_in
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training.checkpoints import checkpoints_in
-from sl_nerfstudio.model.training.interruption import Interrupted, Interruption
-from sl_nerfstudio.runs.trained_run import load_run
+from sl_nerfstudio.runs.run import load_run
 from tests.model.training.small_runs import (
     child,
     content,
@@ -121,7 +120,7 @@ def test_a_full_disk_is_a_message_and_keeps_what_is_there(scan_root, tmp_path, m
 
 def test_checkpoints_are_written_when_time_and_steps_have_passed(scan_root, tmp_path, monkeypatch):
     saved = []
-    monkeypatch.setattr("sl_nerfstudio.model.training.loop.LEAST_STEPS", 4)
+    monkeypatch.setattr("sl_nerfstudio.model.loop.LEAST_STEPS", 4)
     monkeypatch.setattr(torch, "save", lambda state, path: saved.append(state["step"]) or path.touch())
     train(settings(scan_root, tmp_path, "often", seconds_per_save=0.0))
     assert saved == [-1, 3, 7, 11, 11]  # the last one by nerfstudio, at the end

@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.training import Training, settings
-from sl_nerfstudio.device_kernels import launches
-from sl_nerfstudio.geometry.se3 import exp_se3
-from sl_nerfstudio.model.kernel_step import device_poses
-from sl_nerfstudio.model.pose_parameters import (
+from sl_nerfstudio.field.device_kernels import launches
+from sl_nerfstudio.geometry.lie import exp_se3
+from sl_nerfstudio.model.poses import (
     CoupledPoseParameters,
     IndependentPoseParameters,
     PoseParameters,
     RigPoseParameters,
     StaticProjectorParameters,
 )
+from sl_nerfstudio.model.warp_step import device_poses
 from tests.dataparser.tiny_scan import TinyScan
 
 FRAMES = 5

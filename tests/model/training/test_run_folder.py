@@ -10,7 +10,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.methods import sl_neus, sl_neus_paper
-from sl_nerfstudio.model.training.run_folder import LOCK, RunFolder
+from sl_nerfstudio.model.run_files import LOCK, RunFolder
 from tests.model.training.small_runs import (
     child,
     content,

@@ -16,13 +16,13 @@ from nerfstudio.utils import comms
 from torch import nn
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.field.row_adam import RowAdam
-from sl_nerfstudio.field.table_gradient import TableGradient
+from sl_nerfstudio.field.backend import TableGradient
+from sl_nerfstudio.field.optimiser import RowAdam
+from sl_nerfstudio.model import processes
 from sl_nerfstudio.model.model import SLModel
+from sl_nerfstudio.model.processes import MeanGradients, greatest, share_state
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.model.training import launching, shared_table
-from sl_nerfstudio.model.training.shared_training import MeanGradients, greatest, share_state
-from sl_nerfstudio.runs.trained_run import load_run
+from sl_nerfstudio.runs.run import load_run
 from tests.model.training.small_runs import folder_of, go_on, last_state, require_equal, settings, status, train
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
@@ -34,9 +34,9 @@ forked = functools.partial(mp.start_processes, start_method="fork")
 @pytest.fixture(autouse=True)
 def _two_cores_and_forks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ns_train, "launch", ns_train.launch)  # what takes its place would start all later trainings
-    monkeypatch.setattr(launching.mp, "spawn", forked)
+    monkeypatch.setattr(processes.mp, "spawn", forked)
     monkeypatch.setattr("sl_nerfstudio.model.trainer.cores", lambda: 2)
-    monkeypatch.setattr(launching, "cores", lambda: 2)  # one thread each: OpenMP teams do not survive a fork
+    monkeypatch.setattr(processes, "cores", lambda: 2)  # one thread each: OpenMP teams do not survive a fork
 
 
 def by_two(root: Path, output: Path, **more: Any) -> SLTrainerConfig:
@@ -148,7 +148,7 @@ def _three_steps(rank: int, folder: Path) -> None:
 def test_all_processes_take_the_step_along_the_mean_of_their_gradients(tmp_path, monkeypatch, shared):
     """Against torch's own Adam with the mean gradient, in rows that every step touches, and against none elsewhere."""
     if not shared:  # as on several machines
-        monkeypatch.setattr(shared_table, "_opened", lambda *_: None)
+        monkeypatch.setattr(processes, "_opened", lambda *_: None)
     _in_two(_three_steps, tmp_path)
     (table, matrix), other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     require_equal([table, matrix], other)

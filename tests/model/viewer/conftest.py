@@ -15,11 +15,9 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     warnings.simplefilter("ignore")
     from nerfstudio.viewer.viewer import Viewer
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.model.viewer import scene_view
-from sl_nerfstudio.model.viewer.scene_view import SceneView
-from sl_nerfstudio.model.viewer.surface import Surface
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.model import viewer
+from sl_nerfstudio.model.viewer import SceneView, ViewerSurface
 from sl_nerfstudio.scan import Scan, read_scan
 from tests.dataparser.tiny_scan import RADIUS, TinyScan
 
@@ -86,7 +84,7 @@ def server() -> Iterator[viser.ViserServer]:
 @pytest.fixture
 def view(sphere_scan: Scan, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> SceneView:
     """Set up as by nerfstudio; callbacks are called by the tests themselves, in their own thread."""
-    monkeypatch.setattr(scene_view, "Surface", partial(Surface, resolution=32))
+    monkeypatch.setattr(viewer, "ViewerSurface", partial(ViewerSurface, resolution=32))
     server.scene.reset()
     server.gui.reset()
     made = SceneView(SphereModel(sphere_scan))

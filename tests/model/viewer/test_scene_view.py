@@ -11,12 +11,10 @@ import pytest
 import viser
 import viser.transforms as vtf
 
-from sl_nerfstudio.geometry.device_poses import DevicePoses
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.meshing.vertex_quality import VertexQuality
-from sl_nerfstudio.model.viewer.device_nodes import DeviceNodes, vertical_fov
-from sl_nerfstudio.model.viewer.scene_view import SceneView, first_view
-from sl_nerfstudio.model.viewer.surface import MODES, UNKNOWN, Surface
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.mesh import VertexQuality
+from sl_nerfstudio.model.viewer import MODES, UNKNOWN, DeviceNodes, SceneView, ViewerSurface, first_view, vertical_fov
 from tests.dataparser.tiny_scan import RADIUS
 from tests.model.viewer.conftest import SCALE
 
@@ -181,7 +179,7 @@ def test_the_surface_in_all_colours(view: SceneView) -> None:
 
 
 def test_normals_depth_and_coordinates_have_the_colours_of_their_place(view: SceneView) -> None:
-    surface, scan = Surface(model_of(view), 32), model_of(view).scan
+    surface, scan = ViewerSurface(model_of(view), 32), model_of(view).scan
     p = surface.mesh.vertices / SCALE  # mm, in the scan's axes
     np.testing.assert_allclose(surface.coloured("normals", 0).rgb, 127.5 * (p / RADIUS + 1), atol=8)
     distance = np.linalg.norm(p - scan.poses.T_world_camera[1, :3, 3], axis=1)
@@ -205,7 +203,7 @@ def test_normals_depth_and_coordinates_have_the_colours_of_their_place(view: Sce
 
 
 def test_residual_sigma_and_views_are_those_of_the_vertices_and_grey_where_no_frame_confirms(view: SceneView) -> None:
-    surface = Surface(model_of(view), 32)
+    surface = ViewerSurface(model_of(view), 32)
     n = len(surface.mesh.vertices)
     sigma, residual, views = np.linspace(0, 0.2, n), np.linspace(3, 0, n), np.arange(n) % 4
     sigma[views == 0] = residual[views == 0] = np.nan

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from sl_nerfstudio.calibration.exif import CameraStart
+from sl_nerfstudio.calibration.stated import CameraStart
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.capture_files.cameras import read_cameras, refine_camera, require_intrinsics
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frame_worker import FrameWorker
+from sl_nerfstudio.processing.frames import FrameWorker
+from sl_nerfstudio.processing.inputs import read_cameras, refine_camera, require_intrinsics
 
 
 def test_the_camera_is_refined_and_its_uncertainty_stated(ramp_scan, tmp_path):

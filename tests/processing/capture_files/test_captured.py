@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.calibration.device_files import read_device_file
-from sl_nerfstudio.calibration.formats.plain_json import camera_names
-from sl_nerfstudio.decoding.decoded import DecodingError
-from sl_nerfstudio.decoding.graycode.decoder import GrayCodeDecoder
+from sl_nerfstudio.calibration.formats import camera_names, read_device_file
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.decoders import GrayCodeDecoder
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.pattern.graycode import GrayCode
-from sl_nerfstudio.processing.capture_files.captured import read_captured
-from sl_nerfstudio.processing.capture_files.sequences import incomplete
-from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.processing.captures import find_captures, incomplete
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.inputs import read_captured
 from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.gray_captures import exact_coords, photographs
 
@@ -130,7 +128,7 @@ def test_a_video_of_gray_code_is_refused(tmp_path):
 
 
 def test_masked_pixels_of_two_cameras_have_their_own_sizes(tmp_path):
-    from sl_nerfstudio.processing.selection.user_masks import find_masks
+    from sl_nerfstudio.processing.masks import find_masks
 
     for name, size in (("left_0", (16, 12)), ("right_0", (20, 10))):
         Image.fromarray(np.full(size[::-1], 255, np.uint8)).save(tmp_path / f"{name}.png")

@@ -10,8 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.capture_files.video import video_frames
-from sl_nerfstudio.processing.capture_files.video_motion import SHARP, sharpness
+from sl_nerfstudio.processing.video import SHARP, sharpness, video_frames
 from sl_nerfstudio.scan.images import read_image
 
 W, H = 320, 240

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.grid.decoder import NetworkDecoder
+from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.matching.matcher import LineMatcher
 from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.processing import frame_worker
+from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frame_worker import FrameJob, FrameWorker
-from sl_nerfstudio.processing.kept.store import DecodedStore
-from sl_nerfstudio.processing.selection.user_masks import find_masks
+from sl_nerfstudio.processing.frames import FrameJob, FrameWorker
+from sl_nerfstudio.processing.masks import find_masks
+from sl_nerfstudio.processing.records import DecodedStore
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -93,13 +93,13 @@ def test_nothing_is_matched_before_the_camera_is_known(job, frame, result, monke
 
 
 def test_a_frame_that_several_poses_explain_is_left_as_it_was_decoded(job, frame, result, monkeypatch):
-    calls, estimate = counted(monkeypatch), frame_worker.estimate_relative_pose
+    calls, estimate = counted(monkeypatch), frames.estimate_relative_pose
 
     def two(*given):
         pose = estimate(*given)
         return replace(pose, alternatives=(pose,))
 
-    monkeypatch.setattr(frame_worker, "estimate_relative_pose", two)
+    monkeypatch.setattr(frames, "estimate_relative_pose", two)
     left = FrameWorker(replace(job, seed=5))(frame)
     assert left.matched == "" and not calls and len(left.cloud.alternatives) == 1
 

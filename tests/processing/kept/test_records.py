@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sl_nerfstudio.processing.kept.records import decode, digest, encode
+from sl_nerfstudio.processing.records import decode, digest, encode
 
 _PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 _ARRAYS = arrays.arrays(

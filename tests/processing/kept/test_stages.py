@@ -7,16 +7,16 @@ from dataclasses import dataclass, fields, is_dataclass
 import numpy as np
 import pytest
 
-from sl_nerfstudio.files.checked import write_checked
+from sl_nerfstudio.processing import cache
+from sl_nerfstudio.processing.cache import FOLDER, KEPT, StageStore
 from sl_nerfstudio.processing.consistency import ConsistentFrames
-from sl_nerfstudio.processing.kept import stages
-from sl_nerfstudio.processing.kept.records import encode
-from sl_nerfstudio.processing.kept.stages import FOLDER, KEPT, StageStore
+from sl_nerfstudio.processing.records import encode
 from sl_nerfstudio.registration.result import NoCommonSurface
-from sl_nerfstudio.registration.static_projector.solve import NoPlacement, StaticPlacement
+from sl_nerfstudio.registration.static_projector import NoPlacement, StaticPlacement
 from sl_nerfstudio.relative_pose.estimation import RelativePose
-from sl_nerfstudio.relative_pose.unknown_projector.estimate import NoProjector, ProjectorEstimate
-from sl_nerfstudio.relative_pose.unknown_projector.stated_intrinsics import IntrinsicsEvidence
+from sl_nerfstudio.relative_pose.intrinsics import IntrinsicsEvidence
+from sl_nerfstudio.relative_pose.unknown_projector import NoProjector, ProjectorEstimate
+from sl_nerfstudio.storage import write_checked
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ def test_other_inputs_other_code_and_other_versions_are_computed_again(tmp_path,
     store.kept("registration", inputs + 1e-300, compute)
     assert compute.times == 2
     for name, change in (("version", lambda name: "9.9"), ("_PACKAGES", ())):
-        monkeypatch.setattr(stages, name, change)
-        stages.surroundings.cache_clear()
+        monkeypatch.setattr(cache, name, change)
+        cache.surroundings.cache_clear()
         store.kept("registration", inputs + 1e-300, compute)
     assert compute.times == 4
     (tmp_path / "package").mkdir()
     (tmp_path / "package" / "__init__.py").write_text("")
-    monkeypatch.setattr(stages.sl_nerfstudio, "__file__", str(tmp_path / "package" / "__init__.py"))
-    stages.surroundings.cache_clear()
+    monkeypatch.setattr(cache.sl_nerfstudio, "__file__", str(tmp_path / "package" / "__init__.py"))
+    cache.surroundings.cache_clear()
     store.kept("registration", inputs + 1e-300, compute)
-    stages.surroundings.cache_clear()
+    cache.surroundings.cache_clear()
     assert compute.times == 5
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.decoding.decoded import Decoded
+from sl_nerfstudio.decoding.decoder import Decoded
 from sl_nerfstudio.decoding.decoders import DECODERS
-from sl_nerfstudio.pattern.graycode import GrayCode
+from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
-from sl_nerfstudio.processing.kept.store import DecodedStore, Manifest
+from sl_nerfstudio.processing.records import DecodedStore, Manifest
 
 
 @pytest.fixture

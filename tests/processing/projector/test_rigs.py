@@ -9,10 +9,10 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.process import process
-from sl_nerfstudio.processing.projector.found import FIELDS
+from sl_nerfstudio.processing.projector import FIELDS
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.synthesise import make_setup
 from tests.processing.ramp_scan import NAMES, RampScan, make_captures
 
 pytestmark = pytest.mark.long

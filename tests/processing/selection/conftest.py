@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.object_separation.plane import Plane
-from sl_nerfstudio.object_separation.plane_judgement import PlaneFinding
+from sl_nerfstudio.object_separation.planes import Plane, PlaneFinding
 from sl_nerfstudio.object_separation.separate import Part
-from sl_nerfstudio.processing.selection.object_only import FrameShares, ObjectOnly
+from sl_nerfstudio.processing.object_only import FrameShares, ObjectOnly
 
 
 def finding(verdict):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sl_nerfstudio.processing.selection.mask_file import read_mask
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.processing.masks import read_mask
+from sl_nerfstudio.scan.document import FileError
 
 W, H = 12, 9
 DRAWN = np.zeros((H, W), dtype=bool)

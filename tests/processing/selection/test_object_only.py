@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.report.processing_report import render_processing_report
-from sl_nerfstudio.processing.preview import make_preview
+from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
+from sl_nerfstudio.processing.object_only import make_preview
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.result import with_object_only
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.types import PickedPixel, Scale, ScaleBar
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.setup import make_setup
+from sl_nerfstudio.synthesis.synthesise import make_setup
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES, make_captures
 

@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 
-from sl_nerfstudio.processing.selection.object_words import object_document, object_sentences
+from sl_nerfstudio.processing.object_only import object_document, object_sentences
 
 
 def test_everything_that_was_left_out_and_kept_is_said(object_only):

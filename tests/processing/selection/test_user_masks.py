@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.cli.process import main
-from sl_nerfstudio.decoding.decoded import Decoded, DecodingError
+from sl_nerfstudio.decoding.decoder import Decoded, DecodingError
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frame_stage import run_frame_stage
+from sl_nerfstudio.processing.frames import run_frame_stage
 from sl_nerfstudio.processing.inputs import read_inputs
+from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.process import process
-from sl_nerfstudio.processing.selection.user_masks import find_masks
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.file_error import FileError
+from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import encode_png
 from tests.processing.ramp_scan import NAMES
 

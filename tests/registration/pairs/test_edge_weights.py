@@ -4,9 +4,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.edge_weights import edge_weights, is_accepted, is_ambiguous, quality
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.pairs import (
+    PairMatch,
+    Rival,
+    edge_weights,
+    is_accepted,
+    is_ambiguous,
+    quality,
+)
 
 
 def match(i: int, j: int, fitness: float = 0.9, overlap: float = 0.5, ratio: float = 0.2) -> PairMatch:

@@ -9,12 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.rotation_search import around_guess, rotations, without_guess
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.agreement import Hypotheses
+from sl_nerfstudio.registration.pairs import around_guess, register_pair, rotations, without_guess
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, Search
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, difference, on_a_ball, part_of, rolled, similarities_of
 from tests.registration.shaped_clouds import with_wall

@@ -7,12 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.edge_weights import is_ambiguous
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.pairs import PairMatch, Rival, is_ambiguous, register_pair
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.registration.analytic_clouds import difference, rolled
 from tests.registration.shaped_clouds import cloud_of_depth
 

@@ -7,10 +7,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.slip import CostOfPoints, MotionCost, screw_motion, weakest_rotation
+from sl_nerfstudio.registration.pairs import (
+    CostOfPoints,
+    MotionCost,
+    register_pair,
+    screw_motion,
+    weakest_rotation,
+)
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.registration.analytic_clouds import difference
 from tests.registration.graph_edges import exp_at
 from tests.registration.shaped_clouds import cloud_of_depth, rendered

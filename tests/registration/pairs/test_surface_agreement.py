@@ -10,14 +10,29 @@ from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.rays import pixel_centres
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.empty_places import EmptyPlaces
-from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance, agreement, agreement_at
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.geometry.triangulation import pixel_centres
+from sl_nerfstudio.registration.agreement import (
+    Hypotheses,
+    Side,
+    Tolerance,
+    agreement,
+    agreement_at,
+)
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import SurfaceMap, View, build_surface_map, tangent_planes
+from sl_nerfstudio.registration.surfaces import (
+    EmptyPlaces,
+    FrameView,
+    SurfaceMap,
+    build_surface_map,
+    tangent_planes,
+)
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
 from tests.relative_pose.two_views import pose_of
@@ -67,7 +82,9 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     plane = tangent_planes(point, normal, sigma)
     T = np.linalg.inv(pose_of((0.6, 0.1, 0.2), (0.0, 0.0, -3.0), 20.0))
     nothing = EmptyPlaces(~valid & (rng.random(valid.shape) < 0.7), PROJECTOR, T, rng.uniform(2.5, 3.5, (24, 30)))
-    return SurfaceMap(camera, point, plane, valid, tone, nothing, even, centroid, radius, (View(centroid, radius),))
+    return SurfaceMap(
+        camera, point, plane, valid, tone, nothing, even, centroid, radius, (FrameView(centroid, radius),)
+    )
 
 
 def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):

@@ -8,14 +8,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
-from sl_nerfstudio.registration.pairs.hypotheses import Hypotheses
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch
-from sl_nerfstudio.registration.pairs.pair_registration import register_pair
-from sl_nerfstudio.registration.pairs.surface_agreement import Side, Tolerance
-from sl_nerfstudio.registration.pairs.tone_match import likeness, turn_by_tone
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.agreement import Hypotheses, Side, Tolerance
+from sl_nerfstudio.registration.pairs import PairMatch, likeness, register_pair, turn_by_tone
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import SurfaceMap, build_surface_map
+from sl_nerfstudio.registration.surfaces import SurfaceMap, build_surface_map
 from tests.registration.shaped_clouds import rendered
 
 PAIR = REGISTRATION_DEFAULTS.pair

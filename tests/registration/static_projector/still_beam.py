@@ -5,8 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.rays import pixel_centres
+from sl_nerfstudio.geometry.devices import (
+    Device,
+    Intrinsics,
+    project,
+    unproject,
+)
+from sl_nerfstudio.geometry.triangulation import pixel_centres
 from tests.relative_pose.two_views import pose_of
 from tests.relative_pose.unknown_views import aimed
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.registration.static_projector.cells import find_cells
-from sl_nerfstudio.registration.static_projector.resection import resect
-from sl_nerfstudio.registration.static_projector.settings import STATIC_DEFAULTS
-from sl_nerfstudio.registration.static_projector.solve import (
+from sl_nerfstudio.registration.static_projector import (
+    STATIC_DEFAULTS,
     NoPlacement,
     StaticPlacement,
+    find_cells,
     place_under_static_projector,
+    resect,
 )
-from sl_nerfstudio.relative_pose.unknown_projector.parameters import values_of
+from sl_nerfstudio.relative_pose.unknown_projector import values_of
 from tests.registration.static_projector.still_beam import BEAM, CAMERA, still_beam
 
 BLANK = Device(BEAM.w, BEAM.h, 1.5 * BEAM.w, 1.5 * BEAM.w, BEAM.w / 2, BEAM.h / 2)

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.symmetry.exact_turn import _motion_in_camera, exact_turn
+from sl_nerfstudio.registration.symmetry import _motion_in_camera, exact_turn
 from tests.registration.symmetry.turned_scan import Scan
 
 

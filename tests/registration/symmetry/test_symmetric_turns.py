@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
-from sl_nerfstudio.registration.symmetry.symmetric_turns import _half, _parts
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.pairs import PairMatch, Rival
+from sl_nerfstudio.registration.symmetry import _half, _parts
 from tests.registration.symmetry.turned_scan import Scan
 
 

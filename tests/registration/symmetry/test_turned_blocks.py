@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.geometry.similarity import Similarity, angle_deg
-from sl_nerfstudio.registration.graph_residuals import node_at
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch
-from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.assembly import PoseGraphSolution, node_at
+from sl_nerfstudio.registration.pairs import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.symmetry.judged import judged
-from sl_nerfstudio.registration.symmetry.turned_blocks import TurnedBlock, _best_cut, turned_blocks
-from sl_nerfstudio.registration.symmetry.turning_back import turned_back
+from sl_nerfstudio.registration.symmetry import TurnedBlock, _best_cut, judged, turned_back, turned_blocks
 from sl_nerfstudio.registration.view_graph import ViewGraph
 from tests.registration.symmetry.turned_scan import FRAMES, Scan, write_bar
 

@@ -7,13 +7,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch, Rival
-from sl_nerfstudio.registration.pairs.surface_agreement import Side
-from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.agreement import Side
+from sl_nerfstudio.registration.assembly import PoseGraphSolution
+from sl_nerfstudio.registration.pairs import PairMatch, Rival
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surface_map import build_surface_map
-from sl_nerfstudio.registration.symmetry.symmetric_turns import symmetric_turns_deg
+from sl_nerfstudio.registration.surfaces import build_surface_map
+from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import rendered
 

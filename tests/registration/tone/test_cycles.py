@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.similarity import Similarity
-from sl_nerfstudio.registration.graph_residuals import Pivots
-from sl_nerfstudio.registration.pairs.pair_match import PairMatch
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.assembly import Pivots
+from sl_nerfstudio.registration.pairs import PairMatch
 from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.tone.cycles import with_confirmed_tones
+from sl_nerfstudio.registration.view_graph import with_confirmed_tones
 
 PAIR = REGISTRATION_DEFAULTS.pair
 AXIS = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the motion along which frames slip: about y

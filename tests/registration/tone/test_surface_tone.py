@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.registration.tone.settings import ToneSettings
-from sl_nerfstudio.registration.tone.surface_tone import surface_tone
+from sl_nerfstudio.registration.settings import ToneSettings
+from sl_nerfstudio.registration.surfaces import surface_tone
 
 SIZE = 120
 CAMERA = np.array([0.0, 0.0, 4.0])  # the ball's centre is the origin; axes as the camera's

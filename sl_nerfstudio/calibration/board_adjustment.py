@@ -1,0 +1,550 @@
+"""A first solution: focal lengths and poses from homographies and from points whose place is known.
+
+Zhang, "A flexible new technique for camera calibration" (PAMI 2000). Several focal lengths are tried besides the one in
+closed form, which noise can make imaginary.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from sl_nerfstudio.geometry.devices import MODELS, PARAMETERS, Device, DeviceKind, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.lie import exp_se3, hat
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
+
+# The corners of a board in a photograph, to a fraction of a pixel; the detectors are OpenCV's.
+
+LEAST_CORNERS = 8  # of a ChArUco board of which only a part is in view
+_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+_SEARCHED = 1600  # longest side of the image in which a chessboard is searched; it is measured in the full one
+_SMALLEST_WINDOW, _LARGEST_WINDOW = 2, 11  # half the side, pixels
+_OTHER_COUNTS = ((0, -1), (-1, 0), (0, 1), (1, 0), (-1, -1), (1, 1))
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners of a board in the image of a device."""
+
+    ids: Int64[ndarray, "n"]  # places in `board.corners()`, ascending
+    uv: Float64[ndarray, "n 2"]  # pixels; the centre of the first pixel is (0.5, 0.5)
+
+
+def find_corners(image: Float32[ndarray, "h w"], board: Board) -> Corners | None:
+    """The corners of a board in an image with values in [0, 1]; None where it is not seen.
+
+    A chessboard must be seen whole, a ChArUco board with eight corners or more.
+    """
+    grey = _stretched(image)
+    return _find_charuco(grey, board) if isinstance(board, CharucoBoard) else _find_chessboard(grey, board)
+
+
+def other_board_seen(image: Float32[ndarray, "h w"], board: Chessboard) -> Chessboard | None:
+    """A chessboard with other numbers of corners that is seen instead: the user may have counted squares."""
+    grey = _stretched(image)
+    sizes = [(board.rows, board.columns), *((board.columns + x, board.rows + y) for x, y in _OTHER_COUNTS)]
+    for columns, rows in sizes:
+        if min(columns, rows) < 3 or (columns, rows) == (board.columns, board.rows):
+            continue
+        other = replace(board, columns=columns, rows=rows)
+        if _find_chessboard(grey, other) is not None:
+            return other
+    return None
+
+
+def _stretched(image: Float32[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
+    """8 bits, with the brightest hundredth saturated: boards under a projector are often dark."""
+    brightest = max(float(np.quantile(image[::4, ::4], 0.99)), 1e-3)
+    return np.rint(np.clip(image / brightest, 0, 1) * 255).astype(np.uint8)
+
+
+def _find_chessboard(grey: UInt8[ndarray, "h w"], board: Chessboard) -> Corners | None:
+    size = (board.columns, board.rows)
+    factor = min(1.0, _SEARCHED / max(grey.shape))
+    small = grey if factor == 1 else cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    found, uv = cv2.findChessboardCornersSB(small, size, flags=_FLAGS)
+    if not found:
+        found, uv = cv2.findChessboardCorners(small, size)
+        if not found:
+            return None
+    # either detector is off by a tenth of a pixel or more: on synthetic boards 0.10 px (RMS), 0.04 px when refined
+    uv = np.asarray(uv, np.float64).reshape(-1, 2)
+    return Corners(np.arange(len(uv)), _refined(grey, (uv + 0.5) / factor - 0.5) + 0.5)
+
+
+def _refined(grey: UInt8[ndarray, "h w"], uv: Float64[ndarray, "n 2"], share: float = 0.25) -> Float64[ndarray, "n 2"]:
+    """Corners moved to the saddle points of the brightness, in OpenCV's convention (first pixel centre at 0).
+
+    `share` is half the window, in distances to the next corner.
+    """
+    pitch = float(np.quantile(KDTree(uv).query(uv, k=2)[0][:, 1], 0.1))
+    half = int(np.clip(round(share * pitch), _SMALLEST_WINDOW, _LARGEST_WINDOW))
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+    found = cv2.cornerSubPix(grey, uv.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop)
+    return found.reshape(-1, 2).astype(np.float64)
+
+
+def _find_charuco(grey: UInt8[ndarray, "h w"], board: CharucoBoard) -> Corners | None:
+    """With the layout of either version of OpenCV: only one of them has the markers where they are."""
+    found = [_charuco_corners(grey, board, legacy) for legacy in (False, True)]
+    return max((corners for corners in found if corners is not None), key=lambda c: len(c.ids), default=None)
+
+
+def _charuco_corners(grey: UInt8[ndarray, "h w"], board: CharucoBoard, legacy: bool) -> Corners | None:
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+    drawn = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, markers)
+    drawn.setLegacyPattern(legacy)
+    uv, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(grey)
+    if ids is None or uv is None or len(ids) < LEAST_CORNERS:
+        return None
+    order = np.argsort(ids.ravel())
+    # OpenCV counts these pixels from one or the other corner of a pixel, as its version goes: a saddle has one place.
+    share = min(0.25, 0.8 * (board.square - board.marker) / 2 / board.square)  # markers stay outside the window
+    refined = _refined(grey, uv.reshape(-1, 2)[order].astype(np.float64), share)
+    return Corners(ids.ravel()[order].astype(np.int64), refined + 0.5)
+
+
+# What a calibration solves for: the intrinsics of both devices, their relative pose, and the pose of every board.
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One pose of the board, as both devices see it."""
+
+    name: str
+    camera: Corners
+    projector: Corners | None  # in pattern pixels; None where no pattern was projected, or too little of it decoded
+
+
+@dataclass(frozen=True)
+class FreeIntrinsics:
+    """Which intrinsics of a device are fitted. Focal length and principal point always are."""
+
+    aspect: bool = False  # fl_x and fl_y apart
+    terms: int = 0  # of the lens distortion: the first 0, 1, 2 or 4 of k1, k2, p1, p2
+
+    def columns(self) -> Float64[ndarray, "8 n"]:
+        """How PARAMETERS change with each fitted number, the first of which is fl_x or the common focal length."""
+        unit = np.eye(8)
+        focal = [unit[0], unit[1]] if self.aspect else [unit[0] + unit[1]]
+        return np.stack([*focal, unit[2], unit[3], *unit[4 : 4 + self.terms]], -1)
+
+    def __str__(self) -> str:
+        """In words."""
+        lens = ("no lens distortion", "k1", "k1, k2", "", "k1, k2, p1, p2")[self.terms]
+        return f"{'two focal lengths' if self.aspect else 'one focal length'}, {lens}"
+
+
+@dataclass(frozen=True)
+class BoardRig:
+    """A solution. Boards lie in the plane z = 0 of their frame, x to the right and y up, in the board's unit."""
+
+    camera: Device
+    projector: Device | None
+    T_camera_board: Float64[ndarray, "n 4 4"]  # of every view
+    T_projector_camera: Float64[ndarray, "4 4"]
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The camera, and the projector if there is one."""
+        return (self.camera,) if self.projector is None else (self.camera, self.projector)
+
+    def with_devices(self, devices: Sequence[Device]) -> "BoardRig":
+        """With other intrinsics."""
+        camera, *others = devices
+        return replace(self, camera=camera, projector=others[0] if others else None)
+
+    def only(self, views: Sequence[int]) -> "BoardRig":
+        """With the boards of some views."""
+        return replace(self, T_camera_board=self.T_camera_board[list(views)])
+
+
+def with_numbers(device: Device, values: Float64[ndarray, "8"]) -> Device:
+    """A device with other PARAMETERS."""
+    return replace(device, **dict(zip(PARAMETERS, map(float, values), strict=True)))
+
+
+def board_points(corners: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
+    """`board.corners()`, which have y down, as points of the board's frame."""
+    return np.c_[corners[:, 0], -corners[:, 1], np.zeros(len(corners))]
+
+
+# Reprojection residuals of the corners that a device sees, in all views at once, with their derivatives.
+
+_BEHIND_PX = 1e4  # the residual of a corner behind a device: a step that turns a board over must not look good
+
+
+@dataclass(frozen=True)
+class CornerSightings:
+    """All corners that one device sees, ordered by view."""
+
+    view: Int64[ndarray, "n"]
+    p_board: Float64[ndarray, "n 3"]
+    uv: Float64[ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals of the corners in one device, and how the predictions change, in pixels."""
+
+    residual: Float64[ndarray, "n 2"]  # seen minus predicted
+    by_intrinsics: Float64[ndarray, "n 2 k"]  # for each fitted number
+    by_rig: Float64[ndarray, "n 2 6"]  # for a twist (v, w) of T_projector_camera, from the left; 0 in the camera
+    by_board: Float64[ndarray, "n 2 6"]  # for a twist of the view's T_camera_board, from the left
+
+
+def sightings(views: Sequence[BoardView], p_board: Float64[ndarray, "m 3"]) -> tuple[CornerSightings, ...]:
+    """Of the camera, and of the projector if it sees any corner."""
+    seen = [[(k, view.camera) for k, view in enumerate(views)],
+            [(k, view.projector) for k, view in enumerate(views) if view.projector is not None]]  # fmt: skip
+    return tuple(
+        CornerSightings(
+            np.concatenate([np.full(len(corners.ids), k) for k, corners in of_device]),
+            np.concatenate([p_board[corners.ids] for _, corners in of_device]),
+            np.concatenate([corners.uv for _, corners in of_device]),
+        )
+        for of_device in seen
+        if any(len(corners.ids) for _, corners in of_device)
+    )
+
+
+def residuals(rig: BoardRig, device: int, seen: CornerSightings) -> Float64[ndarray, "n 2"]:
+    """Seen minus predicted pixels; `device` is 0 for the camera, 1 for the projector."""
+    p = _in_device(rig, device, seen)[1]
+    uv, in_front = project(Intrinsics.of(rig.devices[device], torch.float64), torch.from_numpy(p))
+    return np.where(in_front.numpy()[:, None], seen.uv - uv.numpy(), _BEHIND_PX)
+
+
+def linearised(rig: BoardRig, device: int, free: FreeIntrinsics, seen: CornerSightings) -> Linearised:
+    """Residuals with their derivatives."""
+    p_camera, p_device = _in_device(rig, device, seen)
+    p = torch.from_numpy(p_device)
+    intrinsics = Intrinsics.of(rig.devices[device], torch.float64)
+    uv, in_front = project(intrinsics, p)
+    by_point = project_jacobian(intrinsics, p).numpy()
+    R = rig.T_projector_camera[:3, :3] if device else np.eye(3)
+    by_board = by_point @ R @ _by_twist(p_camera)
+    return Linearised(
+        np.where(in_front.numpy()[:, None], seen.uv - uv.numpy(), _BEHIND_PX),
+        _by_parameters(rig.devices[device], p) @ free.columns(),
+        by_point @ _by_twist(p_device) if device else np.zeros_like(by_board),
+        by_board,
+    )
+
+
+def _in_device(
+    rig: BoardRig, device: int, seen: CornerSightings
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
+    """Corners in the camera's axes, and in the device's."""
+    T = rig.T_camera_board[seen.view]
+    p_camera = (T[:, :3, :3] @ seen.p_board[..., None])[..., 0] + T[:, :3, 3]
+    if not device:
+        return p_camera, p_camera
+    return p_camera, p_camera @ rig.T_projector_camera[:3, :3].T + rig.T_projector_camera[:3, 3]
+
+
+def _by_twist(p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3 6"]:
+    """d(exp(v, w) p) / d(v, w) at 0."""
+    eye = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+    return np.concatenate([eye, -hat(torch.from_numpy(p)).numpy()], -1)
+
+
+def _by_parameters(device: Device, p: torch.Tensor) -> Float64[ndarray, "n 2 8"]:
+    """Derivatives of pixels by PARAMETERS."""
+    x, y, _, _ = (t.numpy() for t in MODELS[device.model].jacobian(p))
+    r2 = x * x + y * y
+    o, one = np.zeros_like(x), np.ones_like(x)
+    radial = 1 + r2 * (device.k1 + r2 * device.k2)
+    xd = x * radial + 2 * device.p1 * x * y + device.p2 * (r2 + 2 * x * x)
+    yd = y * radial + device.p1 * (r2 + 2 * y * y) + 2 * device.p2 * x * y
+    lens_x = np.stack([x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x], -1) * device.fl_x
+    lens_y = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y], -1) * device.fl_y
+    u = np.concatenate([np.stack([xd, o, one, o], -1), lens_x], -1)
+    v = np.concatenate([np.stack([o, yd, o, one], -1), lens_y], -1)
+    return np.stack([u, v], 1)
+
+
+# Bundle adjustment of both devices and all boards: Levenberg-Marquardt with a robust kernel.
+#
+# Corners in the camera and in the projector have noise of different size, which is estimated from the residuals.
+# Boards
+# are eliminated from the normal equations (Schur complement), so many of them cost little.
+
+_KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
+_LEAST_SIGMA = 1e-6  # pixels: noise-free corners
+_ROUNDS = 4  # of estimating the noise
+_SETTLED = 0.02  # relative change of the noise
+_MOST_STEPS = 50
+_CONVERGED = 1e-6  # relative decrease of the cost
+_LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-5, 1e10
+_PLACING_STEPS = 4
+_SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
+
+Free = tuple[FreeIntrinsics, ...]
+"""Of the camera, and of the projector if there is one."""
+Seen = tuple[CornerSightings, ...]
+Sigma = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class AdjustedBoard:
+    """The solution, its noise, and the normal equations without the boards."""
+
+    rig: BoardRig
+    free: Free
+    sigma_px: Sigma  # of a coordinate of a corner in each device
+    information: Float64[ndarray, "s s"]  # of the fitted intrinsics of each device, then of the rig's twist
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations: shared numbers, and those of each board with what couples them to the shared ones."""
+
+    cost: float
+    H: Float64[ndarray, "s s"]
+    g: Float64[ndarray, "s"]
+    H_board: Float64[ndarray, "b 6 6"]
+    coupling: Float64[ndarray, "b s 6"]
+    g_board: Float64[ndarray, "b 6"]
+
+    def reduced(self, damping: float) -> tuple[Float64[ndarray, "s s"], Float64[ndarray, "s"]]:
+        """Without the boards."""
+        solved = np.linalg.solve(
+            self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_board[..., None]], -1)
+        )
+        H = self.H + damping * np.diag(np.diag(self.H)) - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1])
+        return H, self.g - np.einsum("bsk,bk->s", self.coupling, solved[..., -1])
+
+    def step(self, damping: float) -> tuple[Float64[ndarray, "s"], Float64[ndarray, "b 6"]]:
+        """Of the shared numbers, and of the boards."""
+        H, g = self.reduced(damping)
+        scale = 1 / np.sqrt(np.diag(self.H).clip(1e-300))
+        shared = scale * np.linalg.lstsq(H * scale[:, None] * scale, g * scale, rcond=_SINGULAR)[0]
+        rest = self.g_board - np.einsum("bsk,s->bk", self.coupling, shared)
+        return shared, np.linalg.solve(self._damped(damping), rest[..., None])[..., 0]
+
+    def _damped(self, damping: float) -> Float64[ndarray, "b 6 6"]:
+        diagonal = np.diagonal(self.H_board, axis1=1, axis2=2)
+        least = _SINGULAR * diagonal.max(1, keepdims=True).clip(1e-300)
+        return self.H_board + (damping * diagonal + least)[..., None] * np.eye(6)
+
+
+def adjust(start: BoardRig, free: Free, seen: Seen, sigma_px: Sigma | None = None) -> AdjustedBoard:
+    """The rig that explains the corners best. `sigma_px` holds the noise fixed; default: it is estimated."""
+    rig = start
+    sigma = sigma_px or noise(rig, free, seen)
+    for _ in range(1 if sigma_px else _ROUNDS):
+        rig, normal = _minimised(rig, free, seen, sigma)
+        before, sigma = sigma, sigma_px or noise(rig, free, seen)
+        if np.allclose(before, sigma, rtol=_SETTLED):
+            break
+    return AdjustedBoard(rig, free, sigma, normal.reduced(0.0)[0])
+
+
+def covariance(information: Float64[ndarray, "s s"]) -> Float64[ndarray, "s s"]:
+    """Of the fitted numbers, by the noise of the corners alone; huge where they do not determine them."""
+    scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    inverse = (vectors / values.clip(_SINGULAR * values.max())) @ vectors.T
+    return inverse * scale[:, None] * scale
+
+
+def place_boards(rig: BoardRig, seen: CornerSightings, sigma_px: float) -> BoardRig:
+    """Every board where its corners in the camera put it; the rest of the rig stays."""
+    for _ in range(_PLACING_STEPS):
+        one = linearised(rig, 0, FreeIntrinsics(), seen)
+        root = np.sqrt(kernel(one.residual / sigma_px)[1])[:, None]
+        steps = np.zeros((len(rig.T_camera_board), 6))
+        for b in range(len(steps)):
+            own = seen.view == b
+            B, e = (one.by_board * root[..., None])[own].reshape(-1, 6), (one.residual * root)[own].ravel()
+            steps[b] = np.linalg.lstsq(B, e, rcond=_SINGULAR)[0]
+        rig = replace(rig, T_camera_board=_exp(steps) @ rig.T_camera_board)
+    return rig
+
+
+def noise(rig: BoardRig, free: Free, seen: Seen) -> Sigma:
+    """Robust standard deviation of a coordinate in each device, with the degrees of freedom of the whole fit."""
+    fitted = sum(one.columns().shape[1] for one in free) + 6 * (len(free) - 1 + len(rig.T_camera_board))
+    total = 2 * sum(len(one.view) for one in seen)
+    freedom = np.sqrt(max(total - fitted, 1) / total)
+    medians = [float(np.median(np.abs(residuals(rig, k, one)))) for k, one in enumerate(seen)]
+    return tuple(max(MAD_TO_SIGMA * median / freedom, _LEAST_SIGMA) for median in medians)
+
+
+def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[BoardRig, Normal]:
+    normal, damping = normal_equations(rig, free, seen, sigma), _FIRST_DAMPING
+    for _ in range(_MOST_STEPS):
+        moved = _moved(rig, free, *normal.step(damping))
+        cost = _cost(moved, seen, sigma)
+        if cost < normal.cost:
+            decrease = (normal.cost - cost) / normal.cost
+            rig, damping = moved, max(damping / 10, _LEAST_DAMPING)
+            normal = normal_equations(rig, free, seen, sigma)
+            if decrease < _CONVERGED:
+                break
+        else:
+            damping *= 10
+            if damping > _LARGEST_DAMPING:
+                break
+    return rig, normal
+
+
+def _cost(rig: BoardRig, seen: Seen, sigma: Sigma) -> float:
+    return sum(
+        float(kernel(residuals(rig, k, one) / s)[0].sum()) for k, (one, s) in enumerate(zip(seen, sigma, strict=True))
+    )
+
+
+def kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
+    """Geman-McClure cost of corners, and their weights, from residuals in standard deviations."""
+    x = (whitened**2).sum(-1) / _KERNEL**2
+    return _KERNEL**2 * geman_mcclure_cost(x), geman_mcclure_weight(x)
+
+
+def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Normal:
+    """Of all corners at a rig."""
+    begin = np.cumsum([0, *(one.columns().shape[1] for one in free)])
+    size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
+    products, cost = np.zeros((boards, size + 7, size + 7)), 0.0  # of all columns: shared, of the board, residual
+    for k, of_device in enumerate(seen):
+        one = linearised(rig, k, free[k], of_device)
+        costs, weights = kernel(one.residual / sigma[k])
+        cost += float(costs.sum())
+        rows = np.zeros((len(weights), 2, size + 7))
+        rows[..., begin[k] : begin[k + 1]] = one.by_intrinsics
+        if k:
+            rows[..., size - 6 : size] = one.by_rig
+        rows[..., size : size + 6] = one.by_board
+        rows[..., -1] = one.residual
+        rows *= (np.sqrt(weights) / sigma[k])[:, None, None]
+        ends = np.searchsorted(of_device.view, np.arange(boards + 1))  # corners are ordered by view
+        for b in range(boards):
+            own = rows[ends[b] : ends[b + 1]].reshape(-1, size + 7)
+            products[b] += own.T @ own
+    of_boards = slice(size, size + 6)
+    return Normal(
+        cost,
+        products[:, :size, :size].sum(0),
+        products[:, :size, -1].sum(0),
+        products[:, of_boards, of_boards],
+        products[:, :size, of_boards],
+        products[:, of_boards, -1],
+    )
+
+
+def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:
+    devices, place = [], 0
+    for device, one in zip(rig.devices, free, strict=True):
+        columns = one.columns()
+        devices.append(with_numbers(device, device.parameters + columns @ shared[place : place + columns.shape[1]]))
+        place += columns.shape[1]
+    T_projector_camera = rig.T_projector_camera
+    if len(free) == 2:
+        T_projector_camera = _exp(shared[None, -6:])[0] @ T_projector_camera
+    T_camera_board = _exp(boards) @ rig.T_camera_board
+    return replace(rig.with_devices(devices), T_camera_board=T_camera_board, T_projector_camera=T_projector_camera)
+
+
+def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:
+    return exp_se3(torch.from_numpy(twists)).numpy()
+
+
+_FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
+_CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
+_TRIED = 3  # of the starts that fit best, how many are adjusted
+_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
+_LEAST_CORNERS = 6
+Size = tuple[int, int]
+
+
+def camera_start(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> AdjustedBoard:
+    """The camera without lens distortion, and the boards."""
+    w, h = size
+    focals = [*(share * max(size) for share in _FOCAL_LENGTHS), *_closed_form(views, size, p_board)]
+    found: list[tuple[float, BoardRig]] = []
+    for focal in focals:
+        camera = Device(w, h, focal, focal, w / 2, h / 2)
+        solved = [_pose(camera, p_board, view.camera) for view in views]
+        T = np.array([pose for pose, _ in solved])
+        found.append((float(sum(cost for _, cost in solved)), BoardRig(camera, None, T, np.eye(4))))
+    return _best(found, (FreeIntrinsics(),), sightings(views, p_board)[:1])
+
+
+def projector_start(
+    camera: AdjustedBoard, views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"], model: DeviceKind
+) -> AdjustedBoard:
+    """The projector as well, without lens distortion: it sees all corners of all views in one frame, the camera's."""
+    points, pixels = _seen_by_projector(camera.rig, views, p_board)
+    w, h = size
+    found: list[tuple[float, BoardRig]] = []
+    for focal in _FOCAL_LENGTHS:
+        for centre in _CENTRES:
+            device = Device(w, h, focal * w, focal * w, w / 2, centre * h, model=model)
+            T, cost = _pose(device, points, Corners(np.arange(len(points)), pixels))
+            rig = BoardRig(camera.rig.camera, device, camera.rig.T_camera_board, T)
+            found.append((cost, rig))
+    return _best(found, (*camera.free, FreeIntrinsics()), sightings(views, p_board))
+
+
+def _best(found: list[tuple[float, BoardRig]], free: Free, seen: Seen) -> AdjustedBoard:
+    """The best solution from the starts that fit best."""
+    tried = sorted(found, key=lambda one: one[0])[:_TRIED]
+    return min((adjust(rig, free, seen) for _, rig in tried), key=lambda one: one.sigma_px[-1])
+
+
+def _closed_form(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> Iterator[float]:
+    """The common focal length from all homographies, with the principal point in the middle; nothing if imaginary."""
+    rows, right = [], []
+    for view in views:
+        if len(view.camera.ids) < _LEAST_CORNERS:
+            continue
+        H, _ = cv2.findHomography(p_board[view.camera.ids, :2], view.camera.uv - np.array(size) / 2)
+        if H is None:
+            continue
+        first, second = H[:, 0], H[:, 1]
+        scale = np.linalg.norm(first) * np.linalg.norm(second)
+        rows += [first[:2] @ second[:2] / scale, (first[:2] @ first[:2] - second[:2] @ second[:2]) / scale]
+        right += [-first[2] * second[2] / scale, (second[2] ** 2 - first[2] ** 2) / scale]
+    if rows:
+        squared = float(np.dot(rows, rows) / np.dot(rows, right)) if np.dot(rows, right) else -1.0
+        if squared > 0:
+            yield float(np.clip(np.sqrt(squared), 0.2 * max(size), 50 * max(size)))
+
+
+def _pose(device: Device, points: Float64[ndarray, "m 3"], corners: Corners) -> tuple[Float64[ndarray, "4 4"], float]:
+    """Pose of a device to points, and the sum of squared residuals, in pixels."""
+    K = np.array([[device.fl_x, 0, device.cx], [0, device.fl_y, device.cy], [0, 0, 1]])
+    lens = np.array([device.k1, device.k2, device.p1, device.p2])
+    seen, uv = points[corners.ids], corners.uv
+    middle = seen.mean(0)  # about which the solver is well conditioned
+    flat = bool(np.ptp(points[:, 2]) == 0)
+    ok, rotation, shift = cv2.solvePnP(
+        (seen - middle)[:, None], uv[:, None], K, lens, flags=cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    )
+    if not ok or not np.isfinite(rotation).all():
+        return np.eye(4), np.inf
+    ok, rotation, shift = cv2.solvePnP((seen - middle)[:, None], uv[:, None], K, lens, rotation, shift, True)
+    again = cv2.projectPoints((seen - middle)[:, None], rotation, shift, K, lens)[0][:, 0]
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(rotation)[0]
+    T[:3, 3] = shift[:, 0] - T[:3, :3] @ middle
+    return _AXES @ T, float(((again - uv) ** 2).sum())
+
+
+def _seen_by_projector(
+    rig: BoardRig, views: Sequence[BoardView], p_board: Float64[ndarray, "m 3"]
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 2"]]:
+    """Corners in the camera's frame, and in the pattern."""
+    points, pixels = [], []
+    for view, T in zip(views, rig.T_camera_board, strict=True):
+        if view.projector is not None and len(view.projector.ids):
+            points.append(p_board[view.projector.ids] @ T[:3, :3].T + T[:3, 3])
+            pixels.append(view.projector.uv)
+    return np.concatenate(points), np.concatenate(pixels)

@@ -1,0 +1,165 @@
+"""The decoder of the coded grid."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8, UInt16
+from numpy import ndarray
+
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions
+from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, DetectedGrid, GridDetector, refusal
+from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, load_edge_network, weight_files
+from sl_nerfstudio.decoding.grid_fit import DrawnGrid, draw_sharpnesses, fit_densely
+from sl_nerfstudio.decoding.grid_graph import symbol_log_ratio
+from sl_nerfstudio.decoding.grid_phases import (
+    LEAST_MASK,
+    map_from_pixels,
+    sample_pixels,
+    spread,
+    to_pattern,
+    to_pixel_coordinates,
+)
+from sl_nerfstudio.pattern.codes import rotate_codes
+from sl_nerfstudio.pattern.grid import GridPattern, normalise_locally, projected_light
+from sl_nerfstudio.scan.images import as_grey, read_photograph
+
+# An image of the coded grid, decoded without calibration or other frames.
+#
+# The grid is found and its phases are read, its nodes are recognised, coordinates spread from the nodes over all
+# pixels,
+# a dense fit to the image refines them, and beside edges they are continued from where their surface is seen
+# better.
+
+# Which pixels are kept.
+_LEAST_TRUST = 0.02  # weight in the fit of a pixel that hardly shows the pattern
+_LEAST_LOG_RATIO = 0.0  # log-likelihood ratio of the symbols around a pixel: they must not contradict it
+_MOST_WRONG = 0.3  # probability that the pixel is wrong
+_SMALLEST_REGION = 2.0  # periods squared
+_TEAR = 0.5  # periods between neighbouring pixels
+_NORMALISING = 0.8  # window of the local intensity normalisation, periods
+_LIGHT_WINDOW = 0.5  # window in which the light is measured, periods
+_LIGHT_BLURS = (0.05, 0.09, 0.14, 0.2)  # of the pattern with which it is measured, periods
+
+
+class GridImageDecoder:
+    """Decodes images of one pattern. Create it once for all frames; the same image always gives the same result."""
+
+    def __init__(self, pattern: GridPattern) -> None:
+        self.pattern = pattern
+        self._detector = GridDetector(pattern)
+
+    def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
+        """Projector coordinates of every pixel that shows the pattern.
+
+        `image` is grey (h, w) or RGB (h, w, 3), 8 or 16 bit. Raises DecodingError if it shows no pattern, or another
+        pattern.
+        """
+        grey = as_grey(image)
+        found = self.detect(grey)
+        evidence = self.examine(grey, found)
+        chosen = self.edges.choose(evidence, found.rectified, found.assignment.turn)
+        coords = self._select(chosen, found.appearance.period)
+        return self.decoded(grey, coords, evidence.probability > LEAST_MASK, found.appearance.period)
+
+    def decoded(
+        self,
+        grey: Float32[ndarray, "h w"],
+        coords: Float32[ndarray, "h w 2"],
+        mask: Bool[ndarray, "h w"],
+        pixels_a_period: float,
+    ) -> Decoded:
+        """All maps of a capture with these coordinates; the mask holds every pixel that has any."""
+        mask = mask | np.isfinite(coords[..., 0])
+        light = projected_light(grey, coords, self._soft, _LIGHT_WINDOW * pixels_a_period)
+        return Decoded(coords, mask, self._normalise(grey, mask, pixels_a_period), light)
+
+    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
+        """The grid in an image. Raises DecodingError if too little of it fits the pattern."""
+        found = self._detector.detect(grey)
+        if found is None or found.known < LEAST_NODES:
+            raise refusal(grey, found, self._detector, self.pattern)
+        return found
+
+    def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> EdgeEvidence:
+        """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
+        assignment, known = found.assignment, found.assignment.known
+        phases = sample_pixels(found.maps, found.rectified, (grey.shape[0], grey.shape[1]))
+        at = np.floor(to_pixel_coordinates(found.graph.place[known], found.rectified)).astype(np.int32)
+        turned = spread(phases.phase, phases.clear, np.ascontiguousarray(at[:, ::-1]), assignment.place[known])
+        codes = rotate_codes(np.asarray(self.pattern.codes), assignment.turn)
+        to_map = map_from_pixels(found.rectified)
+        log_ratio = symbol_log_ratio(turned, codes, found.maps.symbol, to_map, found.appearance.period)
+        turned = np.where((log_ratio > _LEAST_LOG_RATIO)[..., None], turned, np.float32(np.nan))
+        read = to_pattern(turned, self.pattern, assignment.turn)
+        read[~self._inside(read)] = np.nan
+        trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
+        fitted, agreement = fit_densely(grey, read, trust, self.drawn, found.appearance.period)
+        return EdgeEvidence(read, fitted, agreement, log_ratio, phases.probability)
+
+    def _select(self, chosen: Chosen, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
+        """The coordinates without pixels that are probably wrong and without small regions."""
+        kept = (chosen.wrong < _MOST_WRONG) & self._inside(chosen.coords)
+        coords = np.where(kept[..., None], chosen.coords, np.float32(np.nan))
+        least = round(_SMALLEST_REGION * pixels_a_period**2)
+        return drop_small_regions(coords, _TEAR * self.pattern.period, least)
+
+    def _inside(self, coords: Float32[ndarray, "h w 2"]) -> Bool[ndarray, "h w"]:
+        """Pixels whose coordinates lie in the pattern; False for NaN."""
+        x, y = coords[..., 0], coords[..., 1]
+        return (x >= 0) & (x <= self.pattern.w) & (y >= 0) & (y <= self.pattern.h)
+
+    @cached_property
+    def drawn(self) -> tuple[DrawnGrid, ...]:
+        """The pattern from sharp to soft."""
+        return draw_sharpnesses(self.pattern.render(), self.pattern.period)
+
+    @cached_property
+    def edges(self) -> EdgeChooser:
+        """Continues coordinates beside edges."""
+        return EdgeChooser(load_edge_network(), self.pattern, self.drawn)
+
+    def _normalise(
+        self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
+    ) -> Float32[ndarray, "h w"]:
+        mean, spread = float(self._picture.mean()), float(self._picture.std())
+        return normalise_locally(grey, mask, _NORMALISING * pixels_a_period, mean, spread)
+
+    @cached_property
+    def _soft(self) -> list[Float32[ndarray, "ph pw"]]:
+        """The pattern through lenses of different sharpness."""
+        picture, period = self.pattern.render(), self.pattern.period
+        return [cv2.GaussianBlur(picture, (0, 0), blur * period) for blur in _LIGHT_BLURS]
+
+    @property
+    def _picture(self) -> Float32[ndarray, "ph pw"]:
+        return self.drawn[0].layers[..., 0]
+
+
+class NetworkDecoder(Decoder[GridPattern]):
+    """Decodes single images with the trained networks of this package."""
+
+    name: ClassVar[str] = "network"
+    version: ClassVar[int] = 9
+    reads: ClassVar[str] = GridPattern.kind
+    sequence: ClassVar[bool] = False
+
+    def decode(self, paths: Sequence[Path]) -> Decoded:
+        """Decode the one image of a frame."""
+        return self.decode_image(read_photograph(paths[0]))
+
+    def decode_image(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
+        """The same for an image that was read, or computed."""
+        return self.images.decode(image)
+
+    def weights(self) -> Iterable[Path]:
+        """The files of the trained networks."""
+        return weight_files()
+
+    @cached_property
+    def images(self) -> GridImageDecoder:
+        """What decodes single images."""
+        return GridImageDecoder(self.layout)

@@ -1,0 +1,270 @@
+"""The report of `sl-process`: what happened to every capture, as one HTML file that needs no network."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy import ndarray
+
+from sl_nerfstudio.calibration.board import BoardCalibration
+from sl_nerfstudio.calibration.board_adjustment import Corners
+from sl_nerfstudio.calibration.board_captures import BoardCaptures, BoardPicture
+from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.charts import data_uri, draw_overlaps, page
+from sl_nerfstudio.evaluation.report.view3d import compressed_script, placed_figure
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device
+from sl_nerfstudio.processing.object_only import FrameShares, Preview, object_sentences
+from sl_nerfstudio.processing.projector import describe
+from sl_nerfstudio.processing.result import FrameRecord, ProcessResult, first_line, unconnected_neighbours
+from sl_nerfstudio.review.verdict import DEVICES, Verdict, shortcomings
+
+# The report of `sl-calibrate`: what was found in every photograph, and how far the result can be trusted.
+
+TITLE = b"<title>Calibration report"
+"""By which an earlier report is known."""
+_THUMBNAIL = 360  # pixels
+_ARROW = 0.06  # of the image's width: length of the arrow of the largest usual residual
+
+
+@dataclass(frozen=True)
+class PoseCard:
+    """One pose of the board."""
+
+    picture: str  # data address
+    name: str
+    problem: str | None
+    figures: tuple[tuple[str, float, float, int], ...]  # device, RMS, predicted error when left out, corners
+
+
+@dataclass(frozen=True)
+class DeviceTable:
+    """The numbers of a device, with their standard deviations."""
+
+    name: str
+    device: Device
+    rows: tuple[tuple[str, float, float], ...]
+    model: str
+    rms_px: float
+    left_out_px: float
+    field: str  # data address: residuals over the image
+
+
+def render_calibration_report(
+    found: BoardCalibration, captures: BoardCaptures, verdict: Verdict, next_pose: str, command: str
+) -> str:
+    """The page as text. `next_pose` is the sentence on what to add."""
+    values = {
+        "found": found,
+        "verdict": verdict,
+        "next_pose": next_pose,
+        "command": command,
+        "lacking": shortcomings(found),
+        "devices": [_device_table(found, k) for k in range(len(found.sigmas))],
+        "models": [(DEVICES[one.device], one) for one in found.models],
+        "cards": _cards(found, captures.pictures),
+        "chart": _chart(found),
+    }
+    return page("calibration.html.j2", values)
+
+
+def _device_table(found: BoardCalibration, k: int) -> DeviceTable:
+    device, sigma = found.adjusted.rig.devices[k], found.sigmas[k]
+    rows = tuple((key, getattr(device, key), sigma.values[key]) for key in PARAMETERS if sigma.values[key])
+    corners = [view.camera if k == 0 else view.projector for view in found.views]
+    field = _residual_field(device, corners, found.residuals[k])
+    return DeviceTable(DEVICES[k], device, rows, str(found.free[k]), found.rms_px[k], found.left_out.error_px[k], field)
+
+
+def _cards(found: BoardCalibration, pictures: Sequence[BoardPicture]) -> list[PoseCard]:
+    number = {view.name: k for k, view in enumerate(found.views)}
+    out = []
+    for picture in pictures:
+        place, figures = number.get(picture.name), []
+        if place is not None:
+            for k, residuals in enumerate(found.residuals):
+                r = residuals[place]
+                if len(r):
+                    rms = float(np.sqrt((r**2).mean()))
+                    figures.append((DEVICES[k], rms, float(found.left_out.by_view_px[k, place]), len(r)))
+        out.append(PoseCard(_thumbnail(picture), picture.name, picture.problem, tuple(figures)))
+    return out
+
+
+def _chart(found: BoardCalibration) -> str:
+    series = [
+        charts.Bars(DEVICES[k], [float(np.sqrt((r**2).mean())) if len(r) else np.nan for r in residuals])
+        for k, residuals in enumerate(found.residuals)
+    ]
+    return charts.frame_bars("Residual of the corners by pose (RMS)", "px", series, wide=True)
+
+
+def _thumbnail(picture: BoardPicture) -> str:
+    """The photograph with the corners that were found."""
+    grey = picture.grey / max(float(np.quantile(picture.grey, 0.99)), 1e-3)
+    factor = _THUMBNAIL / grey.shape[1]
+
+    def draw(axes: Axes) -> None:
+        axes.imshow(np.clip(grey, 0, 1), cmap="gray", vmin=0, vmax=1, extent=(0, grey.shape[1], grey.shape[0], 0))
+        if picture.corners is not None:
+            axes.plot(*picture.corners.uv.T, "+", color=charts.ORANGE, markersize=4, markeredgewidth=0.8)
+        axes.set_xlim(0, grey.shape[1])
+        axes.set_ylim(grey.shape[0], 0)
+        axes.axis("off")
+
+    return data_uri(_drawn(_THUMBNAIL, round(grey.shape[0] * factor), draw, 0.0))
+
+
+def _residual_field(
+    device: Device, corners: Sequence[Corners | None], residuals: Sequence[Float64[ndarray, "_ 2"]]
+) -> str:
+    """Residuals as arrows over the image, all enlarged alike; a pattern in them shows what the model lacks."""
+    uv = np.concatenate([one.uv for one in corners if one is not None and len(one.uv)])
+    r = np.concatenate([one for one in residuals if len(one)])
+    usual = max(float(np.quantile(np.linalg.norm(r, axis=1), 0.95)), 1e-9)
+    scale = _ARROW * device.w / usual
+    low, high = np.minimum(uv.min(0), 0), np.maximum(uv.max(0), (device.w, device.h))
+
+    def draw(axes: Axes) -> None:
+        axes.quiver(*uv.T, *(r * scale).T, angles="xy", scale_units="xy", scale=1, width=0.0018, color=charts.BLUE)
+        axes.plot([device.cx], [device.cy], "x", color=charts.ORANGE, markersize=7)
+        axes.add_patch(Rectangle((0, 0), device.w, device.h, fill=False, color=charts.MUTED))
+        axes.set_aspect("equal")
+        axes.set_xlim(min(low[0], device.cx) - 0.02 * device.w, max(high[0], device.cx) + 0.02 * device.w)
+        axes.set_ylim(max(high[1], device.cy) + 0.02 * device.h, min(low[1], device.cy) - 0.02 * device.h)
+        axes.set_title(f"residuals, enlarged {scale:.0f} times; x: principal point", fontsize=8, color=charts.MUTED)
+        axes.tick_params(labelsize=7)
+
+    return data_uri(_drawn(640, 520, draw, 0.07), quality=90)
+
+
+def _drawn(w: int, h: int, draw: Callable[[Axes], None], margin: float) -> Float[ndarray, "h w 3"]:
+    figure = Figure(figsize=(w / 100, h / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    draw(figure.add_axes((margin, margin, 1 - 1.3 * margin, 1 - 2 * margin)))
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba(), np.float64)[..., :3] / 255
+
+
+_TEMPLATE = "processing.html.j2"
+_WITHOUT_EFFECT = ("output", "work", "jobs")  # flags on which no result depends
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """A frame with its pictures."""
+
+    record: FrameRecord
+    image: str  # data addresses; "" where there is no picture
+    coords: str
+    left_out: str
+    shares: FrameShares | None  # of what was left out
+
+
+def render_processing_report(result: ProcessResult, previews: Sequence[Preview]) -> str:
+    """The page as text."""
+    found = result.object_only
+    shares = {} if found is None else {share.name: share for share in found.frames}
+    rows = [
+        FrameRow(record, *_pictures(preview), shares.get(record.name))
+        for record, preview in zip(result.frames, previews, strict=True)
+    ]
+    values = {
+        "result": result,
+        "rows": rows,
+        "verdict": result.verdict,
+        "sentence": _sentence(result),
+        "projector": "" if result.projector is None else describe(result.projector),
+        "object_only": () if found is None else object_sentences(found),
+        "charts": _charts(result),
+        "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
+        "settings": _settings(result),
+        "figure": _figure(result),
+        "groups": [len(group.frames) for group in result.placed],
+        "plotly": compressed_script() if result.placed else "",
+    }
+    return page(_TEMPLATE, values, first_line=first_line, linked=_linker([f.name for f in result.frames]))
+
+
+def _figure(result: ProcessResult) -> str:
+    """The 3D view; "" if no frame was calibrated."""
+    if not result.placed:
+        return ""
+    undecided = [f.name for f in result.frames if f.undecided]
+    missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
+    return placed_figure(result.placed, undecided, missing, {f.name: k for k, f in enumerate(result.frames)})
+
+
+def _linker(names: Sequence[str]) -> Callable[[str], Markup]:
+    """Makes links of the frame names before the first colon of a text: what it is about."""
+    number = {name: k for k, name in enumerate(names)}
+    among = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    pattern = re.compile(rf"(?<![\w-])(?:{among})(?![\w-])") if names else re.compile(r"(?!)")
+
+    def linked(text: str) -> Markup:
+        parts, end = [], 0
+        for found in pattern.finditer(text, 0, max(text.find(": "), 0)):
+            link = Markup('<a href="#frame-{}">{}</a>').format(number[found[0]], found[0])
+            parts += [escape(text[end : found.start()]), link]
+            end = found.end()
+        return Markup("").join([*parts, escape(text[end:])])
+
+    return linked
+
+
+def _settings(result: ProcessResult) -> list[tuple[str, str]]:
+    """The flags on which the scan depends; with others, and at another time, the report is the same byte for byte."""
+    flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
+    return sorted((key, str(value)) for key, value in flags.items() if value is not None)
+
+
+def _sentence(result: ProcessResult) -> str:
+    lost = len(result.frames) - result.registered
+    begin = f"{result.registered} of {len(result.frames)} frames are in the scan"
+    if result.registered < 2:
+        return f"{begin}: no scan could be written."
+    left_out = "" if not lost else "; 1 was left out" if lost == 1 else f"; {lost} were left out"
+    length = "no length is known, so its unit is arbitrary"
+    if result.scale_source:
+        length = f"its lengths are in {result.units}, known from: {result.scale_source}"
+    return f"{begin}{left_out}; {length}."
+
+
+def _charts(result: ProcessResult) -> list[tuple[str, str]]:
+    """Caption and drawing of every chart over the frames."""
+    frames = result.frames
+
+    def values(key: str, factor: float = 1.0) -> list[float]:
+        return [math.nan if getattr(f, key) is None else factor * getattr(f, key) for f in frames]
+
+    drawn = [
+        ("Decoded: share of the visible pattern, and of the surface that other frames show", "%",
+         [charts.Bars("pattern", values("decode_rate", 100.0)),
+          charts.Bars("surface", values("shared_decoded", 100.0))]),
+        ("Missing: of the surface that other frames show in the sight of both devices, where no pattern was seen", "%",
+         [charts.Bars("missing", values("missing_share", 100.0))]),
+        ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
+         [charts.Bars("epipolar", values("epipolar_px"))]),
+        ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
+         [charts.Bars("rotation", values("relative_sigma_rotation_deg")),
+          charts.Bars("baseline's direction", values("relative_sigma_direction_deg"))]),
+        ("Agreement with overlapping frames", "% of the points",
+         [charts.Bars("surfaces", values("fitness", 100.0)), charts.Bars("coordinates", values("cross_share", 100.0))]),
+        ("Coordinates of this frame against those of the others", "pattern px",
+         [charts.Bars("95 % below", values("cross_px_p95")), charts.Bars("median", values("cross_px_median"))]),
+    ]  # fmt: skip
+    known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]
+    return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]
+
+
+def _pictures(preview: Preview) -> tuple[str, str, str]:
+    shown = (preview.image, preview.coords, preview.left_out)
+    image, coords, left_out = (("" if p is None else data_uri(p)) for p in shown)
+    return image, coords, left_out

@@ -1,0 +1,437 @@
+"""The report: one HTML file with which a person can judge a scan, without a network."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from sl_nerfstudio.calibration.stated import describe_change
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels, frame_pixels
+from sl_nerfstudio.evaluation.evaluate import Evaluation, EvaluationInputs, Length
+from sl_nerfstudio.evaluation.judgement import Judgement
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import MeshReference, PoseErrors, compare_poses
+from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.charts import (
+    NO_SURFACE,
+    NO_VALUE,
+    ColourScale,
+    camera_views,
+    colour_layers,
+    data_uri,
+    page,
+    pixel_map,
+    render,
+    residual_colours,
+    shrink,
+)
+from sl_nerfstudio.evaluation.report.view3d import SceneDevices, compressed_script, mesh_figure
+from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.parallel import results
+from sl_nerfstudio.scan import Frame, PoseSigma, Scan
+
+# Small residual maps of every frame, made while the frames are evaluated one by one.
+
+COORDINATE = ColourScale("YlOrRd", 0.0, 2.0)  # pattern pixels
+EPIPOLAR = ColourScale("RdBu_r", -1.5, 1.5)
+PATTERN = ColourScale("YlOrRd", 0.0, 0.5)  # of full brightness
+_THUMBNAIL_SIDE = 150
+
+
+@dataclass(frozen=True)
+class FrameThumbnails:
+    """One frame's maps as data addresses."""
+
+    name: str
+    figures: FrameAgreement
+    coordinate: str
+    epipolar: str
+    pattern: str
+
+
+class ResidualThumbnails:
+    """Makes the small maps of each frame it gets; meant as the `on_frame` of `evaluate`."""
+
+    def __init__(self) -> None:
+        self.frames: list[FrameThumbnails] = []
+
+    def __call__(self, frame: Frame, figures: FrameAgreement, pixels: FramePixels) -> None:
+        """Add one frame."""
+        missed = ~pixels.hit
+        difference = np.abs(pixels.captured - pixels.rendered * brightness_ratio(pixels))
+        self.frames.append(
+            FrameThumbnails(
+                frame.name,
+                figures,
+                coordinate=_map(pixels, residual_colours(pixels.coordinate, COORDINATE, missed & pixels.decoded)),
+                epipolar=_map(pixels, residual_colours(pixels.epipolar, EPIPOLAR, np.zeros_like(missed))),
+                pattern=_map(pixels, residual_colours(difference, PATTERN, missed)),
+            )
+        )
+
+
+def brightness_ratio(pixels: FramePixels) -> float:
+    """Least-squares factor from the brightness of the rendered to that of the captured pattern."""
+    known = pixels.lit & np.isfinite(pixels.rendered)
+    a, b = pixels.captured[known], pixels.rendered[known]
+    return float(a @ b / (b @ b)) if (b @ b) > 0 else 1.0
+
+
+def _map(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
+    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _THUMBNAIL_SIDE))
+
+
+# Captured and rendered pattern of a few frames, side by side.
+
+_COMPARISON_SIDE = 420
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One frame's pictures as data addresses, all cropped in the same way."""
+
+    name: str
+    why: str  # why this frame is shown
+    captured: str
+    rendered: str
+    difference: str
+    cosine: float
+
+
+def compare_frames(
+    surface: IndexedMesh,
+    scan: Scan,
+    agreement: CaptureAgreement,
+    poses: DevicePoses,
+) -> list[Comparison]:
+    """The frames with the best, the median and the worst pattern agreement."""
+    pattern = scan.read_pattern()
+    shown = []
+    for index, why in _chosen(agreement):
+        frame = scan.frames[index]
+        pixels = frame_pixels(
+            surface, frame, scan, pattern, poses.T_world_camera[index], poses.T_world_projector[index]
+        )
+        shown.append(_compare(frame.name, why, agreement.frames[index].pattern_cosine, pixels))
+    return shown
+
+
+def _chosen(agreement: CaptureAgreement) -> list[tuple[int, str]]:
+    """Indices of frames, and why."""
+    order = sorted(
+        (i for i, f in enumerate(agreement.frames) if math.isfinite(f.pattern_cosine)),
+        key=lambda i: -agreement.frames[i].pattern_cosine,
+    )
+    picks: dict[int, str] = {}
+    for place, why in ((0, "best agreement"), (len(order) // 2, "median"), (-1, "worst agreement")):
+        if order:
+            picks.setdefault(order[place], why)
+    return list(picks.items())
+
+
+def _compare(name: str, why: str, cosine: float, pixels: FramePixels) -> Comparison:
+    rendered = pixels.rendered * brightness_ratio(pixels)
+    white = max(float(np.nanpercentile(pixels.captured, 99.5)), 1e-6) if len(pixels.captured) else 1.0
+    return Comparison(
+        name=name,
+        why=why,
+        captured=_picture(pixels, _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit))),
+        rendered=_picture(pixels, _grey(rendered / white, pixels, pixels.lit)),
+        difference=_picture(pixels, _signed((pixels.captured - rendered) / white, pixels)),
+        cosine=cosine,
+    )
+
+
+def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> Float[ndarray, "n 3"]:
+    rgb = np.repeat(np.clip(np.nan_to_num(values), 0, 1)[:, None], 3, axis=1)
+    rgb[~known] = NO_VALUE
+    rgb[~known & ~pixels.hit] = NO_SURFACE
+    return rgb
+
+
+def _signed(values: Float[ndarray, "n"], pixels: FramePixels) -> Float[ndarray, "n 3"]:
+    return residual_colours(values, ColourScale("RdBu_r", -0.6, 0.6), ~pixels.hit)
+
+
+def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
+    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _COMPARISON_SIDE), quality=85)
+
+
+# What the report says about the intrinsics of a run, from its training.json.
+
+
+def intrinsics_hint(training: dict[str, Any] | None, scan: Scan) -> str:
+    """How the run changed the intrinsics, and which ones would agree better; "" if there is nothing to say."""
+    record = (training or {}).get("intrinsics")
+    if not isinstance(record, dict):
+        return ""
+    sentences = []
+    change = _change(record["change"])
+    if change:
+        sentences.append(
+            "The intrinsics are not those of the scan folder: focal length of the camera "
+            f"{100 * change.camera.focal:+.2f} %, of the projector {100 * change.projector.focal:+.2f} %. The "
+            "transforms.json of the refined poses has them"
+        )
+    found = record["self_calibration"]
+    if found is not None and found["contradicts"]:
+        cameras = [frame.camera for frame in scan.frames]
+        lines = describe_change(_change(found["change"]), _change(found["sigma"]), cameras, scan.projector)
+        sentences.append(
+            f"The intrinsics contradict the captures (chi square {found['chi_square']:.0f}, by chance 6). "
+            f"These changes, together, would agree better: {'; '.join(lines)}. Train with "
+            "--pipeline.model.refine-intrinsics True; if that does not help, calibrate again"
+        )
+    return ". ".join(sentences)
+
+
+def _change(record: dict[str, dict[str, float]]) -> IntrinsicsChange:
+    return IntrinsicsChange(DeviceChange(**record["camera"]), DeviceChange(**record["projector"]))
+
+
+_TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """What the report is made from."""
+
+    evaluation: Evaluation
+    judgement: Judgement
+    inputs: EvaluationInputs
+    thumbnails: list[FrameThumbnails]
+    mesh_name: str
+    made_at: datetime = field(default_factory=datetime.now)
+    lengths: Sequence[Length] = ()
+
+    @property
+    def poses_name(self) -> str:
+        """Folder and file of the evaluated poses; "" if they are the scan's own."""
+        path = self.inputs.poses_path
+        return "" if path is None else f"{path.parent.name}/{path.name}"
+
+
+@dataclass(frozen=True)
+class SurfacePictures:
+    """Shaded views of the surface, with error colours where there is a reference."""
+
+    views: list[str]  # data addresses
+    figure: str  # Plotly's JSON
+    scale: ColourScale | None
+    layers: list[str]  # names of what the interactive view can be coloured by
+    histogram: str  # SVG, "" without a reference
+
+
+def render_report(report: ReportInput) -> str:
+    """The page as text."""
+    evaluation, scan = report.evaluation, report.inputs.scan
+    surface, comparisons, script, drawn = _parts(report)
+    values = {
+        "report": report,
+        "evaluation": evaluation,
+        "scan": scan,
+        "agreement": evaluation.agreement,
+        "units": evaluation.units,
+        "truth_units": evaluation.truth_units,
+        "judgement": report.judgement,
+        "verdict": report.judgement.verdict,
+        "surface": surface,
+        "comparisons": comparisons,
+        "coordinate_scale": COORDINATE,
+        "epipolar_scale": EPIPOLAR,
+        "pattern_scale": PATTERN,
+        "residual_chart": drawn.residuals,
+        "outliers": _outliers(evaluation),
+        "changes": drawn.changes,
+        "lengths": report.lengths,
+        "truth": _truth_rows(evaluation),
+        "training": drawn.training,
+        "summary": _summary(report),
+        "plotly": script,
+    }
+    return page(_TEMPLATE, values)
+
+
+def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "DrawnCharts"]:
+    """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
+    surface = IndexedMesh(report.inputs.mesh)
+    compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
+    tasks: list[Callable[[], Any]] = [
+        partial(_surface_pictures, report, surface), partial(_charts, report), compare, compressed_script,
+    ]  # fmt: skip
+    (pictures, errors), drawn, comparisons, script = results(tasks)
+    if errors is not None and pictures.scale is not None:
+        title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
+        histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
+        pictures = replace(pictures, histogram=histogram)
+    return pictures, comparisons, script, drawn
+
+
+@dataclass(frozen=True)
+class DrawnCharts:
+    """All charts but the histogram, as SVG."""
+
+    residuals: str
+    changes: "PoseChanges | None"
+    training: "TrainingSection | None"
+
+
+def _charts(report: ReportInput) -> DrawnCharts:
+    return DrawnCharts(_residual_chart(report.evaluation), _pose_changes(report), _training(report.inputs.training))
+
+
+def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
+    """The pictures without the histogram, and the errors that it shows."""
+    values, scale = _errors(report, surface, surface.vertices)
+    colours = None if values is None or scale is None else scale(values)
+    views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
+    units = report.evaluation.truth_units
+    layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
+    scan, quality = report.inputs.scan, report.inputs.quality
+    devices = SceneDevices([f.name for f in scan.frames], [f.camera for f in scan.frames], scan.projector)
+    sigma = None if quality is None else quality.sigma
+    figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses, devices, sigma)
+    errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
+    drawn = [data_uri(render(surface, v, colours)) for v in views]
+    return SurfacePictures(drawn, figure, scale, [layer.name for layer in layers], ""), errors
+
+
+def _errors(
+    report: ReportInput, surface: IndexedMesh, points: Float[ndarray, "n 3"]
+) -> tuple[Float[ndarray, "n"] | None, ColourScale | None]:
+    """Signed errors of points of the result after alignment, and their colour scale; None without reference."""
+    reference = report.evaluation.reference
+    if reference is None:
+        return None, None
+    score = report.evaluation.surface[report.evaluation.alignment]
+    exact = isinstance(reference, MeshReference)
+    limit = charts.nice_limit((score.accuracy if exact else score.completeness).p95)
+    return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
+
+
+def _residual_chart(evaluation: Evaluation) -> str:
+    frames = evaluation.agreement.frames
+    return charts.frame_bars(
+        "Median residuals by frame",
+        "pattern px",
+        [
+            charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
+            charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
+        ],
+        wide=True,
+    )
+
+
+def _outliers(evaluation: Evaluation) -> set[str]:
+    """Frames whose coordinate residual is more than twice the scan's."""
+    limit = 2 * evaluation.agreement.coordinate_px_median
+    return {f.name for f in evaluation.agreement.frames if not f.coordinate_px_median <= limit}
+
+
+@dataclass(frozen=True)
+class PoseChanges:
+    """How far the evaluated poses are from the scan's own, and how certain they are."""
+
+    change: PoseErrors
+    sigma: list[PoseSigma | None]
+    unplaced: list[str]  # frames that do not agree with the others
+    charts: list[str]
+
+
+def _pose_changes(report: ReportInput) -> PoseChanges | None:
+    """None where the scan's own poses were evaluated."""
+    if not report.poses_name:
+        return None
+    scan = report.inputs.scan
+    change = compare_poses(report.inputs.poses, scan.poses)
+    sigma = report.inputs.pose_sigma if any(s is not None for s in report.inputs.pose_sigma) else []
+    camera, projector = change.camera, change.projector
+    figures = [
+        charts.frame_bars(title, unit, [charts.Bars("camera", list(c)), charts.Bars("projector", list(p))])
+        for title, unit, c, p in (
+            ("Change of position by frame", scan.units, camera.translation, projector.translation),
+            ("Change of rotation by frame", "degrees", camera.rotation_deg, projector.rotation_deg),
+        )
+    ]
+    if sigma:
+        for title, unit, keys in (
+            ("Uncertainty of position (1 sigma) by frame", scan.units, ("camera_translation", "relative_translation")),
+            ("Uncertainty of rotation (1 sigma) by frame", "degrees", ("camera_rotation_deg", "relative_rotation_deg")),
+        ):
+            labels = ("frame in the world", "projector relative to camera")
+            series = [
+                charts.Bars(label, [getattr(s, key) if s else math.nan for s in sigma])
+                for key, label in zip(keys, labels, strict=True)
+            ]
+            figures.append(charts.frame_bars(title, unit, series))
+    return PoseChanges(change, sigma, report.inputs.unplaced, figures)
+
+
+def _truth_rows(evaluation: Evaluation) -> list[tuple[str, PoseErrors]]:
+    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
+    return [(name, errors) for name, errors in rows if errors is not None]
+
+
+@dataclass(frozen=True)
+class TrainingSection:
+    """Curves, settings and versions of the run."""
+
+    curves: list[str]
+    settings: list[tuple[str, str]]
+    versions: list[tuple[str, str]]
+
+
+def _training(training: dict[str, Any] | None) -> TrainingSection | None:
+    if training is None:
+        return None
+    curves = {k: v for k, v in _dict(training.get("curves")).items() if isinstance(v, list) and len(v) > 0}
+    step = curves.pop("step", [])
+    drawn = [
+        charts.curve(name, step if len(step) == len(values) else range(len(values)), values)
+        for name, values in curves.items()
+    ]
+    return TrainingSection(drawn, _flat(_dict(training.get("settings"))), _flat(_dict(training.get("versions"))))
+
+
+def _dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as dotted names."""
+    rows: list[tuple[str, str]] = []
+    for key, value in settings.items():
+        name = f"{prefix}{key}"
+        rows += _flat(value, f"{name}.") if isinstance(value, dict) and value else [(name, str(value))]
+    return rows
+
+
+def _summary(report: ReportInput) -> list[tuple[str, str]]:
+    scan, poses = report.inputs.scan, report.inputs.poses
+    frames, baseline = report.evaluation.agreement.frames, poses.baseline
+    centre = (report.inputs.mesh.vertices.min(0) + report.inputs.mesh.vertices.max(0)) / 2
+    distance = np.linalg.norm(poses.T_world_camera[:, :3, 3] - centre, axis=1)
+    mesh = report.inputs.mesh
+    size = np.ptp(mesh.vertices, axis=0)
+    cameras = sorted({f"{f.camera.w} × {f.camera.h}" for f in scan.frames})
+    decoded = np.mean([f.decoded_share for f in frames])
+    scale = f"known ({scan.scale.source})" if scan.scale.known else "unknown: all lengths are relative"
+    return [
+        ("Frames", str(len(scan.frames))),
+        ("Image size", ", ".join(cameras) + " pixels"),
+        ("Projector", f"{scan.projector.w} × {scan.projector.h} pixels, model {scan.projector.model}"),
+        ("Unit", scan.units),
+        ("Scale", scale if scan.scale.source or not scan.scale.known else "known"),
+        ("Pixels with pattern", f"{sum(f.pixels for f in frames):,}, of which {decoded:.0%} were decoded"),
+        ("Distance of the cameras", f"{np.median(distance):.4g} {scan.units} (median)"),
+        ("Camera to projector", f"{np.median(baseline):.4g} {scan.units} (median), "
+         f"{np.min(baseline):.4g} to {np.max(baseline):.4g}"),
+        ("Mesh", f"{len(mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
+    ]  # fmt: skip

@@ -1,0 +1,560 @@
+"""Uncertainty of the distance between two points of the surface.
+
+A point that is measured on the surface moves with the poses of the frames that see it, along the surface as well as
+across it. It is where their rays meet: it minimises its residuals in camera pixels and projector pixels. The shared
+part of a length's variance follows from the joint covariance, in the gauge of the scan: the length that fixes the scale
+counts as exact. Decoding noise moves each end along its normal.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from numpy import ndarray
+from scipy.sparse import coo_array
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, is_exact
+from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, by_intrinsics
+from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
+from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.devices import MODELS, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.lie import DevicePoses, hat, inverse, transform
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, evenly_spaced
+from sl_nerfstudio.meshing import visibility as loops
+from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
+from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX, Occluder, dot, lit_vertices, write_rows
+from sl_nerfstudio.parallel import compiled_range, parallel, results, threads
+from sl_nerfstudio.scan.types import Frame, Scan
+
+# How the residuals of one frame depend on the surface, on the frame's poses and on the intrinsics.
+#
+# A surface that is locally a plane moves by s along its normal, or the frame's poses change while its decoded
+# coordinates
+# stay. The residual is the predicted minus the decoded coordinate of a camera pixel, in projector pixels.
+# Increments are
+# those of `bundle_adjustment.residuals`; intrinsics are shares of the focal length (`IntrinsicsChange.values`).
+
+
+@dataclass(frozen=True)
+class FrameDevices:
+    """Camera and projector of one frame, batch ()."""
+
+    camera: Intrinsics
+    projector: Intrinsics
+    T_world_camera: Float[Tensor, "4 4"]
+    T_camera_projector: Float[Tensor, "4 4"]
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """Points of a surface as one frame sees them."""
+
+    p_camera: Float[Tensor, "n 3"]
+    uv_camera: Float[Tensor, "n 2"]
+    uv_projector: Float[Tensor, "n 2"]  # predicted
+    by_point: Float[Tensor, "n 2 3"]  # of the predicted coordinate by the point in the camera's axes
+    slope: Float[Tensor, "n 2"]  # of the residual, projector pixels per unit of length along the normal
+    by_pixel: Float[Tensor, "n 2 2"]  # of the predicted coordinate by the camera pixel, along the surface
+    pixels_per_area: Float[Tensor, "n"]  # camera pixels on a unit of the surface's area
+    ray_angle: Float[Tensor, "n"]  # between camera ray and projector ray, radian
+
+
+def packed_devices(d: FrameDevices) -> Float[ndarray, "devices"]:
+    """The devices of a frame as compiled loops read them."""
+    T_camera_world, T_projector_camera = inverse(d.T_world_camera), inverse(d.T_camera_projector)
+    codes = [float(MODELS[device.model].code) for device in (d.camera, d.projector)]
+    matrices = [T[:3].reshape(-1).numpy() for T in (T_camera_world, T_projector_camera)]
+    return np.concatenate(
+        [*matrices, d.T_camera_projector[:3, 3].numpy(), d.camera.params.numpy(), d.projector.params.numpy(), codes]
+    )
+
+
+def view_surface(d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> SurfaceView:
+    """The view of points with unit normals, which must be in front of both devices and face the camera."""
+    rows = np.empty((len(p_world), loops.VIEW))
+    _view_points(len(rows), packed_devices(d), p_world.numpy(), normal.numpy(), rows)
+    views = torch.from_numpy(rows)
+    return SurfaceView(
+        p_camera=views[:, loops.P_CAMERA : loops.BY_POINT],
+        by_point=views[:, loops.BY_POINT : loops.UV_CAMERA].unflatten(1, (2, 3)),
+        uv_camera=views[:, loops.UV_CAMERA : loops.UV_PROJECTOR],
+        uv_projector=views[:, loops.UV_PROJECTOR : loops.SLOPE],
+        slope=views[:, loops.SLOPE : loops.BY_PIXEL],
+        by_pixel=views[:, loops.BY_PIXEL : loops.AREA].unflatten(1, (2, 2)),
+        pixels_per_area=views[:, loops.AREA],
+        ray_angle=views[:, loops.ANGLE],
+    )
+
+
+@compiled_range
+def _view_points(first, last, devices, points, normals, rows):
+    for i in range(first, last):
+        loops.view_point(devices, points[i], normals[i], rows[i])
+
+
+def point_equations(d: FrameDevices, p_world: Float[Tensor, "n 3"]) -> tuple[Tensor, Tensor]:
+    """Derivatives of the residuals of a *point*, which the frame sees at a camera pixel and at a projector pixel.
+
+    Returns those by the point (n, 4, 3), and by delta, rho and the intrinsics (n, 4, 18). Unlike a surface, a point
+    cannot slide along itself: lengths between points depend on all of its motion.
+    """
+    p = transform(inverse(d.T_world_camera), p_world)
+    K, P = project_jacobian(d.camera, p), _projector_jacobian(d, p)
+    R = d.T_world_camera[:3, :3].T
+    by_point = torch.cat([K, P], 1) @ R
+    by_delta = torch.cat([-by_point, by_point @ hat(p_world)], -1)
+    by_rho = torch.cat([torch.zeros_like(by_delta[:, :2]), torch.cat([-P, P @ hat(p)], -1)], 1)
+    uv_camera = project(d.camera, p)[0]
+    uv_projector = project(d.projector, transform(inverse(d.T_camera_projector), p))[0]
+    zero = p.new_zeros(len(p), 2, 3)
+    camera = torch.cat([by_intrinsics(d.camera, uv_camera), zero], 1)
+    projector = torch.cat([zero, by_intrinsics(d.projector, uv_projector)], 1)
+    return by_point, torch.cat([by_delta, by_rho, camera, projector], -1)
+
+
+def _projector_jacobian(d: FrameDevices, p_camera: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:
+    T = inverse(d.T_camera_projector)
+    return project_jacobian(d.projector, transform(T, p_camera)) @ T[:3, :3]
+
+
+# For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry.
+
+_LOOKED_UP = 2000  # vertices of a frame, to compare the noise of windows with that of pixels
+_FEWEST = 20  # values of which a spread is stated
+
+
+@dataclass(frozen=True)
+class VertexViews:
+    """Pairs of a vertex and a frame that confirms it, by vertex; lengths in the scan's unit."""
+
+    vertex: Int64[ndarray, "m"]
+    frame: Int64[ndarray, "m"]
+    slope: Float[ndarray, "m 2"]  # of the residual along the normal, projector pixels per unit of length
+    residual: Float[ndarray, "m 2"]  # predicted minus decoded coordinate, projector pixels
+    pixels_per_area: Float[ndarray, "m"]
+    ray_angle: Float[ndarray, "m"]  # between the rays of camera and projector, radian
+    noise_px: Float[ndarray, "frames"]  # 1 sigma of one pixel's coordinate, each component; NaN if unknown
+    correlation: float  # how many neighbouring pixels share an error: 1 if their errors are independent
+
+
+@dataclass(frozen=True)
+class FrameViews:
+    """The same of one frame."""
+
+    vertex: Int64[ndarray, "m"]  # ascending
+    slope: Float[ndarray, "m 2"]
+    residual: Float[ndarray, "m 2"]
+    pixels_per_area: Float[ndarray, "m"]
+    ray_angle: Float[ndarray, "m"]
+    noise_px: float
+    window_ratio: float  # variance of a window's value over that of a pixel; NaN if unknown
+
+
+def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
+    """The devices of one frame at the given poses."""
+    T_camera = torch.from_numpy(poses.T_world_camera[frame])
+    T_projector = torch.from_numpy(poses.T_world_projector[frame])
+    camera = Intrinsics.of(scan.frames[frame].camera, torch.float64)
+    return FrameDevices(
+        camera, Intrinsics.of(scan.projector, torch.float64), T_camera, torch.linalg.inv(T_camera) @ T_projector
+    )
+
+
+def views_by_frame(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None, task: str
+) -> Iterator[FrameViews]:
+    """Of each frame in order, what it confirms of a mesh, or of the `chosen` vertices; `task` names the progress.
+
+    As many frames are in memory at a time as there are threads.
+    """
+    chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
+    points, normals = mesh.vertices, mesh.vertex_normals()
+    occluder, all_frames = Occluder(mesh), list(enumerate(scan.frames))
+    for first in track(range(0, len(all_frames), threads()), task):
+        frames = all_frames[first : first + threads()]
+        yield from results(
+            [partial(_views_of, points, normals, chosen, occluder, f, scan, poses, k) for k, f in frames]
+        )
+
+
+def collect_views(
+    mesh: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    chosen: Int64[ndarray, "c"] | None = None,
+    task: str = "uncertainty of the surface",
+) -> VertexViews:
+    """All frames that see, light and confirm each vertex (or each of the `chosen` ones), which takes memory for each.
+
+    A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
+    predicts.
+    """
+    found = list(views_by_frame(mesh, scan, poses, chosen, task))
+    vertex = np.concatenate([f.vertex for f in found])
+    order = np.argsort(vertex, kind="stable")
+    frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
+
+    def joined(name: str) -> ndarray:
+        return np.concatenate([getattr(f, name) for f in found])[order]
+
+    return VertexViews(
+        vertex=vertex[order],
+        frame=frame[order],
+        slope=joined("slope"),
+        residual=joined("residual"),
+        pixels_per_area=joined("pixels_per_area"),
+        ray_angle=joined("ray_angle"),
+        noise_px=np.array([f.noise_px for f in found]),
+        correlation=correlation_of([f.window_ratio for f in found]),
+    )
+
+
+def correlation_of(window_ratios: Sequence[float]) -> float:
+    """How many neighbouring pixels share an error, from what windows gain in each frame (NaN: unknown)."""
+    known = [ratio for ratio in window_ratios if np.isfinite(ratio)]
+    return max(1.0, window_pixels() * float(np.median(known))) if known else 1.0
+
+
+def _views_of(
+    points: Float[ndarray, "v 3"],
+    normals: Float[ndarray, "v 3"],
+    chosen: Int64[ndarray, "c"],
+    occluder: Occluder,
+    frame: Frame,
+    scan: Scan,
+    poses: DevicePoses,
+    k: int,
+) -> FrameViews:
+    seen = lit_vertices(
+        points,
+        normals,
+        chosen,
+        occluder,
+        frame.camera,
+        scan.projector,
+        poses.T_world_camera[k],
+        poses.T_world_projector[k],
+    ).vertex
+    devices, coords = devices_of(scan, poses, k), frame.read_coords()
+    view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+    uv = view.uv_camera.numpy()
+    column, row = np.floor(uv).astype(np.int64).T
+    at_pixel = np.einsum("nij,nj->ni", view.by_pixel.numpy(), np.stack([column, row], 1) + 0.5 - uv)
+    residual = view.uv_projector.numpy() + at_pixel - coords[row, column]
+    size = np.linalg.norm(residual, axis=1)
+    known = np.isfinite(size)
+    usual = float(np.median(size[known])) if known.any() else 0.0
+    good = np.flatnonzero(known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX)))
+    residual = residual[good]
+    slope, pixels_per_area, ray_angle = (x.numpy()[good] for x in (view.slope, view.pixels_per_area, view.ray_angle))
+    noise = _spread(_across(slope, residual))
+    ratio = _window_ratio(coords, view, good, noise)
+    return FrameViews(seen[good], slope, residual, pixels_per_area, ray_angle, noise, ratio)
+
+
+def _across(slope: Float[ndarray, "m 2"], residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
+    """The component of residuals that no motion of the surface changes: noise, and errors of the poses."""
+    return (slope[:, 0] * residual[:, 1] - slope[:, 1] * residual[:, 0]) / np.linalg.norm(slope, axis=1)
+
+
+def _spread(values: Float[ndarray, "n"]) -> float:
+    return float(np.median(np.abs(values))) * MAD_TO_SIGMA if len(values) >= _FEWEST else float("nan")
+
+
+def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int64[ndarray, "m"], noise: float) -> float:
+    """Variance of look-ups, which average a window, over that of single pixels; of the points that are good."""
+    some = good[evenly_spaced(len(good), min(_LOOKED_UP, len(good)))]
+    maps = CoordinateMaps.of([torch.from_numpy(coords)])
+    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), view.uv_camera[some])
+    across = _across(view.slope.numpy()[some], (view.uv_projector[some] - seen.uv_projector).numpy())
+    return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
+
+
+def window_pixels(half: int = LookUpSettings().half_window) -> float:
+    """How many independent pixels have the variance of one look-up in a window that is decoded throughout."""
+    y, x = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1).astype(float)
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+    return 1 / float(np.linalg.inv(basis.T @ basis)[0, 0])
+
+
+# What all frames say of every vertex of a mesh, added up frame by frame: memory does not depend on their number.
+
+
+@dataclass(frozen=True)
+class VertexSums:
+    """Sums over the frames that confirm each vertex."""
+
+    number: Int64[ndarray, "v"]  # of the frames
+    distance: Float[ndarray, "v"]  # lengths of the residuals, projector pixels
+    ray_angle: Float[ndarray, "v"]  # the largest, radian; NaN without a frame
+    weight: Float[ndarray, "v"]  # pixels per area, times the square of their residuals' slope along the normal
+    variance: Float[ndarray, "v"]  # the same times the variance of a pixel's coordinate
+    pull: Float[ndarray, "v"]  # pixels per area times slope times residual
+    correlation: float  # how many neighbouring pixels share an error: 1 if their errors are independent
+    bits: UInt8[ndarray, "frames eighth"]  # which frames confirm which vertices, eight in a byte
+
+    def confirmed(self, vertices: Int64[ndarray, "n"]) -> Bool[ndarray, "n frames"]:
+        """Which frames confirm some vertices."""
+        return (self.bits[:, vertices // 8].T >> (7 - vertices % 8)[:, None]) & 1 > 0
+
+
+def sum_views(views: Iterable[FrameViews], vertices: int) -> VertexSums:
+    """Of a mesh with a number of vertices, from the views of all frames in order."""
+    number, (distance, weight, variance, unknown, pull) = np.zeros(vertices, dtype=np.int64), np.zeros((5, vertices))
+    ray_angle, noises, ratios, bits = np.full(vertices, np.nan), [], [], []
+    for one in views:
+        v = one.vertex
+        number[v] += 1
+        distance[v] += np.linalg.norm(one.residual, axis=1)
+        ray_angle[v] = np.fmax(ray_angle[v], one.ray_angle)
+        mine = one.pixels_per_area * (one.slope**2).sum(1)
+        weight[v] += mine
+        pull[v] += one.pixels_per_area * (one.slope * one.residual).sum(1)
+        if np.isfinite(one.noise_px):
+            variance[v] += mine * one.noise_px**2
+        else:
+            unknown[v] += mine
+        noises.append(one.noise_px)
+        ratios.append(one.window_ratio)
+        mask = np.zeros(vertices, dtype=bool)
+        mask[v] = True
+        bits.append(np.packbits(mask))
+    if unknown.any():  # a frame that confirms too few vertices has the noise of the others
+        variance += unknown * (np.nanmedian(noises) ** 2 if np.isfinite(noises).any() else np.nan)
+    return VertexSums(
+        number,
+        distance,
+        ray_angle,
+        weight,
+        variance,
+        pull,
+        correlation_of(ratios),
+        np.stack(bits),
+    )
+
+
+# The part of a vertex's uncertainty that comes from decoding noise, and from a field that does not follow the
+# pixels.
+#
+# The field averages the pixels of all frames over a small area of the surface. So the variance of a vertex is that
+# of a
+# pixel's coordinate, divided by the number of pixels in that area and by the square of their slope along the
+# normal.
+# Where the pixels, averaged over the same area, put the surface elsewhere, the distance counts instead: a field
+# that was
+# trained too briefly, or that rounds an edge, is farther from the truth than noise alone would put it.
+
+AVERAGED_CELLS = 2.0
+"""Area over which the field averages, in squares of its finest cells; measured with several draws of noise (1.4 to 3.8
+in benchmarks/log.md)."""
+_MOST_ROUNDS = 60  # of smoothing, for meshes that are much finer than the field
+
+
+def independent_variance(mesh: Mesh, sums: VertexSums, averaged_area: float) -> Float[ndarray, "v"]:
+    """Variance of each vertex along its normal, from what its own neighbourhood was decoded as; NaN without views."""
+    total = sums.weight
+    seen = total > 0
+    if not seen.any():
+        return np.full(len(total), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        from_noise = sums.correlation * sums.variance / averaged_area / total**2
+        smooth = Smoothing(mesh, averaged_area)
+        misfit = smooth(sums.pull) / smooth(total)
+        from_misfit = smooth(np.where(seen, misfit**2, 0.0)) / smooth(seen.astype(float))
+    return np.where(seen, np.fmax(from_noise, from_misfit), np.nan)
+
+
+class Smoothing:
+    """Averages values of vertices over an area of the mesh, by diffusion along its edges."""
+
+    def __init__(self, mesh: Mesh, area: float) -> None:
+        """A Gaussian of standard deviation d averages as much as a disk of area 4 pi d^2."""
+        count = len(mesh.vertices)
+        a, b = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).T
+        ends = np.concatenate([a, b]), np.concatenate([b, a])
+        links = coo_array((np.ones(2 * len(a)), ends), (count, count)).tocsr()
+        degree = np.maximum(np.asarray(links.sum(1)).reshape(-1), 1.0)
+        self._links, self._degree = links, degree
+        # A round keeps half of each value and spreads the other half: d^2 grows by a quarter of the squared edge.
+        edge2 = float(((mesh.vertices[a] - mesh.vertices[b]) ** 2).sum(1).mean())
+        self._rounds = min(round(area / (4 * np.pi) / (edge2 / 4)), _MOST_ROUNDS) if edge2 > 0 else 0
+
+    def __call__(self, values: Float[ndarray, "v"]) -> Float[ndarray, "v"]:
+        """The averages; the sum over all vertices stays."""
+        for _ in range(self._rounds):
+            values = 0.5 * values + 0.5 * (self._links @ (values / self._degree))
+        return values
+
+
+# Uncertainty of every vertex along its normal, by linear propagation.
+#
+# Near a vertex the surface minimises the residuals of all pixels that see it. So it moves along its normal by
+# `s = -sum(a . r) / sum(a . a)` when residuals change by r, with a the residuals' slope along the normal. Two kinds
+# of
+# errors change them. Decoding noise is independent from one vertex to another that is farther away than the field
+# averages (`sigma_independent`). Errors of poses and intrinsics are shared by the whole surface: their joint
+# covariance
+# is propagated, less the rigid motion of the whole surface, which changes no shape.
+
+_TOGETHER = 512  # neighbouring vertices, which mostly the same frames see
+_GAUGE_VERTICES = 4000  # of which the rigid motion of the whole surface is fitted
+
+
+def vertex_uncertainty(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, joint: JointCovariance | None, cell: float
+) -> VertexQuality:
+    """Uncertainty of a mesh in the scan's world.
+
+    `joint` is the covariance of `poses` and intrinsics; None if they are exact. `cell` is the length of the field's
+    finest cells.
+    """
+    count = len(mesh.vertices)
+    sums = sum_views(views_by_frame(mesh, scan, poses, None, "uncertainty of the surface"), count)
+    independent, seen = independent_variance(mesh, sums, AVERAGED_CELLS * cell**2), sums.number > 0
+    shared = np.zeros(count) if joint is None else _shared_variance(mesh, scan, poses, sums, joint)
+    return VertexQuality(
+        sigma=np.where(seen, np.sqrt(independent + shared), np.nan),
+        sigma_independent=np.where(seen, np.sqrt(independent), np.nan),
+        views=sums.number,
+        residual=np.where(seen, sums.distance / np.maximum(sums.number, 1), np.nan),
+        ray_angle=np.degrees(sums.ray_angle),
+    )
+
+
+def _shared_variance(
+    mesh: Mesh, scan: Scan, poses: DevicePoses, sums: VertexSums, joint: JointCovariance
+) -> Float[ndarray, "v"]:
+    """Variance along the normal from the errors of poses and intrinsics, up to a rigid motion of the surface.
+
+    A row of derivatives has entries for the frames that see the vertex, so that its product with the covariance's
+    factor takes time by those frames, not by all. The rigid motion of the whole surface is taken out of the products.
+    """
+    seen, normals = np.flatnonzero(sums.number), mesh.vertex_normals()
+    out = np.full(len(mesh.vertices), np.nan)
+    if len(seen) == 0:
+        return out
+    points = mesh.vertices - mesh.vertices[seen].mean(0)
+    rigid = np.concatenate([normals, np.cross(points, normals)], 1)
+    devices = _all_devices(scan, poses)
+    kind = np.float64 if is_exact(len(joint.factor)) else np.float32  # random draws are off by more than rounding is
+    factor = joint.factor.astype(kind, copy=False)
+
+    def moved(part: Int64[ndarray, "n"]) -> Float[ndarray, "n k"]:
+        """Changes of some vertices by the columns of the factor."""
+        confirmed = sums.confirmed(part)
+        frames = np.flatnonzero(confirmed.any(0))
+        rows = _rows(mesh.vertices[part], normals[part], devices[frames], confirmed[:, frames])
+        columns = np.concatenate([_columns(frames, len(scan.frames)), np.arange(-UNKNOWNS, 0)])
+        return rows.astype(kind, copy=False) @ factor[columns]
+
+    some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
+    of_some = np.concatenate(results([partial(moved, part) for part in _portions(some)]))
+    motion = np.linalg.lstsq(rigid[some], of_some, rcond=None)[0]
+
+    def write(part: Int64[ndarray, "n"]) -> None:
+        change = moved(part) - rigid[part] @ motion
+        out[part] = dot(change, change)
+
+    parallel([partial(write, part) for part in _portions(seen)])
+    return out
+
+
+def _portions(vertices: Int64[ndarray, "v"]) -> list[Int64[ndarray, "_"]]:
+    return [vertices[first : first + _TOGETHER] for first in range(0, len(vertices), _TOGETHER)]
+
+
+def surface_rows(
+    points: Float[ndarray, "v 3"],
+    normals: Float[ndarray, "v 3"],
+    scan: Scan,
+    poses: DevicePoses,
+    confirmed: Bool[ndarray, "v frames"],
+) -> Float[ndarray, "v joint"]:
+    """Derivatives of vertices along their normals by (delta, rho, intrinsics); each has a frame that confirms it."""
+    return _rows(points, normals, _all_devices(scan, poses), confirmed)
+
+
+def _rows(
+    points: Float[ndarray, "v 3"],
+    normals: Float[ndarray, "v 3"],
+    devices: Float[ndarray, "some devices"],
+    confirmed: Bool[ndarray, "v some"],
+) -> Float[ndarray, "v joint"]:
+    """The columns of `surface_rows` that belong to some frames, among which are all that confirm the vertices."""
+    out = np.zeros((len(points), 12 * len(devices) + UNKNOWNS))
+    write_rows(confirmed, devices, points, normals, out)
+    return out
+
+
+def _all_devices(scan: Scan, poses: DevicePoses) -> Float[ndarray, "frames devices"]:
+    return np.stack([packed_devices(devices_of(scan, poses, k)) for k in range(len(scan.frames))])
+
+
+def _columns(some: Int64[ndarray, "some"], frames: int) -> Int64[ndarray, "twelve_each"]:
+    """Where delta of some frames, and then their rho, are among the unknowns."""
+    delta = (6 * some[:, None] + np.arange(6)).reshape(-1)
+    return np.concatenate([delta, 6 * frames + delta])
+
+
+def columns_of(frame: int, frames: int) -> Int64[ndarray, "12"]:
+    """Where delta and rho of a frame are among the unknowns."""
+    return np.r_[6 * frame : 6 * frame + 6, 6 * (frames + frame) : 6 * (frames + frame) + 6]
+
+
+@dataclass(frozen=True)
+class LengthSigma:
+    """1 sigma of lengths, in the scan's unit; NaN where no frame confirms one of the ends."""
+
+    shared: Float[ndarray, "n"]  # from poses and intrinsics
+    independent: Float[ndarray, "n"]  # from decoding noise at both ends
+
+
+def length_sigma(
+    mesh: Mesh,
+    sigma_independent: Float[ndarray, "v"],
+    ends: Int64[ndarray, "n 2"],
+    scan: Scan,
+    poses: DevicePoses,
+    joint: JointCovariance,
+) -> LengthSigma:
+    """Uncertainty of the distances between pairs of vertices."""
+    chosen, index = np.unique(ends, return_inverse=True)
+    index = index.reshape(ends.shape)
+    views = collect_views(mesh, scan, poses, chosen)
+    moved = point_changes(mesh, scan, poses, views, chosen, joint.factor)
+    along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    change = np.einsum("ni,nik->nk", along, moved[index[:, 1]] - moved[index[:, 0]])
+    across = np.einsum("ni,nei->ne", along, mesh.vertex_normals()[ends])
+    return LengthSigma(np.sqrt((change**2).sum(1)), np.sqrt(((across * sigma_independent[ends]) ** 2).sum(1)))
+
+
+def point_changes(
+    mesh: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    views: VertexViews,
+    chosen: Int64[ndarray, "c"],
+    steps: Float[ndarray, "joint k"],
+) -> Float[ndarray, "c 3 k"]:
+    """Changes of points by some steps of (delta, rho, intrinsics); NaN where no frame confirms the vertex."""
+    n, p = len(scan.frames), torch.from_numpy(mesh.vertices)
+    normal = np.zeros((len(chosen), 3, 3))
+    right = np.zeros((len(chosen), 3, steps.shape[1]))
+    for k in np.unique(views.frame).tolist():
+        vertex = views.vertex[views.frame == k]
+        at = np.searchsorted(chosen, vertex)
+        A, B = (x.numpy() for x in point_equations(devices_of(scan, poses, k), p[vertex]))
+        normal[at] += A.transpose(0, 2, 1) @ A
+        mine = np.concatenate([steps[columns_of(k, n)], steps[12 * n :]])
+        right[at] += (A.transpose(0, 2, 1) @ B) @ mine
+    seen = np.isin(chosen, views.vertex)
+    out = np.full_like(right, np.nan)
+    out[seen] = -np.linalg.solve(normal[seen], right[seen])
+    return out

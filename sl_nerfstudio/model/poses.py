@@ -1,0 +1,225 @@
+"""Poses of all devices as parameters, in the scene frame.
+
+`RigPoseParameters`: a frame moves as a whole, and its projector moves relative to its camera.
+`StaticProjectorParameters`: cameras move, their projector does not.
+`IndependentPoseParameters` (the paper's): camera and projector of a frame move independently of each other.
+`CoupledPoseParameters`: each camera moves independently; the relative pose of its projector is known or shared by all.
+
+All start from a *base* that may be replaced (by the bundle adjustment) before training continues; the parameters are
+increments to it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, as_stored, stored_columns
+from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.geometry.lie import exp_se3, inverse
+from sl_nerfstudio.model.settings import SLModelSettings
+
+ProjectorMoves = Literal["nothing", "relative pose", "own pose"]
+
+
+@dataclass(frozen=True)
+class FrameTransforms:
+    """What rays need of the current poses, in float32."""
+
+    camera_centre: Float[Tensor, "frames 3"]
+    correction: Float[Tensor, "frames 4 4"]  # from the starting pose of the camera, at which rays are made
+    T_scene_projector: Float[Tensor, "frames 4 4"]
+    T_projector_scene: Float[Tensor, "frames 4 4"]
+
+
+class PoseParameters(nn.Module):
+    """Base poses (float64 buffers, saved with the weights) and increments to them."""
+
+    about_scene = True
+    """Whether cameras turn about the scene's centre; otherwise about their own."""
+    projector_moves_by: ProjectorMoves = "relative pose"
+    """What the projector's increment changes."""
+
+    start_camera: Tensor
+    start_projector: Tensor
+    base_camera: Tensor
+    base_projector: Tensor
+    sigma: Tensor
+    intrinsics_change: Tensor
+    intrinsics_covariance: Tensor
+    joint_factor: Tensor
+    unplaced: Tensor
+
+    def __init__(
+        self,
+        T_scene_camera: Float[Tensor, "frames 4 4"],
+        T_scene_projector: Float[Tensor, "frames 4 4"],
+        refine_camera: bool,
+        refine_projector: bool,
+        shared_projector: bool = False,
+    ) -> None:
+        super().__init__()
+        for name, T in (("camera", T_scene_camera), ("projector", T_scene_projector)):
+            self.register_buffer(f"start_{name}", T.double().clone())
+            self.register_buffer(f"base_{name}", T.double().clone())
+        n = len(T_scene_camera)
+        # 1 sigma of (delta, rho): translation xyz, rotation xyz each; NaN where not estimated
+        self.register_buffer("sigma", torch.full((n, 12), float("nan"), dtype=torch.float64))
+        # the adjustment's self-calibration of the intrinsics (see SelfCalibration); NaN where there is none
+        self.register_buffer("intrinsics_change", torch.full((UNKNOWNS,), float("nan"), dtype=torch.float64))
+        covariance = torch.full((UNKNOWNS, UNKNOWNS), float("nan"), dtype=torch.float64)
+        self.register_buffer("intrinsics_covariance", covariance)
+        # of the covariance of all poses and the intrinsics, see JointCovariance; NaN where not estimated
+        size = 12 * n + UNKNOWNS
+        joint = torch.full((size, stored_columns(size)), float("nan"), dtype=torch.float64)
+        self.register_buffer("joint_factor", joint)
+        self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
+        self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
+        self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
+        self._fixed: FrameTransforms | None = None
+        self.register_load_state_dict_post_hook(_forget)
+
+    @torch.no_grad()
+    def rebase(
+        self, T_scene_camera: Float[Tensor, "frames 4 4"], T_scene_projector: Float[Tensor, "frames 4 4"]
+    ) -> None:
+        """Continue from other poses; the increments become zero."""
+        self.base_camera.copy_(T_scene_camera)
+        self.base_projector.copy_(T_scene_projector)
+        self.camera_step.zero_()
+        self.projector_step.zero_()
+        self._fixed = None
+
+    @torch.no_grad()
+    def note(
+        self,
+        sigma: Float[Tensor, "frames 12"],
+        factor: Float[Tensor, "joint k"],
+        intrinsics: SelfCalibration | None,
+        unplaced: Sequence[int] = (),
+    ) -> None:
+        """Store the adjustment's results other than the poses."""
+        self.sigma.copy_(sigma)
+        self.joint_factor.copy_(as_stored(factor))
+        self.unplaced.zero_()
+        self.unplaced[list(unplaced)] = True
+        if intrinsics is not None:
+            self.intrinsics_change.copy_(intrinsics.change)
+            self.intrinsics_covariance.copy_(intrinsics.covariance)
+
+    def self_calibration(self) -> SelfCalibration | None:
+        """The adjustment's self-calibration of the intrinsics; None if nothing was adjusted."""
+        found = SelfCalibration(self.intrinsics_change.cpu(), self.intrinsics_covariance.cpu())
+        return found if found.known else None
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """The covariance of all poses and the intrinsics in the scene; None if it was not estimated."""
+        if bool(self.joint_factor.isnan().any()):
+            return None
+        return JointCovariance(self.joint_factor.cpu().numpy())
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""
+        raise NotImplementedError
+
+    def transforms(self) -> FrameTransforms:
+        """The current poses as rays need them, differentiable; computed once if no losses move the poses."""
+        if self.camera_step.requires_grad or self.projector_step.requires_grad:
+            return self._transforms()
+        if self._fixed is None:
+            with torch.inference_mode(False), torch.no_grad():
+                self._fixed = self._transforms()
+        return self._fixed
+
+    def _transforms(self) -> FrameTransforms:
+        camera, projector = self()
+        correction = (camera @ inverse(self.start_camera)).float()
+        return FrameTransforms(camera[:, :3, 3].float(), correction, projector.float(), inverse(projector).float())
+
+    def _apply(self, fn: Any, recurse: bool = True) -> Any:
+        self._fixed = None  # torch moves parameters and buffers to another device
+        return super()._apply(fn, recurse)
+
+    def _camera_about_scene(self) -> Float[Tensor, "frames 4 4"]:
+        return exp_se3(self.camera_step.double()) @ self.base_camera
+
+    def _camera_about_itself(self) -> Float[Tensor, "frames 4 4"]:
+        return self.base_camera @ exp_se3(self.camera_step.double())
+
+    def _relative(self) -> Float[Tensor, "frames 4 4"]:
+        return exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
+
+
+def _forget(parameters: PoseParameters, _: object) -> None:
+    """After a checkpoint was loaded."""
+    parameters._fixed = None
+
+
+class RigPoseParameters(PoseParameters):
+    """`T_scene_camera = exp(delta) base` and `T_camera_projector = exp(rho) base`.
+
+    delta rotates about the scene's centre.
+    """
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See PoseParameters."""
+        camera = self._camera_about_scene()
+        return camera, camera @ self._relative()
+
+
+class StaticProjectorParameters(PoseParameters):
+    """`T_scene_camera = exp(delta) base`, and a projector that does not move."""
+
+    projector_moves_by = "nothing"
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See PoseParameters."""
+        return self._camera_about_scene(), self.base_projector
+
+
+class IndependentPoseParameters(PoseParameters):
+    """`T = base exp(xi)` for camera and projector separately: each rotates about its own centre."""
+
+    about_scene = False
+    projector_moves_by = "own pose"
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See PoseParameters."""
+        return self._camera_about_itself(), self.base_projector @ exp_se3(self.projector_step.double())
+
+
+class CoupledPoseParameters(PoseParameters):
+    """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres, and their projectors move with them."""
+
+    about_scene = False
+
+    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """See PoseParameters."""
+        camera = self._camera_about_itself()
+        return camera, camera @ self._relative()
+
+
+def make_pose_parameters(
+    settings: SLModelSettings,
+    T_scene_camera: Float[Tensor, "frames 4 4"],
+    T_scene_projector: Float[Tensor, "frames 4 4"],
+) -> PoseParameters:
+    """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
+    free, independent = settings.refine_poses, settings.pose_method == "render-independently"
+    if free == "static-projector":
+        kind = StaticProjectorParameters
+    elif not independent:
+        kind = RigPoseParameters
+    else:
+        kind = CoupledPoseParameters if free in ("known-rig", "rigid-rig") else IndependentPoseParameters
+    moves = settings.renders_poses
+    return kind(
+        T_scene_camera,
+        T_scene_projector,
+        refine_camera=moves,
+        refine_projector=moves and free not in ("known-rig", "static-projector"),
+        shared_projector=free == "rigid-rig",
+    )

@@ -1,0 +1,632 @@
+"""The scan in nerfstudio's viewer, in `ns-viewer` and during training."""
+
+import base64
+import contextlib
+import io
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import matplotlib
+import numpy as np
+import torch
+import viser
+import viser.transforms as vtf
+from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer.viewer_elements import ViewerControl
+from numpy import ndarray
+from PIL import Image
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.errors import UserError, first_line
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, transform
+from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate
+from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
+from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
+from sl_nerfstudio.model.outputs import coordinate_colours
+from sl_nerfstudio.scan import Scan
+
+# Lines as thin rods: one mesh for any number of them, where the viewer has no line segments.
+
+_SIDES = 3
+
+
+def rods(segments: Float[ndarray, "n 2 3"], radius: float) -> tuple[Float[ndarray, "v 3"], Int64[ndarray, "f 3"]]:
+    """Vertices and triangles of open prisms around the segments; those without a length are left out."""
+    axis = segments[:, 1] - segments[:, 0]
+    length = np.linalg.norm(axis, axis=1)
+    kept = np.isfinite(length) & (length > 0)
+    segments, axis = segments[kept], axis[kept] / length[kept, None]
+    least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
+    u = np.cross(axis, least)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(axis, u)
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    ring = radius * (np.cos(angle)[None, :, None] * u[:, None] + np.sin(angle)[None, :, None] * v[:, None])
+    vertices = (segments[:, :, None] + ring[:, None]).reshape(-1, 3)
+    k, after = np.arange(_SIDES), (np.arange(_SIDES) + 1) % _SIDES
+    one = np.concatenate([np.stack([k, after, after + _SIDES], 1), np.stack([k, after + _SIDES, k + _SIDES], 1)])
+    faces = one[None] + 2 * _SIDES * np.arange(len(segments))[:, None, None]
+    return vertices, faces.reshape(-1, 3).astype(np.int64)
+
+
+# Cameras and projectors in the viewer's scene: pyramids at starting and current poses, the way between, and names.
+
+Colour = tuple[int, int, int]
+GREY: Colour = (130, 130, 130)
+UNPLACED_COLOUR: Colour = (230, 60, 50)
+_STARTING_SIZE = 0.8  # of the current ones
+_ROD = 0.02  # radius of the line from start to current pose, as a share of a pyramid's size
+
+
+@dataclass(frozen=True)
+class DeviceKind:
+    """What cameras, or projectors, have in common in the scene."""
+
+    name: str
+    colour: Colour
+
+
+CAMERA, PROJECTOR = DeviceKind("camera", (90, 160, 255)), DeviceKind("projector", (255, 140, 40))
+
+
+class DeviceNodes:
+    """The nodes of all devices of one kind, one of each frame; poses are in the scene."""
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        kind: DeviceKind,
+        names: Sequence[str],
+        devices: Sequence[Device],
+        start: Float64[ndarray, "n 4 4"],
+        current: Float64[ndarray, "n 4 4"],
+        scale: float,
+        image: UInt8[ndarray, "h w 3"] | None = None,
+    ) -> None:
+        """`names` are the frames'; `scale` is viser's size of a pyramid; `image` is drawn on the current ones."""
+        self._scene, self._kind, self._names, self._scale, self._image = scene, kind, names, scale, image
+        self._shapes = [(vertical_fov(device), device.w / device.h) for device in devices]
+        self.start, self.current = start, current
+        self.unplaced = [False] * len(names)
+        self.starting = [
+            scene.add_camera_frustum(f"/starting/{kind.name}/{name}", *shape, _STARTING_SIZE * scale, color=GREY)
+            for name, shape in zip(names, self._shapes, strict=True)
+        ]
+        for handle, T in zip(self.starting, start, strict=True):
+            place(handle, T)
+        drawn = [self._current_nodes(k) for k in range(len(names))]
+        self.refined, self.labels = [nodes[0] for nodes in drawn], [nodes[1] for nodes in drawn]
+        self.path = self._drawn_path()
+        self.move(current)
+
+    def _current_nodes(self, k: int) -> tuple[viser.CameraFrustumHandle, viser.LabelHandle]:
+        """The pyramid and the name of a frame's device at its current pose; they replace those that are there."""
+        kind, lost, path = self._kind.name, self.unplaced[k], f"{self._kind.name}/{self._names[k]}"
+        colour = UNPLACED_COLOUR if lost else self._kind.colour
+        pyramid = self._scene.add_camera_frustum(
+            f"/refined/{path}", *self._shapes[k], self._scale, color=colour, image=self._image
+        )
+        return pyramid, self._scene.add_label(f"/names/{path}", f"{kind} {k}: not placed" if lost else f"{kind} {k}")
+
+    def mark(self, unplaced: Sequence[bool]) -> None:
+        """Show in red, and say, which frames do not agree with the others."""
+        changed = [k for k, lost in enumerate(unplaced) if lost != self.unplaced[k]]
+        self.unplaced = list(unplaced)
+        for k in changed:
+            shown = self.refined[k].visible, self.labels[k].visible
+            self.refined[k], self.labels[k] = self._current_nodes(k)
+            self.refined[k].visible, self.labels[k].visible = shown
+        if changed:
+            self.move(self.current)
+
+    def move(self, current: Float64[ndarray, "n 4 4"]) -> None:
+        """To other current poses; the lines from the starting poses follow."""
+        for handle, label, T in zip(self.refined, self.labels, current, strict=True):
+            place(handle, T)
+            label.position = T[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+        if not np.array_equal(current, self.current):
+            shown = self.path.visible
+            self.current = current
+            self.path = self._drawn_path()
+            self.path.visible = shown
+
+    def show(self, *, refined: bool, starting: bool, named: Sequence[int]) -> None:
+        """Choose what is visible; `named` are the frames with a name. Lines are where both of their ends are."""
+        for handles, visible in ((self.refined, refined), (self.starting, starting)):
+            for handle in handles:
+                handle.visible = visible
+        for k, label in enumerate(self.labels):
+            label.visible = refined and k in named
+        self.path.visible = refined and starting
+
+    def _drawn_path(self) -> viser.MeshHandle:
+        ends = np.stack([self.start[:, :3, 3], self.current[:, :3, 3]], 1) * VISER_NERFSTUDIO_SCALE_RATIO
+        vertices, faces = rods(ends, _ROD * self._scale)
+        return add_rods(self._scene, f"/moved/{self._kind.name}", vertices, faces, self._kind.colour)
+
+
+def add_rods(
+    scene: viser.SceneApi, name: str, vertices: Float[ndarray, "v 3"], faces: ndarray, colour: Colour
+) -> viser.MeshHandle:
+    """A mesh of rods; the viewer accepts no empty one, so it has an invisible triangle then."""
+    if not len(faces):
+        vertices, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
+    return scene.add_mesh_simple(name, vertices, faces, color=colour, side="double")
+
+
+def vertical_fov(device: Device) -> float:
+    """Angle in radian between the rays through the middle of the upper and of the lower edge."""
+    uv = torch.tensor([[device.w / 2, 0.0], [device.w / 2, float(device.h)]], dtype=torch.float64)
+    up, down = unproject(Intrinsics.of(device, torch.float64), uv)
+    return math.acos(max(-1.0, min(1.0, float(up @ down))))
+
+
+def place(handle: viser.CameraFrustumHandle, T_scene_device: Float64[ndarray, "4 4"]) -> None:
+    """Viser's frusta look along +z with y down; nerfstudio draws the scene ten times as large."""
+    R = vtf.SO3.from_matrix(T_scene_device[:3, :3]) @ vtf.SO3.from_x_radians(math.pi)
+    handle.wxyz = R.wxyz
+    handle.position = T_scene_device[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+
+
+# Rays of a frame's camera and projector through pixels that decoded the same point of the surface.
+
+MOST_RAYS = 60
+_FARTHEST = 3.0  # from the object's centre, scene units, whose radius is 0.8: rays that meet beyond are decoding errors
+
+
+def pattern_rays(
+    scan: Scan,
+    frame: int,
+    T_scene_camera: Float[Tensor, "4 4"],
+    T_scene_projector: Float[Tensor, "4 4"],
+) -> tuple[Float64[ndarray, "n 2 3"], Float64[ndarray, "n 2 3"]]:
+    """Segments from the camera, and from the projector, to where the two rays meet; in the scene.
+
+    At most `MOST_RAYS` of the decoded pixels, evenly over the image; none where nothing was decoded.
+    """
+    camera, projector = T_scene_camera.double().cpu(), T_scene_projector.double().cpu()
+    coords = scan.frames[frame].read_coords()
+    row, column = _evenly(np.isfinite(coords).all(-1))
+    uv_camera = torch.from_numpy(np.stack([column, row], 1) + 0.5)
+    uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
+    met = triangulate(
+        Intrinsics.of(scan.frames[frame].camera, torch.float64), camera, uv_camera,
+        Intrinsics.of(scan.projector, torch.float64), projector, uv_projector,
+    )  # fmt: skip
+    p = met.p_world
+    good = (met.depth_camera > 0) & (met.depth_projector > 0) & (p.norm(dim=-1) < _FARTHEST)
+    ends = p[good].numpy()
+    starts = (np.broadcast_to(T[:3, 3].numpy(), ends.shape) for T in (camera, projector))
+    first, second = (np.stack([start, ends], 1) for start in starts)
+    return first, second
+
+
+def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
+    """Rows and columns of some decoded pixels, on a square lattice that has at most `MOST_RAYS` of them."""
+    step = max(1, int((decoded.sum() / MOST_RAYS) ** 0.5))
+    while True:
+        row, column = np.nonzero(decoded[step // 2 :: step, step // 2 :: step])
+        if len(row) <= MOST_RAYS:
+            return row * step + step // 2, column * step + step // 2
+        step += 1
+
+
+# What the viewer needs of a model.
+
+
+@runtime_checkable
+class ViewedModel(Protocol):
+    """A model that is trained, or was loaded."""
+
+    scan: Scan
+    S_scene_world: Similarity
+    viewed_frame: int  # whose projector lights what is rendered from a free viewpoint
+
+    @property
+    def step(self) -> int:
+        """The step of the training."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field is evaluated."""
+        ...
+
+    @property
+    def cell(self) -> float:
+        """Length of the field's finest cells, in the scan's unit."""
+        ...
+
+    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance in scene units."""
+        ...
+
+    def poses(self) -> DevicePoses:
+        """Current poses in the scan's world and unit."""
+        ...
+
+    def poses_scene(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """Current poses of cameras and projectors in the scene."""
+        ...
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
+        ...
+
+    def unplaced(self) -> list[bool]:
+        """Of each frame, whether it does not agree with the others."""
+        ...
+
+
+# The surface of the field as a mesh for the viewer, and what it can be coloured by.
+
+RENDERED = "as rendered"
+MODES = (RENDERED, "normals", "depth", "coordinates", "residual", "sigma", "views")
+RESOLUTION = 128  # cells along the scene's box: about a second
+UNKNOWN = (110, 110, 110)  # colour where a value does not exist
+
+
+@dataclass(frozen=True)
+class Coloured:
+    """Colours of the vertices, and what they mean."""
+
+    rgb: UInt8[ndarray, "v 3"]
+    meaning: str
+    scale: tuple[str, float, float, str] | None = None  # matplotlib's colour map, values at its ends, their unit
+
+
+class ViewerSurface:
+    """The zero level of a model's field at one step; lengths in the scene, values in the scan's unit."""
+
+    def __init__(self, model: ViewedModel, resolution: int = RESOLUTION) -> None:
+        """Raises UserError if there is no surface."""
+        self._model = model
+        self.step = model.step
+        self.mesh: Mesh = extract_mesh(model.sdf, resolution, device=model.device)
+
+    @cached_property
+    def quality(self) -> VertexQuality:
+        """What is known of each vertex, in the scan's unit: it needs the coordinates of all frames, so some seconds."""
+        model = self._model
+        world = self.mesh.mapped(model.S_scene_world.inverse())
+        return vertex_uncertainty(world, model.scan, model.poses(), model.joint_covariance(), model.cell)
+
+    def coloured(self, mode: str, frame: int) -> Coloured:
+        """The colours of one of `MODES`; `frame` is the one whose devices depth and coordinates are of."""
+        units = self._model.scan.units
+        if mode == "normals":
+            rgb = 0.5 * self.mesh.vertex_normals() + 0.5
+            return Coloured(_bytes(rgb), "Direction of the surface: red is x, green y, blue z.")
+        if mode == "depth":
+            return self._depth(frame, units)
+        if mode == "coordinates":
+            return self._coordinates(frame)
+        of = f"Grey: no frame confirms the surface there. Step {self.step}."
+        if mode == "residual":
+            said = f"Mean distance of predicted and decoded coordinates. {of}"
+            return _scaled(self.quality.residual, "inferno", "pattern px", said)
+        if mode == "sigma":
+            return _scaled(self.quality.sigma, "inferno", units, f"Uncertainty along the normal, 1 sigma. {of}")
+        views = self.quality.views.astype(np.float64)
+        said = f"Frames that saw, lit and confirmed it. {of}"
+        return _scaled(np.where(views > 0, views, np.nan), "viridis", "frames", said, percentile=100.0)
+
+    def _depth(self, frame: int, units: str) -> Coloured:
+        T_scene_camera = self._model.poses_scene()[0][frame].double().cpu().numpy()
+        distance = np.linalg.norm(self.mesh.vertices - T_scene_camera[:3, 3], axis=1)
+        world = distance / self._model.S_scene_world.scale
+        scale = ("turbo", float(world.min()), float(world.max()), units)
+        return Coloured(_mapped(world, scale), f"Distance from the camera of frame {frame}.", scale)
+
+    def _coordinates(self, frame: int) -> Coloured:
+        T_projector_scene = inverse(self._model.poses_scene()[1][frame].double().cpu())
+        projector = self._model.scan.projector
+        p = transform(T_projector_scene, torch.from_numpy(self.mesh.vertices))
+        uv, in_front = project(Intrinsics.of(projector, torch.float64), p)
+        normals = torch.from_numpy(self.mesh.vertex_normals()) @ T_projector_scene[:3, :3].T
+        inside = ((uv >= 0) & (uv <= torch.tensor([projector.w, projector.h]))).all(-1)
+        lit = in_front & inside & ((normals * p).sum(-1) < 0)
+        rgb = coordinate_colours(torch.where(lit[:, None], uv, 0.0), lit)
+        meaning = f"Pattern coordinates of the projector of frame {frame}, modulo 128: x is red, y green."
+        return Coloured(_bytes(rgb.numpy(), lit.numpy()), meaning)
+
+
+def _scaled(
+    values: Float64[ndarray, "v"], colours: str, units: str, meaning: str, percentile: float = 95.0
+) -> Coloured:
+    """Colours from 0 to a percentile of the values."""
+    known = values[np.isfinite(values)]
+    limit = float(np.percentile(known, percentile)) if len(known) else 1.0
+    scale = (colours, 0.0, limit or 1.0, units)
+    return Coloured(_mapped(values, scale), meaning, scale)
+
+
+def _mapped(values: Float64[ndarray, "v"], scale: tuple[str, float, float, str]) -> UInt8[ndarray, "v 3"]:
+    colours, lower, upper, _ = scale
+    share = np.clip((np.nan_to_num(values) - lower) / max(upper - lower, 1e-12), 0, 1)
+    return _bytes(np.asarray(matplotlib.colormaps[colours](share))[:, :3], np.isfinite(values))
+
+
+def _bytes(rgb: Float64[ndarray, "v 3"], known: Bool[ndarray, "v"] | None = None) -> UInt8[ndarray, "v 3"]:
+    out = np.rint(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
+    if known is not None:
+        out[~known] = UNKNOWN
+    return out
+
+
+# The controls of a scan at the top of the viewer's panel.
+
+
+class Panel:
+    """The values that the user chose; every change calls `changed` with the name of what changed."""
+
+    def __init__(
+        self, server: viser.ViserServer, names: Sequence[str], training: bool, changed: Callable[[str], None]
+    ) -> None:
+        gui = server.gui
+        with gui.add_folder("Scan", order=-1.0):
+            self.surface = gui.add_dropdown("Surface", MODES, RENDERED, hint="The surface as a mesh, in these colours")
+            self._legend = gui.add_markdown("", visible=False)
+            self.update = gui.add_button("Update surface", visible=False, hint="Make the mesh of the current step")
+            last = max(len(names) - 1, 1)
+            self.frame = gui.add_slider(
+                "Frame", 0, last, 1, 0, hint="Its projector lights the surface; depth, coordinates and rays are its own"
+            )
+            self._name = gui.add_markdown("")
+            self.rays = gui.add_checkbox("Pattern rays", False, hint="Where rays of the frame's devices meet")
+            self.projectors = gui.add_checkbox("Projectors", True)
+            self.starting = gui.add_checkbox("Starting poses", True, hint="Grey, with a line to the current pose")
+            self.names = gui.add_checkbox("All names", False, hint="Otherwise those of the chosen frame")
+        self._frames, self._training = names, training
+        for name in ("surface", "frame", "rays", "projectors", "starting", "names"):
+            getattr(self, name).on_update(_Call(changed, name))
+        self.update.on_click(_Call(changed, "update"))
+        self.show_frame()
+
+    @property
+    def chosen_frame(self) -> int:
+        """Number of the chosen frame."""
+        return min(int(self.frame.value), len(self._frames) - 1)
+
+    def show_frame(self) -> None:
+        """Write the chosen frame's name under the slider."""
+        self._name.content = f"`{self._frames[self.chosen_frame]}`"
+
+    def show_legend(self, coloured: Coloured | None) -> None:
+        """Say what the colours mean; None if the surface is not drawn as a mesh."""
+        self._legend.visible = coloured is not None
+        self.update.visible = self._training and coloured is not None
+        if coloured is not None:
+            self.say(legend(coloured))
+
+    def say(self, text: str) -> None:
+        """Write something under the choice of the surface."""
+        self._legend.visible = True
+        self._legend._image_root = Path()  # pictures are data, not files
+        self._legend.content = text
+
+
+class _Call:
+    """A callback that passes on a name, not viser's event."""
+
+    def __init__(self, changed: Callable[[str], None], name: str) -> None:
+        self._changed, self._name = changed, name
+
+    def __call__(self, event: viser.GuiEvent) -> None:
+        self._changed(self._name)
+
+
+def legend(coloured: Coloured) -> str:
+    """Markdown: the colour scale with its limits, and what it shows."""
+    if coloured.scale is None:
+        return coloured.meaning
+    colours, lower, upper, units = coloured.scale
+    strip = np.repeat(matplotlib.colormaps[colours](np.linspace(0, 1, 240))[None, :, :3], 10, 0)
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(buffer, "PNG")
+    address = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return f"![colours]({address})\n\n**{lower:.3g}** to **{upper:.3g} {units}**. {coloured.meaning}"
+
+
+_PATTERN_PIXELS = 256  # longest side of the pattern drawn on a projector
+_SECONDS_BETWEEN_UPDATES = 0.5
+_FRUSTUM_SIZE = 0.4  # of the devices' distance from the object, times nerfstudio's --viewer.camera-frustum-scale of 0.1
+_RAY = 0.012  # radius of a ray, as a share of a pyramid's size
+_OBJECT_RADIUS = 0.8  # scene units
+_USUAL_FOV, _USUAL_ASPECT = math.radians(75), 1.5  # of a client that has not said its own
+_MARGIN = 1.1  # pyramids reach a little beyond their centres, and names beyond them
+
+ScenePoses = tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]
+
+
+class SceneView(ViewerControl):
+    """Draws the scan once a viewer exists, and moves what depends on poses while these are refined.
+
+    nerfstudio finds the object as an attribute of the pipeline and calls `_setup`, in training and in `ns-viewer`.
+    """
+
+    def __init__(self, model: ViewedModel) -> None:
+        self._model = model
+        self._devices: tuple[DeviceNodes, DeviceNodes] | None = None
+        self._surface: ViewerSurface | None = None
+        self._nodes: dict[str, viser.SceneNodeHandle] = {}  # of the surface and of the rays
+        self._last_update = 0.0
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        if viewer.config.websocket_host == "0.0.0.0":  # the default of ns-viewer, which a plugin cannot change
+            print("The viewer listens on all networks; --viewer.websocket-host 127.0.0.1 restricts it to this machine.")
+        viewer.control_panel._layer_depth.value = False  # with it, the picture hides the devices behind the object
+        scan = self._model.scan
+        start = self._model.S_scene_world.poses(scan.poses.stacked())
+        cameras, projectors = start[: len(scan.frames)], start[len(scan.frames) :]
+        # nerfstudio assumes that cameras are inside the unit box; here the object is, and they are far outside.
+        # It draws its own frusta after this, with the same setting.
+        distance = float(np.median(np.linalg.norm(cameras[:, :3, 3], axis=1)))
+        viewer.config.camera_frustum_scale *= _FRUSTUM_SIZE * distance * VISER_NERFSTUDIO_SCALE_RATIO
+        self._scale = viewer.config.camera_frustum_scale
+        names, current = [frame.name for frame in scan.frames], self._numpy_poses()
+        scene, pattern = self.viser_server.scene, _thumbnail(scan.read_pattern())
+        devices = [frame.camera for frame in scan.frames], [scan.projector] * len(names)
+        self._devices = (
+            DeviceNodes(scene, CAMERA, names, devices[0], cameras, current[0], self._scale),
+            DeviceNodes(scene, PROJECTOR, names, devices[1], projectors, current[1], self._scale, pattern),
+        )
+        self._mark_unplaced()
+        self.panel = Panel(self.viser_server, names, viewer.trainer is not None, self._changed)
+        self.show_devices()
+        self.viser_server.on_client_connect(self._look_at_object)
+
+    # ---- the user's choices
+
+    def _changed(self, what: str) -> None:
+        """Called by viser's threads."""
+        if what in ("frame", "projectors", "starting", "names"):
+            self.show_devices()
+        with self._lock():
+            if what == "frame":
+                self.panel.show_frame()
+                self._model.viewed_frame = self.panel.chosen_frame
+                self.viewer._trigger_rerender()
+            if what in ("frame", "rays"):
+                self.show_rays()
+            if what == "update":
+                self._surface = None
+            if what in ("surface", "update") or (what == "frame" and self.panel.surface.value != RENDERED):
+                self.show_surface()
+
+    def _lock(self) -> AbstractContextManager[object]:
+        """Training waits while something is computed from its field or poses."""
+        return self.viewer.train_lock or contextlib.nullcontext()
+
+    def show_devices(self) -> None:
+        """Show and hide pyramids, lines and names as the panel says."""
+        if self._devices is None:
+            return
+        cameras, projectors = self._devices
+        panel = self.panel
+        starting, projected = panel.starting.value, panel.projectors.value
+        named = range(len(self._model.scan.frames)) if panel.names.value else [panel.chosen_frame]
+        with self.viser_server.atomic():
+            cameras.show(refined=True, starting=starting, named=named)
+            projectors.show(refined=projected, starting=starting and projected, named=named)
+
+    def show_rays(self) -> None:
+        """Draw the rays of the chosen frame, or remove them."""
+        for name in ("/rays/camera", "/rays/projector"):
+            self._remove(name)
+        if not self.panel.rays.value:
+            return
+        frame, (camera, projector) = self.panel.chosen_frame, self._model.poses_scene()
+        segments = pattern_rays(self._model.scan, frame, camera[frame], projector[frame])
+        for kind, ends in zip((CAMERA, PROJECTOR), segments, strict=True):
+            drawn = rods(ends * VISER_NERFSTUDIO_SCALE_RATIO, _RAY * self._scale)
+            name = f"/rays/{kind.name}"
+            self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, kind.colour)
+
+    def show_surface(self) -> None:
+        """Draw the surface as a mesh in the chosen colours, or leave it to the rendered picture."""
+        mode = self.panel.surface.value
+        if mode == RENDERED:
+            self._remove("/surface")
+            self.panel.show_legend(None)
+            return
+        try:
+            if self._surface is None or self._surface.step != self._model.step:
+                self.panel.say("Extracting the surface …")
+                self._surface = ViewerSurface(self._model)
+            coloured = self._surface.coloured(mode, self.panel.chosen_frame)
+        except UserError as error:
+            self._remove("/surface")
+            self.panel.say(first_line(error))
+            return
+        self._draw_surface(self._surface, coloured)
+        self.panel.show_legend(coloured)
+
+    def _draw_surface(self, surface: ViewerSurface, coloured: Coloured) -> None:
+        import trimesh  # takes half a second, and only a viewer needs it
+
+        mesh = trimesh.Trimesh(
+            surface.mesh.vertices * VISER_NERFSTUDIO_SCALE_RATIO,
+            surface.mesh.faces,
+            vertex_colors=coloured.rgb,
+            vertex_normals=surface.mesh.vertex_normals(),
+            process=False,
+        )
+        self._nodes["/surface"] = self.viser_server.scene.add_mesh_trimesh("/surface", mesh)
+
+    def _remove(self, name: str) -> None:
+        node = self._nodes.pop(name, None)
+        if node is not None:
+            node.remove()
+
+    # ---- poses
+
+    def update(self, force: bool = False) -> None:
+        """Move everything to the current poses; at most twice a second, and only if a client is connected."""
+        if self._devices is None or not (force or self._is_due()):
+            return
+        self._last_update = time.monotonic()
+        poses = self._numpy_poses()
+        moved = not all(np.array_equal(T, d.current) for T, d in zip(poses, self._devices, strict=True))
+        if not (self._mark_unplaced() or moved or force):
+            return
+        # nerfstudio's own frusta show the captured images; it would leave them at the starting poses
+        stock = getattr(self.viewer, "camera_handles", {})
+        with self.viser_server.atomic():
+            for devices, T in zip(self._devices, poses, strict=True):
+                devices.move(T)
+            for k, handle in stock.items():
+                place(handle, poses[0][k])
+        if self.panel.rays.value:
+            self.show_rays()
+
+    def _mark_unplaced(self) -> bool:
+        """Whether any frame is newly known not to agree with the others, or to do so."""
+        assert self._devices is not None
+        unplaced = self._model.unplaced()
+        changed = unplaced != self._devices[0].unplaced
+        for devices in self._devices:
+            devices.mark(unplaced)
+        return changed
+
+    def _is_due(self) -> bool:
+        return time.monotonic() - self._last_update > _SECONDS_BETWEEN_UPDATES and bool(self.viser_server.get_clients())
+
+    def _numpy_poses(self) -> ScenePoses:
+        camera, projector = self._model.poses_scene()
+        return camera.detach().cpu().double().numpy(), projector.detach().cpu().double().numpy()
+
+    # ---- the first view
+
+    def _look_at_object(self, client: viser.ClientHandle) -> None:
+        fov, aspect = client.camera.fov or _USUAL_FOV, client.camera.aspect or _USUAL_ASPECT
+        view = first_view(np.concatenate(self._numpy_poses()), fov, aspect)
+        client.camera.up_direction = view.up
+        client.camera.position = view.eye * VISER_NERFSTUDIO_SCALE_RATIO
+        client.camera.look_at = view.centre * VISER_NERFSTUDIO_SCALE_RATIO
+
+
+def first_view(T_scene_device: Float64[ndarray, "n 4 4"], vertical_fov: float, aspect: float) -> Viewpoint:
+    """Framed on the object, beside the first device, and so far away that all devices are in the picture."""
+    corners = _OBJECT_RADIUS * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+    up, position = np.array([0.0, 0.0, 1.0]), T_scene_device[0, :3, 3]
+    direction = beside(position if np.linalg.norm(position) > 0 else T_scene_device[0, :3, 2], up)
+    points = np.concatenate([T_scene_device[:, :3, 3], corners])
+    return far_enough(points, np.zeros(3), direction, up, vertical_fov, aspect, _MARGIN)
+
+
+def _thumbnail(pattern: Float[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2 3"]:
+    step = max(1, math.ceil(max(pattern.shape) / _PATTERN_PIXELS))
+    grey = (pattern[::step, ::step] * 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)

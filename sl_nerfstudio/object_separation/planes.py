@@ -1,0 +1,799 @@
+"""The planes of the surroundings as each frame sees them, and which of a frame's points are part of them.
+
+The pose of a frame may be wrong by more than its points are noisy. A plane fitted again in each frame, with the common
+plane as prior, takes that error out of the heights above it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
+from sl_nerfstudio.parallel import compiled, compiled_range
+
+# All settings of the separation of object and surroundings.
+
+
+@dataclass(frozen=True)
+class SeparationSettings:
+    """Limits are in standard deviations of the measured noise, or shares; none is a length."""
+
+    pixels_per_frame: int = 40_000
+    """Decoded pixels of each frame that the search looks at, at most."""
+    points: int = 30_000
+    """Points of all frames together from which planes are found, at most."""
+    neighbours: int = 12
+    """Points of the same frame from which the normal of a point is found."""
+    hypotheses: int = 300
+    """Planes that are tried in each round of the search."""
+    planes: int = 8
+    """Planes that are looked for, at most."""
+    least_support: float = 0.03
+    """Smallest share of the points that a plane must hold."""
+    normal_cosine: float = 0.9
+    """Smallest cosine between the normal of a point and that of its plane."""
+    search_sigmas: float = 4.0
+    """Distance from a plane within which a point counts as part of it, while planes are searched for."""
+    clear_sigmas: float = 8.0
+    """Distance from a plane above which a point certainly does not belong to it."""
+    plane_sigmas: float = 3.0
+    """Height up to which a pixel is part of the plane wherever the object may be near, at least. Decoders err more
+    beside edges than elsewhere, so the height is measured: nothing is below the plane, what seems to be is error."""
+    error_share: float = 0.98
+    """Share of the errors below the plane that the measured height covers."""
+    most_sigmas: float = 30.0
+    """What is farther below the plane is no error of this kind; the measured height is at most this."""
+    bare_sigmas: float = 8.0
+    """Height up to which a pixel is part of the plane where the plane is bare, at least."""
+    bare_factor: float = 3.0
+    """The same in measured heights."""
+    bare_share: float = 0.7
+    """Share of the points near the plane that must lie on it for a place to count as bare."""
+    cameras_in_front: float = 0.95
+    """Share of the cameras that must be in front of a plane that is left out."""
+    most_behind: float = 0.05
+    """Largest share of the points in the viewed region that may lie behind such a plane."""
+    least_above: float = 0.005
+    """Smallest share of the points in the viewed region that must lie in front of it: there must be an object."""
+    directions: int = 36
+    """Directions in which the edge of a plane is looked for."""
+    view_margin: float = 0.1
+    """Strip along the borders of image and pattern in which an edge is not told from the end of the view: a share."""
+    edge_frames: float = 0.15
+    """Share of the frames that must look past the edge of a plane, for the edge to count as seen."""
+    continues: float = 0.5
+    """Share of the directions in which a plane must leave the views, for it to be more than the object."""
+    support_area: float = 3.0
+    """A plane whose edges are seen counts as support only if its bare area is at least so many times the area of what
+    stands on it."""
+    support_height: float = 0.25
+    """and if what stands on it rises at least so high, as a share of the root of its area."""
+    voxels: int = 40
+    """Voxels along the radius of the viewed region; parts of the object farther apart than two voxels are separate."""
+    least_frames: int = 2
+    """Frames that must have seen a voxel, or"""
+    least_points: int = 4
+    """points in it, for it to count."""
+    least_voxels: int = 5
+    """Voxels of the smallest part that is kept beside the main part."""
+    gap: float = 0.15
+    """Distance from the main part within which other parts are kept, as a share of its size."""
+    silhouette_points: int = 200_000
+    """Points of the object that are looked for in every frame, to tell which pixels that were not decoded show it."""
+    least_object: float = 0.01
+    """Smallest share of the points that the object must hold; with less, nothing is left out."""
+
+
+SEPARATION_DEFAULTS = SeparationSettings()
+
+# Planes in the world, and their least-squares fit.
+
+
+@dataclass(frozen=True)
+class Plane:
+    """All points with `normal . p = offset`; heights are positive on the side that the unit normal points to."""
+
+    normal: Float64[ndarray, "3"]
+    offset: float
+
+    def heights(self, p_world: Float[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
+        """Signed distances of points."""
+        return p_world @ self.normal - self.offset
+
+    def flipped(self) -> "Plane":
+        """The same plane with the other side up."""
+        return Plane(-self.normal, -self.offset)
+
+    def axes(self) -> Float64[ndarray, "2 3"]:
+        """Two unit vectors in the plane, perpendicular to each other."""
+        least = np.eye(3)[np.argmin(np.abs(self.normal))]
+        first = np.cross(self.normal, least)
+        first = first / np.linalg.norm(first)
+        return np.stack([first, np.cross(self.normal, first)])
+
+
+def fit_plane(p_world: Float[ndarray, "n 3"], weight: Float[ndarray, "n"]) -> Plane:
+    """The plane with the least weighted sum of squared distances; at least three points not on a line."""
+    centre = (weight[:, None] * p_world).sum(0) / weight.sum()
+    offset = p_world - centre
+    _, vectors = np.linalg.eigh((weight[:, None] * offset).T @ offset)
+    normal = vectors[:, 0]
+    return Plane(normal, float(normal @ centre))
+
+
+# Triangulated points of decoded frames, with their measured noise.
+
+LEAST_COSINE = 0.05  # between a ray and a plane's normal: a ray in the plane would have no noise across it
+_LEAST_NOISE_PX = 0.01  # rounding of stored coordinates and poses
+_SAME_PLACE = 3.0  # spacings: how far apart points of two frames on the same surface may be
+_SAME_NORMAL = 0.9  # cosine
+
+
+@dataclass(frozen=True)
+class DecodedFrame:
+    """The decoded coordinates of one frame, at every `stride`-th pixel, with both devices in the world."""
+
+    camera: Device
+    projector: Device
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    coords: Float32[ndarray, "h w 2"]  # NaN where not decoded
+    seen: Bool[ndarray, "h w"]  # where the pattern was seen, decoded or not
+    stride: int = 1
+
+    def thinned(self, most: int) -> "DecodedFrame":
+        """Every n-th pixel, so that at most about `most` are decoded."""
+        count = int(np.isfinite(self.coords).all(-1).sum())
+        step = max(1, int(np.ceil(np.sqrt(count / most))))
+        coords, seen = self.coords[::step, ::step].copy(), self.seen[::step, ::step].copy()
+        return replace(self, coords=coords, seen=seen, stride=step * self.stride)
+
+
+@dataclass(frozen=True)
+class FramePoints:
+    """The surface points of one frame."""
+
+    row: Int64[ndarray, "n"]  # of the thinned frame
+    column: Int64[ndarray, "n"]
+    p_world: Float64[ndarray, "n 3"]
+    ray: Float64[ndarray, "n 3"]  # unit direction from the camera
+    sigma: Float64[ndarray, "n"]  # 1 sigma along the ray
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.p_world)
+
+    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "FramePoints":
+        """Some of the points."""
+        return FramePoints(*(values[index] for values in vars(self).values()))
+
+    def scaled_noise(self, factor: float) -> "FramePoints":
+        """With all sigmas multiplied."""
+        return replace(self, sigma=self.sigma * factor)
+
+    def sigma_along(self, normal: Float[ndarray, "3"] | Float[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
+        """1 sigma of each point's place along a direction."""
+        return self.sigma * np.abs((self.ray * normal).sum(-1)).clip(LEAST_COSINE)
+
+
+def points_of(frame: DecodedFrame) -> FramePoints:
+    """Triangulate a frame; pixels whose rays meet behind a device, or nowhere, have no point.
+
+    The noise of the coordinates is measured: the robust standard deviation of the epipolar residual.
+    """
+    row, column = np.nonzero(np.isfinite(frame.coords).all(-1))
+    uv = torch.from_numpy(np.stack([column, row], -1) * float(frame.stride) + 0.5)
+    pair = (
+        Intrinsics.of(frame.camera, torch.float64), torch.from_numpy(frame.T_world_camera), uv,
+        Intrinsics.of(frame.projector, torch.float64), torch.from_numpy(frame.T_world_projector),
+        torch.from_numpy(frame.coords[row, column].astype(np.float64)),
+    )  # fmt: skip
+    found = triangulate(*pair)
+    residual = epipolar_residual(*pair).numpy()
+    origin = frame.T_world_camera[:3, 3]
+    p = found.p_world.numpy()
+    good = np.isfinite(residual) & np.isfinite(p).all(-1)
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(residual[good]))) if good.any() else 0.0
+    ray = p[good] - origin
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    sigma = found.sigma_depth.numpy()[good] * max(noise, _LEAST_NOISE_PX)
+    return FramePoints(row[good].astype(np.int64), column[good].astype(np.int64), p[good], ray, sigma)
+
+
+def normals_of(points: FramePoints, neighbours: int) -> Float64[ndarray, "n 3"]:
+    """Unit normals towards the camera, from the nearest points of the same frame; NaN with too few points."""
+    if len(points) < neighbours:
+        return np.full((len(points), 3), np.nan)
+    _, near = KDTree(points.p_world).query(points.p_world, neighbours)
+    offset = points.p_world[near] - points.p_world[near].mean(1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
+    normal = vectors[:, :, 0]
+    return normal * -np.sign((normal * points.ray).sum(-1, keepdims=True))
+
+
+def cross_frame_noise(frames: Sequence[FramePoints], normals: Sequence[Float[ndarray, "_n 3"]]) -> float:
+    """How much farther points of different frames are from each other than their own noise explains; at least 1.
+
+    Every frame is compared with some others, one by one: each point with the tangent plane at the nearest point there.
+    What exceeds the noise of coordinates is error of the poses.
+    """
+    count = len(frames)
+    ratios = [
+        _distances_in_sigmas(frames[k], normals[k], frames[other], normals[other])
+        for k in range(count)
+        for other in sorted({(k + step) % count for step in (1, 2, count // 3, count // 2)} - {k})
+    ]
+    ratio = np.concatenate([np.zeros(0), *ratios])
+    return max(1.0, MAD_TO_SIGMA * float(np.median(ratio))) if len(ratio) else 1.0
+
+
+def _distances_in_sigmas(
+    a: FramePoints, normal_a: Float[ndarray, "n 3"], b: FramePoints, normal_b: Float[ndarray, "m 3"]
+) -> Float64[ndarray, "k"]:
+    """Distances of points of one frame from tangent planes of another, where both show the same surface."""
+    if min(len(a), len(b)) < 2:
+        return np.zeros(0)
+    tree = KDTree(b.p_world)
+    spacing = float(np.median(np.asarray(tree.query(b.p_world, 2)[0])[:, 1]))
+    distance, near = (np.asarray(v) for v in tree.query(a.p_world, distance_upper_bound=_SAME_PLACE * spacing))
+    mine = np.flatnonzero(np.isfinite(distance))
+    there = near[mine]
+    same = (normal_a[mine] * normal_b[there]).sum(-1) > _SAME_NORMAL
+    mine, there = mine[same], there[same]
+    off = ((a.p_world[mine] - b.p_world[there]) * normal_b[there]).sum(-1)
+    sigma = np.hypot(a.sigma_along(normal_a)[mine], b.sigma_along(normal_b)[there])
+    return np.abs(off) / sigma
+
+
+# Planes grown from single points: a compiled loop over hypotheses.
+
+GROWTH = (0.2, 0.5, np.inf)  # of the radius: a plane is fitted near its seed first, and then to more and more points
+FEWEST = 6  # points that a plane is fitted to
+
+
+def grown_planes(
+    points: FramePoints,
+    normal: Float64[ndarray, "n 3"],
+    seeds: Int64[ndarray, "s"],
+    radius: float,
+    sigmas: float,
+    cosine: float,
+) -> tuple[Float64[ndarray, "s 4"], Int64[ndarray, "s"]]:
+    """Planes (unit normal, offset) through points along their normals, fitted to more and more points around them.
+
+    Points within `sigmas` of a plane, whose normals' cosine is greater than `cosine`, are part of it. Returns the
+    planes, and the number of points that are part of each.
+    """
+    planes, counts = np.zeros((len(seeds), 4)), np.zeros(len(seeds), dtype=np.int64)
+    arrays = [np.ascontiguousarray(x) for x in (points.p_world, points.ray, points.sigma, normal)]
+    reaches = np.array([reach * radius for reach in GROWTH])
+    _grow(len(seeds), seeds, *arrays, reaches, sigmas, cosine, planes, counts)
+    return planes, counts
+
+
+@compiled_range
+def _grow(first, last, seeds, p, ray, sigma, normal, reaches, sigmas, cosine, planes, counts):
+    for k in range(first, last):
+        seed, plane = seeds[k], planes[k]
+        plane[:3] = normal[seed]
+        plane[3] = normal[seed] @ p[seed]
+        moments = np.empty((4, 4))
+        for reach in reaches:
+            if _moments(p, ray, sigma, normal, p[seed], reach, sigmas, cosine, plane, moments) >= FEWEST:
+                _fit(moments, p[seed], plane)
+        counts[k] = _moments(p, ray, sigma, normal, p[seed], np.inf, sigmas, cosine, plane, moments)
+
+
+@compiled
+def _moments(p, ray, sigma, normal, about, reach, sigmas, cosine, plane, moments):
+    """Weighted sums of (1, x, y, z) (1, x, y, z)^T about a point, and the number of points that are part of a plane."""
+    a, b, c, offset = plane
+    count, here = 0, np.empty(4)
+    here[0] = 1.0
+    moments[:] = 0.0
+    for i in range(len(p)):
+        height = a * p[i, 0] + b * p[i, 1] + c * p[i, 2] - offset
+        along = sigma[i] * max(abs(a * ray[i, 0] + b * ray[i, 1] + c * ray[i, 2]), LEAST_COSINE)
+        if not abs(height) < sigmas * along:
+            continue
+        if not abs(a * normal[i, 0] + b * normal[i, 1] + c * normal[i, 2]) > cosine:
+            continue
+        distance = 0.0
+        for j in range(3):
+            here[j + 1] = p[i, j] - about[j]
+            distance += here[j + 1] ** 2
+        if not distance < reach * reach:
+            continue
+        count += 1
+        for j in range(4):
+            for m in range(4):
+                moments[j, m] += here[j] * here[m] / along**2
+    return count
+
+
+@compiled
+def _fit(moments, about, plane):
+    """The plane of least weighted squared distances, on the same side up as before."""
+    centre = moments[0, 1:] / moments[0, 0]
+    spread = moments[1:, 1:] - moments[0, 0] * centre.reshape(3, 1) * centre
+    axis = np.ascontiguousarray(np.linalg.eigh(spread)[1][:, 0])
+    if axis @ plane[:3] < 0:
+        axis = -axis
+    plane[:3] = axis
+    plane[3] = axis @ (centre + about)
+
+
+# The dominant planes in the points of all frames, by random sampling and refinement.
+
+_SCORED = 6000  # points on which hypotheses are compared
+
+
+@dataclass(frozen=True)
+class PointPool:
+    """Points of all frames together, thinned, with normals."""
+
+    points: FramePoints
+    normal: Float64[ndarray, "n 3"]
+    frame: Int64[ndarray, "n"]
+
+    @staticmethod
+    def of(frames: Sequence[FramePoints], normals: Sequence[Float[ndarray, "_n 3"]]) -> "PointPool":
+        """The points of several frames that have a normal."""
+        joined = FramePoints(*(np.concatenate([vars(f)[key] for f in frames]) for key in vars(frames[0])))
+        frame = np.repeat(np.arange(len(frames)), [len(f) for f in frames])
+        pool = PointPool(joined, np.concatenate(list(normals)), frame)
+        return pool.chosen(np.isfinite(pool.normal).all(-1))
+
+    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "PointPool":
+        """Some of the points."""
+        return PointPool(self.points.chosen(index), self.normal[index], self.frame[index])
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.frame)
+
+    def on(self, plane: Plane, settings: SeparationSettings) -> Bool[ndarray, "n"]:
+        """The points that are part of a plane: by their place and by their normal."""
+        near = np.abs(plane.heights(self.points.p_world)) < settings.search_sigmas * self.points.sigma_along(
+            plane.normal
+        )
+        return near & (np.abs(self.normal @ plane.normal) > settings.normal_cosine)
+
+
+def find_planes(
+    pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings
+) -> list[tuple[Plane, float]]:
+    """Planes with the share of all points that they hold, the largest first; none that holds too few or one frame's.
+
+    `radius` is that of the viewed region.
+    """
+    found: list[tuple[Plane, float]] = []
+    rest = pool
+    for _ in range(settings.planes):
+        plane = _largest(rest, radius, rng, settings)
+        if plane is None:
+            break
+        on = rest.on(plane, settings)
+        if on.sum() < settings.least_support * len(pool) or len(np.unique(rest.frame[on])) < 2:
+            break
+        found.append((plane, float(on.sum() / len(pool))))
+        clear = np.abs(plane.heights(rest.points.p_world)) > settings.clear_sigmas * rest.points.sigma_along(
+            plane.normal
+        )
+        rest = rest.chosen(clear)
+    return found
+
+
+def _largest(pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings) -> Plane | None:
+    """The plane that holds the most points, of planes grown from random points; None if there are too few points."""
+    if len(pool) < settings.neighbours:
+        return None
+    some = pool.chosen(rng.choice(len(pool), min(_SCORED, len(pool)), replace=False))
+    seeds = rng.integers(0, len(some), settings.hypotheses)
+    planes, counts = grown_planes(
+        some.points, some.normal, seeds, radius, settings.search_sigmas, settings.normal_cosine
+    )
+    most = int(counts.argmax())
+    if counts[most] == 0:
+        return None
+    best = Plane(planes[most, :3], float(planes[most, 3]))
+    for _ in range(3):
+        best = _refitted(pool, pool.on(best, settings), best)
+    return best
+
+
+def _refitted(pool: PointPool, on: Bool[ndarray, "n"], plane: Plane) -> Plane:
+    """The plane fitted to some points; unchanged if they are too few."""
+    if on.sum() < FEWEST:
+        return plane
+    points = pool.points.chosen(on)
+    found = fit_plane(points.p_world, 1 / points.sigma_along(plane.normal) ** 2)
+    return found if found.normal @ plane.normal > 0 else found.flipped()
+
+
+# Where all cameras look at: the point that their axes pass nearest, and how far around it they see.
+
+_TOWARDS_POINTS = 1e-2  # weight of the points' middle against one axis; it decides where all axes are parallel
+
+
+@dataclass(frozen=True)
+class ViewedRegion:
+    """A sphere that most frames see, and light, completely."""
+
+    focus: Float64[ndarray, "3"]
+    radius: float
+
+    def contains(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Whether points are in it."""
+        return np.linalg.norm(p_world - self.focus, axis=-1) < self.radius
+
+
+def viewed_region(frames: Sequence[DecodedFrame], p_world: Float[ndarray, "n 3"]) -> ViewedRegion:
+    """From the poses and fields of view of all devices; `p_world` are points of all frames."""
+    middle = np.median(p_world, axis=0)
+    A, b = _TOWARDS_POINTS * np.eye(3), _TOWARDS_POINTS * middle
+    for frame in frames:
+        axis, origin = frame.T_world_camera[:3, 2], frame.T_world_camera[:3, 3]
+        across = np.eye(3) - np.outer(axis, axis)
+        A, b = A + across, b + across @ origin
+    focus = np.linalg.solve(A, b)
+    reach = [
+        min(_reach(frame.camera, frame.T_world_camera, focus), _reach(frame.projector, frame.T_world_projector, focus))
+        for frame in frames
+    ]
+    return ViewedRegion(focus, float(np.median(reach)))
+
+
+def _reach(device: Device, T_world_device: Float[ndarray, "4 4"], focus: Float[ndarray, "3"]) -> float:
+    """Half the width of what a device sees at the distance of the focus."""
+    distance = float(np.linalg.norm(T_world_device[:3, 3] - focus))
+    return distance * min(device.w / device.fl_x, device.h / device.fl_y) / 2
+
+
+# Whether a plane is what the object stands on or stands before, or a part of the object itself.
+
+Verdict = Literal[
+    "leaves the views", "object stands on it", "cameras on both sides", "surface behind it", "nothing on it",
+    "edges seen",
+]  # fmt: skip
+"""Why a plane is surroundings (the first two), or why it may be a part of the object and is kept."""
+
+_CELLS = 20  # of the grid in the plane, along the radius of the viewed region
+_POINTS_IN_CELL = 3
+_BEYOND_EDGE = (
+    1.04,
+    1.1,
+    1.2,
+    1.35,
+)  # where past the edge to look, as distances from the middle in distances of the edge
+_AROUND = 0.75  # share of the directions in which a support extends beyond what stands on it
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneFinding:
+    """A plane, facing the cameras, and what is known about it; shares are between 0 and 1."""
+
+    plane: Plane
+    share: float  # of all points that lie on it
+    cameras_in_front: float  # of the cameras
+    behind: float  # of the points in the viewed region
+    above: float  # the same, in front of it
+    continues: float  # of the directions, those in which no frame looks past its edge
+    area_ratio: float  # its bare area, in areas of what stands on it
+    height_ratio: float  # height of what stands on it, in roots of its area
+    around: float  # share of the directions in which it extends beyond what stands on it
+    verdict: Verdict
+
+    @property
+    def is_surroundings(self) -> bool:
+        """Whether the plane is not part of the object."""
+        return self.verdict in ("leaves the views", "object stands on it")
+
+
+def judge_plane(
+    plane: Plane,
+    share: float,
+    pool: PointPool,
+    frames: Sequence[DecodedFrame],
+    points: Sequence[FramePoints],
+    region: ViewedRegion,
+    settings: SeparationSettings,
+) -> PlaneFinding:
+    """Judge one plane. `pool` has points of all frames, `points` are those of each frame.
+
+    Surroundings have all cameras in front of them and nothing of the object behind them, carry something, and either
+    extend beyond the views (no frame looks past their edge), or are far larger than what rises from them.
+    """
+    centres = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
+    if (plane.heights(centres) > 0).mean() < 0.5:
+        plane = plane.flipped()
+    in_front = float((plane.heights(centres) > 0).mean())
+    p = pool.points.p_world
+    height, clear = plane.heights(p), settings.clear_sigmas * pool.points.sigma_along(plane.normal)
+    inside = region.contains(p)
+    behind, above = (float((side & inside).sum() / max(inside.sum(), 1)) for side in (height < -clear, height > clear))
+    on = pool.on(plane, settings)
+    continues = _continues(plane, p[on], frames, points, settings)
+    area, tall, around = _what_stands_on_it(plane, p[on], p[inside & (height > clear)], region)
+    return PlaneFinding(
+        plane, share, in_front, behind, above, continues, area, tall, around,
+        _verdict(in_front, behind, above, continues, (area, tall, around), settings),
+    )  # fmt: skip
+
+
+def _verdict(
+    in_front: float,
+    behind: float,
+    above: float,
+    continues: float,
+    support: tuple[float, float, float],
+    settings: SeparationSettings,
+) -> Verdict:
+    area, tall, around = support
+    if in_front < settings.cameras_in_front:
+        return "cameras on both sides"
+    if behind > settings.most_behind:
+        return "surface behind it"
+    if above < settings.least_above:
+        return "nothing on it"
+    if continues >= settings.continues:
+        return "leaves the views"
+    if area >= settings.support_area and tall >= settings.support_height and around >= _AROUND:
+        return "object stands on it"
+    return "edges seen"
+
+
+def _continues(
+    plane: Plane,
+    on: Float[ndarray, "n 3"],
+    frames: Sequence[DecodedFrame],
+    points: Sequence[FramePoints],
+    settings: SeparationSettings,
+) -> float:
+    """Share of the directions in the plane in which no more than a few frames look past its edge."""
+    if not len(on):
+        return 0.0
+    centre = np.median(on, axis=0)
+    flat = (on - centre) @ plane.axes().T
+    distance = np.linalg.norm(flat, axis=1)
+    sector = _sectors(flat, settings.directions)
+    probes = []
+    for k in range(settings.directions):
+        if (sector == k).sum() < _POINTS_IN_CELL:
+            continue
+        reach = np.percentile(distance[sector == k], 98) * np.array(_BEYOND_EDGE)
+        angle = 2 * np.pi * (k + 0.5) / settings.directions - np.pi
+        outward = np.array([np.cos(angle), np.sin(angle)]) @ plane.axes()
+        probes.append(centre + reach[:, None] * outward)
+    if not probes:
+        return 0.0
+    places = np.concatenate(probes)
+    past = sum(
+        _looks_past(plane, places, frame, own, settings).astype(int) for frame, own in zip(frames, points, strict=True)
+    )
+    # A rim may stand on the edge, so that only places farther out show that nothing follows.
+    most = np.reshape(past, (len(probes), -1)).max(1)
+    return float((most <= settings.edge_frames * len(frames)).mean())
+
+
+def _looks_past(
+    plane: Plane,
+    probes: Float[ndarray, "m 3"],
+    frame: DecodedFrame,
+    points: FramePoints,
+    settings: SeparationSettings,
+) -> Bool[ndarray, "m"]:
+    """Places where a frame looks past the plane: well inside its view, it saw something behind it or nothing at all."""
+    uv, inside = _well_inside(frame.camera, frame.T_world_camera, probes, settings.view_margin)
+    _, lit = _well_inside(frame.projector, frame.T_world_projector, probes, settings.view_margin)
+    looked = inside & lit
+    nothing, beyond = ~frame.seen, np.zeros_like(frame.seen)
+    below = plane.heights(points.p_world) < -settings.clear_sigmas * points.sigma_along(plane.normal)
+    beyond[points.row[below], points.column[below]] = True
+    past = np.zeros(len(probes), dtype=bool)
+    for k in np.flatnonzero(looked):
+        column, row = (uv[k] / frame.stride).astype(int)
+        window = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
+        past[k] = (nothing[window] | beyond[window]).all()
+    return past
+
+
+def _well_inside(
+    device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "m 3"], margin: float
+) -> tuple[Float[ndarray, "m 2"], Bool[ndarray, "m"]]:
+    """Pixels of points, and whether they are in the image without a strip along its borders."""
+    p_device = (p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]
+    found, in_front = project(Intrinsics.of(device, torch.float64), torch.from_numpy(np.ascontiguousarray(p_device)))
+    uv = found.numpy()
+    share = uv / (device.w, device.h)
+    return uv, in_front.numpy() & (share > margin).all(1) & (share < 1 - margin).all(1)
+
+
+def _what_stands_on_it(
+    plane: Plane, on: Float[ndarray, "n 3"], above: Float[ndarray, "m 3"], region: ViewedRegion
+) -> tuple[float, float, float]:
+    """How much more than what rises from it a plane is.
+
+    Returns its bare area in areas of what rises, the height of that in roots of its area, and the share of the
+    directions in which the plane extends beyond it.
+    """
+    size = region.radius / _CELLS
+    axes = plane.axes()
+
+    def cells(p: Float[ndarray, "k 3"]) -> Int64[ndarray, "c 2"]:
+        cell, count = np.unique(
+            np.floor((p - region.focus) @ axes.T / size).astype(np.int64), axis=0, return_counts=True
+        )
+        return cell[count >= _POINTS_IN_CELL]
+
+    standing, bare = cells(above), cells(on)
+    if not len(standing) or not len(bare):
+        return 0.0, 0.0, 0.0
+    bare = bare[~(bare[:, None] == standing[None]).all(-1).any(1)]
+    tall = float(np.percentile(plane.heights(above), 95)) / (size * np.sqrt(len(standing)))
+    middle = standing.mean(0)
+    beyond = []
+    own, others = (_sectors(c - middle, 12) for c in (standing, bare))
+    for k in range(12):
+        edge = np.linalg.norm(standing[own == k] - middle, axis=1).max(initial=0.0)
+        beyond.append(np.linalg.norm(bare[others == k] - middle, axis=1).max(initial=0.0) > edge + 1)
+    return len(bare) / len(standing), tall, float(np.mean(beyond))
+
+
+def _sectors(flat: Float[ndarray, "n 2"], count: int) -> Int64[ndarray, "n"]:
+    """Number of the angular sector of each place."""
+    turn = (np.arctan2(flat[:, 1], flat[:, 0]) + np.pi) / (2 * np.pi)
+    return np.minimum((count * turn).astype(np.int64), count - 1)
+
+
+_FEWEST = 100  # points on a plane from which a frame's own plane is found
+_STEPS = 6
+_PRESENT = 0.1  # share of the points of a cell with which something is there
+
+
+@dataclass(frozen=True)
+class FramePlane:
+    """A plane in one frame, and how noisy its points are relative to their stated sigma."""
+
+    plane: Plane
+    noise: float
+
+    def in_sigmas(self, points: FramePoints) -> Float64[ndarray, "n"]:
+        """Heights of points in standard deviations."""
+        return self.plane.heights(points.p_world) / (self.noise * points.sigma_along(self.plane.normal))
+
+
+def plane_in_frame(
+    plane: Plane, points: FramePoints, pose_noise: float, region_radius: float, settings: SeparationSettings
+) -> FramePlane:
+    """The plane fitted to the points of one frame that are near it.
+
+    `points` have the noise of their coordinates; that of poses makes heights `pose_noise` times as uncertain.
+    """
+    found, noise = plane, 1.0
+    width = settings.clear_sigmas * pose_noise
+    for _ in range(_STEPS):
+        sigma = points.sigma_along(found.normal)
+        z = found.heights(points.p_world) / sigma
+        near = np.abs(z) < width
+        if near.sum() < _FEWEST:
+            return FramePlane(plane, pose_noise)
+        found = _corrected(found, plane, points.chosen(near), z[near], pose_noise, region_radius)
+        z = found.heights(points.p_world) / sigma
+        noise = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z[np.abs(z) < width]))))
+        width = max(settings.search_sigmas * noise, width / 2)
+    return FramePlane(found, noise)
+
+
+def _corrected(
+    found: Plane,
+    prior: Plane,
+    points: FramePoints,
+    z: Float[ndarray, "n"],
+    pose_noise: float,
+    radius: float,
+) -> Plane:
+    """One step of robust least squares for height and slopes, with the common plane as prior."""
+    axes = prior.axes()
+    centre = points.p_world.mean(0)
+    centre = centre - prior.heights(centre[None])[0] * prior.normal
+    flat = (points.p_world - centre) @ axes.T / radius
+    sigma = points.sigma_along(found.normal)
+    weight = geman_mcclure_weight((z / 3) ** 2) / sigma**2
+    A = np.concatenate([np.ones((len(z), 1)), flat], 1)
+    b = prior.heights(points.p_world)
+    spread = max(pose_noise, 2.0) * float(np.median(sigma))  # how far this frame's plane may be from the common one
+    H = (weight[:, None] * A).T @ A + np.eye(3) / spread**2
+    height, u, v = np.linalg.solve(H, (weight * b) @ A)
+    normal = prior.normal - (u * axes[0] + v * axes[1]) / radius
+    normal = normal / np.linalg.norm(normal)
+    return Plane(normal, float(normal @ (centre + height * prior.normal)))
+
+
+@dataclass(frozen=True)
+class BarePlaces:
+    """The cells of a grid in a plane in which nothing rises from it, and how high its points seem to be; in sigmas."""
+
+    plane: Plane
+    size: float  # of a cell
+    cells: frozenset[tuple[int, int]]
+    near: float  # height up to which a point is part of the plane where something may rise from it
+    bare: float  # and where nothing does
+
+    def at(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
+        """Whether the plane is bare below points."""
+        cell, place = np.unique(_cells(self.plane, p_world, self.size), axis=0, return_inverse=True)
+        bare = np.array([tuple(c) in self.cells for c in cell.tolist()], dtype=bool)
+        return bare[place.reshape(-1)]
+
+
+def find_bare_places(
+    plane: Plane, frames: Sequence[tuple[FramePoints, FramePlane]], size: float, settings: SeparationSettings
+) -> BarePlaces:
+    """Cells where nearly all points near the plane are part of it, in all frames together.
+
+    First with the points' own noise. Where something rises from the plane, what seems to be below it is error, and says
+    how high points of the plane may seem to be there; the cells are judged again with that.
+    """
+    p = np.concatenate([points.p_world for points, _ in frames])
+    z = np.concatenate([own.in_sigmas(points) for points, own in frames])
+    first = _bare(plane, p, z, size, settings.plane_sigmas, settings)
+    near = np.abs(z) < settings.most_sigmas
+    errors = -z[near][_beside_what_rises(plane, p[near], z[near], size, settings) & (z[near] < 0) & ~first.at(p[near])]
+    measured = float(np.quantile(errors, settings.error_share)) if len(errors) >= _FEWEST else 0.0
+    return _bare(plane, p, z, size, max(settings.plane_sigmas, measured), settings)
+
+
+def _beside_what_rises(
+    plane: Plane, p_world: Float[ndarray, "n 3"], z: Float[ndarray, "n"], size: float, settings: SeparationSettings
+) -> Bool[ndarray, "n"]:
+    """Points in cells that hold parts of the plane, and of what rises from it.
+
+    At the edge of a plate, too, there are points below the plane; but those are surface.
+    """
+    _, place = np.unique(_cells(plane, p_world, size), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    count = np.bincount(place)
+    rising = np.bincount(place, (z > settings.plane_sigmas).astype(float)) > _PRESENT * count
+    flat = np.bincount(place, (np.abs(z) < settings.plane_sigmas).astype(float)) > _PRESENT * count
+    return (rising & flat)[place]
+
+
+def _bare(
+    plane: Plane,
+    p_world: Float[ndarray, "n 3"],
+    z: Float[ndarray, "n"],
+    size: float,
+    height: float,
+    settings: SeparationSettings,
+) -> BarePlaces:
+    """The cells in which nearly all points near the plane seem to be no higher than `height` (in sigmas)."""
+    bare = max(settings.bare_sigmas, settings.bare_factor * height)
+    near = np.abs(z) < 2 * bare
+    cell, place = np.unique(_cells(plane, p_world[near], size), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    flat = (np.abs(z[near]) < height).astype(float)
+    share = np.bincount(place, flat, len(cell)) / np.maximum(np.bincount(place, minlength=len(cell)), 1)
+    chosen = cell[share >= settings.bare_share]
+    return BarePlaces(plane, size, frozenset((a, b) for a, b in chosen.tolist()), height, bare)
+
+
+def on_plane(points: FramePoints, own: FramePlane, bare: BarePlaces) -> Bool[ndarray, "n"]:
+    """Points that are part of a plane or behind it."""
+    z = own.in_sigmas(points)
+    low = z < bare.near
+    unsure = ~low & (z < bare.bare)
+    low[unsure] = bare.at(points.p_world[unsure])
+    return low
+
+
+def _cells(plane: Plane, p_world: Float[ndarray, "n 3"], size: float) -> Int64[ndarray, "n 2"]:
+    return np.floor(p_world @ plane.axes().T / size).astype(np.int64)

@@ -1,0 +1,298 @@
+"""Work on many frames or pairs of them, side by side on all threads, with its progress."""
+
+import ctypes
+import inspect
+import itertools
+import math
+import mmap
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import torch
+from threadpoolctl import threadpool_limits
+
+from sl_nerfstudio.console import track
+
+# The control groups of Linux that this process is in, and what they allow (cgroups(7)).
+
+ROOT, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+
+
+def groups_around(controller: str, root: Path, own: Path) -> list[Path]:
+    """Folders of the groups whose limits for a controller, "cpu" or "memory", hold for this process.
+
+    `root` is where control groups are mounted, `own` lists those of the process: version 2 as `0::/a/b`, version 1 with
+    the controller's name. The limits of all groups around its own hold, too. A container sees its own group as the
+    root. Folders need not exist.
+    """
+    try:
+        lines = own.read_text().splitlines()
+    except OSError:
+        lines = []
+    found: list[Path] = []
+    for _, names, path in (line.split(":", 2) for line in ["0::/", f"0:{controller}:/", *lines] if line.count(":") > 1):
+        if names and controller not in names.split(","):
+            continue
+        mount = root / controller if names else root
+        group = mount / path.strip("/")
+        inside = [group, *group.parents]
+        found += inside[: inside.index(mount) + 1]
+    return found
+
+
+# How many cores this process may use: as its affinity mask and the quotas of its control groups allow.
+#
+# A container that is given two of 64 cores by a quota still sees 64: as many threads would wait for each other.
+
+
+def cores() -> int:
+    """The smaller of both numbers, at least 1."""
+    mask = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(math.ceil(min(mask, quota(ROOT, OWN))), 1)
+
+
+def quota(root: Path, own: Path) -> float:
+    """Cores' worth of time that the control groups of this process allow, infinite without a limit.
+
+    For the arguments see `control_groups.groups_around`.
+    """
+    return min((_limit(folder) for folder in groups_around("cpu", root, own)), default=math.inf)
+
+
+def _limit(folder: Path) -> float:
+    """That of one group: `cpu.max` of version 2, or the two files of version 1."""
+    try:
+        if (folder / "cpu.max").is_file():
+            allowed, period = (folder / "cpu.max").read_text().split()
+        else:
+            allowed, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        return float(allowed) / float(period) if allowed.strip() not in ("max", "-1") else math.inf
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf
+
+
+# Freed memory is kept for the next array instead of being returned to the system.
+#
+# By default the C library maps each array of a few megabytes anew and returns it when it is freed. Then every page
+# of the
+# next one is a fault again, all threads of the process wait for each other in the kernel, and loops that make
+# temporaries spend a third of their time there.
+
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # numbers of malloc.h
+
+
+def keep_freed_memory() -> bool:
+    """Arrays below 256 MiB come from memory that stays with the process; up to 1 GiB of it may be unused at its end.
+
+    With glibc on Linux, whose `mallopt` this sets (mallopt(3)); elsewhere nothing changes. Returns whether it was set.
+    """
+    if sys.platform != "linux":
+        return False
+    library = _c_library()
+    if not hasattr(library, "gnu_get_libc_version"):  # musl
+        return False
+    settings = ((_MMAP_THRESHOLD, 2**28), (_TRIM_THRESHOLD, 2**30), (_TOP_PAD, 2**26))
+    return all([library.mallopt(number, value) == 1 for number, value in settings])
+
+
+def return_freed_memory() -> None:
+    """Give all freed memory back to the system after all, once (malloc_trim(3)); with glibc on Linux only."""
+    if sys.platform == "linux" and hasattr(library := _c_library(), "malloc_trim"):
+        library.malloc_trim(0)
+
+
+def read_at_random(address: int, length: int) -> None:
+    """Tell Linux that mapped memory will be read here and there: then it reads no megabytes around each place."""
+    _advise(address, length, "MADV_RANDOM")
+
+
+def read_in_order(address: int, length: int) -> None:
+    """Tell Linux that mapped memory will be read from its beginning to its end: then it reads ahead."""
+    _advise(address, length, "MADV_NORMAL")
+
+
+def _advise(address: int, length: int, advice: str) -> None:
+    """madvise(2) for whole pages; it is only a hint, so failure does not matter."""
+    if sys.platform == "linux" and length > 0:
+        first = address - address % mmap.PAGESIZE
+        length += address - first
+        _c_library().madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), getattr(mmap, advice))
+
+
+@cache
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
+
+
+# Independent pieces of work in parallel, on as many threads as torch uses.
+#
+# The pieces are numba kernels that release the GIL. Idle threads sleep: unlike an OpenMP team they do not spin
+# beside
+# torch's own. Callers may be several threads (training, viewer) at once.
+
+T = TypeVar("T")
+
+if torch.get_num_threads() > cores():  # torch does not know of quotas
+    torch.set_num_threads(cores())
+keep_freed_memory()
+
+_ours: int | None = None  # threads of our own loops while torch has one
+_this_thread = threading.local()  # `one_of_many`: it works on one of as many tasks as there are threads, or more
+
+
+def threads() -> int:
+    """Number of threads that take part; one in a task of `parallel` whose other threads are busy with other tasks."""
+    if getattr(_this_thread, "one_of_many", False):
+        return 1
+    return torch.get_num_threads() if _ours is None else _ours
+
+
+@contextmanager
+def one_library_thread() -> Iterator[None]:
+    """Operations of torch and of numpy's BLAS on one thread, our loops on all, for work made of many small operations.
+
+    Those gain nothing from a team of threads, which spin between them: beside other busy processes the work then takes
+    ten times as long and more.
+    """
+    with one_torch_thread(), threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """The same without BLAS, for what is called often: looking for the process's BLAS libraries takes milliseconds."""
+    global _ours
+    before, count = _ours, torch.get_num_threads()
+    _ours = threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+        _ours = before
+
+
+def torch_on_one_thread() -> None:
+    """`one_torch_thread` for the rest of this process."""
+    global _ours
+    _ours = threads()
+    torch.set_num_threads(1)
+
+
+def only_one_library_thread() -> None:
+    """All libraries and our loops on one thread for the rest of this process: one of several that share the cores."""
+    torch.set_num_threads(1)
+    threadpool_limits(limits=1, user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The process's threads; a forked child makes its own."""
+    return ThreadPoolExecutor(max_workers=max((os.cpu_count() or 2) - 1, 1), thread_name_prefix="sl-threads")
+
+
+def parallel(tasks: Sequence[Callable[[], object]]) -> None:
+    """Run all tasks, each once, in any order, on up to `threads()` threads; raises what a task raises.
+
+    Tasks may themselves call this: a thread that has not begun when the tasks are done is not waited for. Where there
+    are enough tasks for all threads, what they call stays on their own thread.
+    """
+    queue, count = itertools.count(), threads()
+    others, many = min(count, len(tasks)) - 1, len(tasks) >= count > 1
+    futures = [_pool(os.getpid()).submit(_work, tasks, queue, many) for _ in range(others)]
+    try:
+        _work(tasks, queue, many)
+    finally:
+        errors = [future.exception() for future in futures if not future.cancel()]
+    for error in errors:
+        if error is not None:
+            raise error
+
+
+def results(tasks: Sequence[Callable[[], T]]) -> list[T]:
+    """What the tasks return, in their order; they run as in `parallel`, and gain where they leave Python's lock free.
+
+    numpy, torch and open3d do so while they work on large arrays.
+    """
+    found: dict[int, T] = {}
+    parallel([partial(_keep, found, k, task) for k, task in enumerate(tasks)])
+    return [found[k] for k in range(len(tasks))]
+
+
+def _keep(found: dict[int, T], k: int, task: Callable[[], T]) -> None:
+    found[k] = task()
+
+
+def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: bool) -> None:
+    """Run tasks until none is left; `queue` gives each number once, whichever thread asks."""
+    before = getattr(_this_thread, "one_of_many", False)
+    _this_thread.one_of_many = before or many
+    try:
+        while (i := next(queue)) < len(tasks):
+            tasks[i]()
+    finally:
+        _this_thread.one_of_many = before
+
+
+def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:
+    """One to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
+    step = max(-(-n // parts), 1)
+    step = -(-step // multiple) * multiple
+    return [(start, min(start + step, n)) for start in range(0, max(n, 1), step)]
+
+
+# Machine code for loops that numpy cannot express; kept on disk, so that it is made once.
+
+_njit: Any = numba.njit  # its overloads do not accept options in a set
+ANY_ORDER = {"contract", "reassoc", "nsz"}
+"""For numba's `fastmath`: fused multiply-add, and sums in any order; infinity and NaN stay what they are."""
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function compiled for one thread; without the run-time type checks that tests wrap it in.
+
+    Other threads run beside it. Division by zero gives infinity or NaN: a check of every divisor would keep loops from
+    working on several numbers at once.
+    """
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
+def compiled_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function compiled for one thread, with sums in any order: so several numbers are added at once."""
+    return _njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)(inspect.unwrap(function))
+
+
+def compiled_range(function: Callable[..., None]) -> Callable[..., None]:
+    """A loop over a range, compiled, run in pieces on all threads.
+
+    `function(first, last, *arguments)` does the iterations first to last - 1, which must not depend on each other. The
+    result is called with the number of iterations in place of the range. Unlike an OpenMP team (numba's `prange`), idle
+    threads sleep: a team spins at the end of every loop, and beside other busy processes takes many times its share.
+    """
+    loop = compiled(function)
+
+    def run(count: int, *arguments: Any) -> None:
+        parallel([partial(loop, first, last, *arguments) for first, last in split(count, threads(), 1)])
+
+    return run
+
+
+_EACH = 4  # pieces of work of a thread between two reports
+
+
+def tracked(tasks: Sequence[Callable[[], T]], words: str) -> list[T]:
+    """What the tasks return, in their order; they must not depend on each other.
+
+    Each draws from a random generator of its own, so that results do not depend on the number of threads.
+    """
+    together = _EACH * threads()
+    batches = [tasks[first : first + together] for first in range(0, len(tasks), together)]
+    return [found for batch in track(batches, words) for found in results(batch)]

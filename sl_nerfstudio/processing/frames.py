@@ -1,0 +1,380 @@
+"""The frame stage: every capture decoded and calibrated by itself, in several processes."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import connection, get_context, resource_tracker
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray
+
+from sl_nerfstudio.calibration.stated import StatedSigma
+from sl_nerfstudio.console import track
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder, DecodingError
+from sl_nerfstudio.decoding.grid import NetworkDecoder
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.matching.lines import pixels_a_period
+from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
+from sl_nerfstudio.parallel import cores, one_library_thread, only_one_library_thread
+from sl_nerfstudio.processing.cache import StageStore, surroundings
+from sl_nerfstudio.processing.captures import CapturedFrame, Captures
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.masks import UserMasks
+from sl_nerfstudio.processing.records import DecodedStore, LargeClouds, Manifest, digest
+from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
+from sl_nerfstudio.relative_pose.estimation import (
+    RelativePose,
+    RelativePoseError,
+    estimate_relative_pose,
+    relative_pose_near,
+)
+from sl_nerfstudio.scan.document import FileError
+from sl_nerfstudio.scan.images import as_grey, read_photograph
+from sl_nerfstudio.storage import memory_of_process
+
+# Decoded frames matched along the epipolar lines of their relative poses, kept in the work folder.
+
+_KEY_LENGTH = 24
+
+
+class FrameMatcher:
+    """Matches the frames of one decoder; of those that read more than one image of a frame, none."""
+
+    def __init__(self, decoder: Decoder[Any], store: DecodedStore) -> None:
+        self._decoder = decoder if isinstance(decoder, NetworkDecoder) else None
+        self._matcher = None if self._decoder is None else LineMatcher(self._decoder.layout)
+        self._store = store
+
+    def matched(
+        self, frame: CapturedFrame, key: str, decoded: Decoded, devices: tuple[Device, Device], pose: RelativePose
+    ) -> tuple[str, Decoded] | None:
+        """Key and maps of a frame that was decoded under `key`; None where it is left as it is.
+
+        So are frames that several poses explain: coordinates must not be changed for one of them. Raises FileError if
+        the image cannot be read.
+        """
+        if self._decoder is None or self._matcher is None or pose.alternatives:
+            return None
+        new = digest((surroundings(), key, devices, pose.T_camera_projector))[:_KEY_LENGTH]
+        kept = self._store.load(frame, new)
+        if kept is not None:
+            return new, kept
+        grey = as_grey(read_photograph(frame.images[0]))
+        image = DecodedImage(grey, decoded.coords, decoded.mask)
+        coords = self._matcher.match(image, *devices, pose.T_camera_projector)
+        size = pixels_a_period(decoded.coords, self._decoder.layout.period)
+        if coords is decoded.coords or size is None:
+            return None
+        return new, self._store.save(frame, new, self._decoder.images.decoded(grey, coords, decoded.mask, size))
+
+
+# One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation.
+
+
+@dataclass(frozen=True)
+class FrameJob:
+    """What decoding and calibrating a frame needs, the same for every frame."""
+
+    work: Path  # folder of the decoded frames
+    decoder: Decoder[Any]
+    camera: Device
+    projector: Device
+    seed: int
+    masks: UserMasks | None = None  # of the user
+    cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
+    stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
+    projector_known: bool = True  # False: frames are only decoded, until the projector has been found
+    camera_known: bool = True  # False: nothing is matched along epipolar lines, until the camera has been found
+
+    def camera_of(self, frame: CapturedFrame) -> Device:
+        """The camera that took a frame."""
+        return self.cameras.get(frame.camera, self.camera)
+
+
+@dataclass(frozen=True)
+class FrameStageResult:
+    """What the frame stage made of one frame."""
+
+    frame: CapturedFrame
+    key: str = ""  # of the decoded frame in the store; "" if it was not decoded
+    resumed: bool = False  # it had been decoded by an earlier run
+    decode_rate: float = 0.0  # decoded pixels of those in the mask
+    mask_share: float = 0.0  # of the image
+    cloud: FrameCloud | None = None  # None: the frame is left out
+    stage: str = ""  # in which the frame failed: "reading", "decoding", "calibrating"; "" if it did not
+    reason: str = ""  # problem, cause and remedy, with the file they are about
+    matched: str = ""  # key of the frame matched along epipolar lines in the store; "" if it was not matched
+
+    @property
+    def name(self) -> str:
+        """The frame's name."""
+        return self.frame.name
+
+
+def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
+    """The clouds of all frames that are not left out."""
+    return [result.cloud for result in results if result.cloud is not None]
+
+
+def with_clouds(results: Sequence[FrameStageResult], clouds: Sequence[FrameCloud]) -> list[FrameStageResult]:
+    """The results with other clouds of the same frames, in the order of `clouds_of`."""
+    found = iter(clouds)
+    return [result if result.cloud is None else replace(result, cloud=next(found)) for result in results]
+
+
+def with_kept_cloud(result: FrameStageResult, clouds: LargeClouds) -> FrameStageResult:
+    """A frame whose cloud, if it has one, is where there is room for it."""
+    return result if result.cloud is None else replace(result, cloud=clouds.kept(result.cloud))
+
+
+class FrameWorker:
+    """Decodes and calibrates frames one after the other."""
+
+    def __init__(self, job: FrameJob) -> None:
+        self._job = job
+        self._store = DecodedStore(job.work, job.decoder.key)
+        self._stages = StageStore(job.work)
+        self._matcher = FrameMatcher(job.decoder, self._store)
+
+    def __call__(self, frame: CapturedFrame) -> FrameStageResult:
+        """Decode (or load) and calibrate a frame. A frame that fails is left out, with its reason."""
+        try:
+            key = self._store.key(frame)
+            decoded = self._store.load(frame, key)
+            resumed = decoded is not None
+            if decoded is None:
+                decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
+            selected = self._selected(frame.name, decoded)
+        except FileError as error:
+            return FrameStageResult(frame, stage="reading", reason=str(error))
+        except DecodingError as error:
+            return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
+        share = float(selected.mask.mean())
+        result = FrameStageResult(frame, key, resumed, selected.rate, share)
+        return self._calibrated(result, decoded) if self._job.projector_known else result
+
+    def calibrate(self, result: FrameStageResult) -> FrameStageResult:
+        """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
+        return self._calibrated(result, self._stored(result, result.key))
+
+    def load(self, result: FrameStageResult) -> Decoded:
+        """The maps of a frame, matched if it was, whichever worker stored them. Raises UserError if there are none."""
+        return self.load_with_seen(result)[0]
+
+    def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
+        """The same, and where the camera saw the pattern, whatever the user's mask selects."""
+        stored = self._stored(result, result.matched or result.key)
+        return self._selected(result.name, stored), stored.mask
+
+    def _calibrated(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
+        job, camera = self._job, self._job.camera_of(result.frame)
+        selected = self._selected(result.name, decoded)
+        seen = decoded.mask  # also where the user's mask selects nothing
+        try:
+            pose = self._pose(result, selected)
+            devices = camera, job.projector
+            found = (
+                self._matcher.matched(result.frame, result.key, decoded, devices, pose) if job.camera_known else None
+            )
+            result = replace(result, matched="")
+            if found is not None:
+                selected, seen = self._selected(result.name, found[1]), found[1].mask
+                share = float(selected.mask.mean())
+                result = replace(result, matched=found[0], decode_rate=selected.rate, mask_share=share)
+                pose = self._pose_near(pose, result, selected)
+            cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light, seen=seen)
+        except FileError as error:
+            return replace(result, cloud=None, stage="reading", reason=str(error))
+        except DecodingError as error:  # nothing that was matched is inside the user's mask
+            return replace(result, cloud=None, stage="decoding", reason=self._with_file(result.frame, error))
+        except RelativePoseError as error:
+            return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
+        return replace(result, cloud=cloud)
+
+    def _pose(self, result: FrameStageResult, decoded: Decoded) -> RelativePose:
+        """From all coordinates, or as an earlier run found it."""
+        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+        return self._stages.kept(
+            f"calibration {result.name}",
+            (coords, camera, job.projector, job.seed),
+            lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
+        )
+
+    def _pose_near(self, start: RelativePose, result: FrameStageResult, decoded: Decoded) -> RelativePose:
+        """From the coordinates that were matched with the pose `start`, beside which there is no other."""
+        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+        T = start.T_camera_projector
+        return self._stages.kept(
+            f"calibration {result.name}",
+            (coords, camera, job.projector, job.seed, T),
+            lambda: relative_pose_near(T, *correspondences_of(coords), camera, job.projector, job.seed),
+        )
+
+    def _stored(self, result: FrameStageResult, key: str) -> Decoded:
+        decoded = self._store.load(result.frame, key)
+        if decoded is None:
+            raise UserError(
+                f"{self._job.work}: the decoded frame {result.name} is missing\n"
+                "    cause:  files were removed while sl-process was running\n    remedy: start again"
+            )
+        return decoded
+
+    def _selected(self, name: str, decoded: Decoded) -> Decoded:
+        """What the user's mask of a frame selects; without masks, everything."""
+        return decoded if self._job.masks is None else self._job.masks.applied(name, decoded)
+
+    def _with_file(self, frame: CapturedFrame, error: UserError) -> str:
+        """The error with the file it is about: the image, or the folder of a sequence."""
+        path = frame.images[0].parent if self._job.decoder.sequence else frame.images[0]
+        return f"{path}: {error}"
+
+
+# Worker processes that end with their parent, whatever ends it, and leave control-C to it.
+
+_EXIT_ORPHANED = 1
+_PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each of its pixels
+_MAIN_PROCESS = 1.0e9  # bytes of the process that collects the results, without the clouds that it may keep
+_FOR_PROCESSES = 0.85  # share of the memory that is left to the processes
+
+
+def default_processes(pixels: int, memory: int) -> int:
+    """One for each core, but not more than `memory` (bytes) is enough for; `pixels` of the largest photograph."""
+    room = _FOR_PROCESSES * memory - _MAIN_PROCESS
+    return max(1, min(cores(), int(room / (_PROCESS + _PIXEL * pixels))))
+
+
+@contextmanager
+def worker_pool(workers: int, initialise: Callable[..., None], *arguments: object) -> Iterator[ProcessPoolExecutor]:
+    """A pool of new processes, each of which calls `initialise` first; work must be submitted under `no_interrupts`.
+
+    An exception in the block, control-C among them, ends the workers at once, whatever they are doing.
+    """
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (initialise, *arguments))
+    try:
+        yield pool
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def no_interrupts() -> Iterator[None]:
+    """Processes started in the block never see control-C: the terminal sends it to them, too, and each would print."""
+    resource_tracker.ensure_running()  # when it starts by itself, it lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start(initialise: Callable[..., None], *arguments: object) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    initialise(*arguments)
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the parent: the pipe to it, which only it holds, is then closed by the kernel."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(_EXIT_ORPHANED)
+
+
+def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
+    """Results of all frames, in the order of the captures; the manifest in the work folder is kept up to date."""
+    found: dict[str, FrameStageResult] = {
+        frame.name: FrameStageResult(frame, stage="reading", reason=str(captures.faults[frame.name]))
+        for frame in captures.frames
+        if frame.name in captures.faults
+    }
+    todo = [frame for frame in captures.frames if frame.name not in found]
+    settings = {"decoder": job.decoder.name, "pattern": str(config.pattern), "images": str(config.images)}
+    if job.masks is not None:
+        settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
+    manifest = Manifest(job.work, settings)
+    largest = max((w * h for w, h in captures.sizes.values()), default=0)
+    jobs, clouds = config.jobs or default_processes(largest, memory_of_process()), LargeClouds()
+    with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
+        for result in track(ready, "decoding and calibrating", len(todo)):
+            found[result.name] = with_kept_cloud(result, clouds)
+            done = "decoded before" if result.resumed else "decoded"
+            status = f"failed in {result.stage}" if result.stage else done
+            manifest.note(result.name, result.matched or result.key, status, result.reason)
+    return [found[frame.name] for frame in captures.frames]
+
+
+def run_frame_stage_again(
+    config: ProcessConfig, job: FrameJob, captures: Captures, before: Sequence[FrameStageResult]
+) -> list[FrameStageResult]:
+    """The same with another job, for frames that this run has decoded."""
+    resumed = {result.name: result.resumed for result in before}
+    return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
+
+
+def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:
+    """One line: how many frames can be used, and how good they are."""
+    resumed = sum(result.resumed for result in results)
+    again = f" ({resumed} had been decoded before)" if resumed else ""
+    clouds = clouds_of(results)
+    begin = f"decoded and calibrated {len(clouds)} of {len(results)} frames{again}"
+    if not clouds:
+        return begin
+    rate = float(np.median([result.decode_rate for result in results if result.cloud is not None]))
+    epipolar = float(np.median([cloud.pose.residual_px for cloud in clouds]))
+    return f"{begin}: {rate:.0%} of the pattern, epipolar residual {epipolar:.2f} px (medians)"
+
+
+def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Generator[FrameStageResult, None, None]:
+    """Results in the order in which they are ready, from `jobs` processes (1: this one).
+
+    Raises UserError if a process was killed.
+    """
+    if jobs == 1 or len(frames) < 2:
+        worker = FrameWorker(job)
+        for frame in frames:
+            with one_library_thread():  # as in worker processes: sums over several threads differ in the last digit
+                result = worker(frame)
+            yield result
+        return
+    try:
+        with worker_pool(min(jobs, len(frames)), _start_worker, job) as pool:
+            with no_interrupts():  # a future keeps its result: of those that are done, none may be kept
+                ready = as_completed([pool.submit(_work, frame) for frame in frames])
+            for future in ready:
+                yield future.result()
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a process that decoded frames was killed\n    cause:  {jobs} processes need more memory than there is\n"
+            "    remedy: give a smaller number with --jobs; frames decoded so far are kept"
+        ) from error
+
+
+_worker: FrameWorker | None = None  # of a worker process
+
+
+def _start_worker(job: FrameJob) -> None:
+    global _worker
+    only_one_library_thread()
+    _worker = FrameWorker(job)
+
+
+def _work(frame: CapturedFrame) -> FrameStageResult:
+    if _worker is None:
+        raise RuntimeError("a worker process was not set up")
+    return _worker(frame)

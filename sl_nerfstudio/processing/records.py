@@ -1,0 +1,203 @@
+"""Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code."""
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float16, Float32, UInt16
+from numpy import ndarray
+
+from sl_nerfstudio.decoding.decoder import Decoded
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.processing.captures import CapturedFrame
+from sl_nerfstudio.registration.surfaces import FrameCloud
+from sl_nerfstudio.relative_pose.estimation import Degeneracy, RelativePose
+from sl_nerfstudio.scan.document import read_bytes
+from sl_nerfstudio.scan.write import encode_json
+from sl_nerfstudio.storage import in_file, largest_in_memory, read_checked, write_atomic, write_checked
+
+# Decoded frames that are kept between runs: only changed images, patterns or decoders need decoding again.
+
+_KEY_LENGTH = 24
+MANIFEST = "manifest.json"
+DECODED = "decoded"
+
+
+class DecodedStore:
+    """A folder of decoded frames; the name of each file contains a digest of what it was decoded from."""
+
+    def __init__(self, root: Path, decoder_key: str) -> None:
+        self.root = root
+        self._decoder_key = decoder_key
+
+    def key(self, frame: CapturedFrame) -> str:
+        """Digest of the images' contents and of the decoder. Raises FileError if an image cannot be read."""
+        digest = hashlib.sha256(self._decoder_key.encode())
+        for path in frame.images:
+            digest.update(hashlib.sha256(read_bytes(path)).digest())
+        return digest.hexdigest()[:_KEY_LENGTH]
+
+    def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
+        """A frame that was decoded before; None if there is none, or if its file is damaged."""
+        content = read_checked(self._path(frame, key))
+        if content is None:
+            return None
+        try:
+            with np.load(BytesIO(content), allow_pickle=False) as stored:
+                coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
+                light = stored.get("light")
+        except (ValueError, KeyError, EOFError, BadZipFile):
+            return None
+        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
+            return None
+        if light is not None and light.shape != mask.shape:
+            return None
+        return _restored(coords, mask, pattern, light)
+
+    def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
+        """Store a frame, and return it as `load` will, so that a resumed run gives the same result."""
+        buffer = BytesIO()
+        pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
+        light = None if decoded.light is None else decoded.light.astype(np.float16)
+        more = {} if light is None else {"light": light}
+        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern, **more)
+        write_checked(self._path(frame, key), buffer.getvalue())
+        return _restored(decoded.coords, decoded.mask, pattern, light)
+
+    def _path(self, frame: CapturedFrame, key: str) -> Path:
+        return self.root / DECODED / f"{frame.name}-{key}.npz"
+
+
+def _restored(
+    coords: Float32[ndarray, "h w 2"],
+    mask: Bool[ndarray, "h w"],
+    pattern: UInt16[ndarray, "h w"],
+    light: Float16[ndarray, "h w"] | None,
+) -> Decoded:
+    """What was decoded, with intensities as exact as they are stored."""
+    values = pattern.astype(np.float32) / np.float32(65535)
+    return Decoded(coords, mask, values, None if light is None else light.astype(np.float32))
+
+
+class Manifest:
+    """What happened to each frame, in words, in the folder of the decoded frames; written after every frame."""
+
+    def __init__(self, root: Path, settings: dict[str, Any]) -> None:
+        self._path = root / MANIFEST
+        self._settings = settings
+        self._frames = self._known()
+
+    def note(self, frame: str, key: str, status: str, reason: str = "") -> None:
+        """Note what happened to a frame."""
+        self._frames[frame] = {"key": key, "status": status, **({"reason": reason} if reason else {})}
+        write_atomic(self._path, encode_json({"settings": self._settings, "frames": self._frames}))
+
+    def _known(self) -> dict[str, Any]:
+        """The notes of an earlier run; none if there are none that can be read."""
+        try:
+            frames = json.loads(self._path.read_text(encoding="utf-8"))["frames"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return {}
+        return dict(frames) if isinstance(frames, dict) else {}
+
+
+T = TypeVar("T")
+_TREE = "tree"  # name of the archive's member that is no array
+
+
+def encode(value: object) -> bytes:
+    """Dataclasses, tuples, lists, arrays, tensors, numbers and texts as an archive. Raises TypeError for others."""
+    arrays: list[ndarray] = []
+    tree = json.dumps(_flat(value, arrays))
+    buffer = BytesIO()
+    members = {f"array{k}": array for k, array in enumerate(arrays)}
+    np.savez_compressed(buffer, **{_TREE: np.frombuffer(tree.encode(), np.uint8)}, **members)
+    return buffer.getvalue()
+
+
+def decode(content: bytes, classes: Sequence[type]) -> Any:
+    """The value that was encoded; its dataclasses must be among `classes`. Raises KeyError for another one."""
+    with np.load(BytesIO(content), allow_pickle=False) as archive:
+        tree = json.loads(archive[_TREE].tobytes())
+        arrays = [archive[f"array{k}"] for k in range(len(archive.files) - 1)]
+    return _built(tree, arrays, {kind.__name__: kind for kind in classes})
+
+
+def with_arrays(value: T, classes: Sequence[type], change: Callable[[Sequence[ndarray]], Sequence[ndarray]]) -> T:
+    """The same value with other arrays in place of its own; `classes` as for `decode`."""
+    arrays: list[ndarray] = []
+    tree = _flat(value, arrays)
+    return _built(tree, change(arrays), {kind.__name__: kind for kind in classes})
+
+
+def digest(value: object) -> str:
+    """A text that is equal for equal values only."""
+    arrays: list[ndarray] = []
+    found = hashlib.sha256(json.dumps(_flat(value, arrays)).encode())
+    for array in arrays:
+        found.update(f"{array.dtype.str} {array.shape} ".encode())
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
+
+
+def _flat(value: Any, arrays: list[ndarray]) -> Any:
+    """JSON for a value; its arrays are added to `arrays`, and their numbers stand for them."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, ndarray | torch.Tensor):
+        arrays.append(value if isinstance(value, ndarray) else value.detach().cpu().numpy())
+        return {"array" if isinstance(value, ndarray) else "tensor": len(arrays) - 1}
+    if isinstance(value, tuple | list):
+        kind = "tuple" if isinstance(value, tuple) else "list"
+        return {kind: [_flat(item, arrays) for item in value]}
+    if is_dataclass(value) and not isinstance(value, type):
+        content = {field.name: _flat(getattr(value, field.name), arrays) for field in fields(value)}
+        return {"class": type(value).__name__, "fields": content}
+    raise TypeError(f"a {type(value).__name__} cannot be kept")
+
+
+def _built(tree: Any, arrays: Sequence[ndarray], classes: dict[str, type]) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    if "class" in tree:
+        kind = classes[tree["class"]]
+        return kind(**{name: _built(item, arrays, classes) for name, item in tree["fields"].items()})
+    ((kind, content),) = tree.items()
+    if kind in ("tuple", "list"):
+        items = [_built(item, arrays, classes) for item in content]
+        return tuple(items) if kind == "tuple" else items
+    return torch.from_numpy(arrays[content]) if kind == "tensor" else arrays[content]
+
+
+# Clouds of many frames: beyond a share of the memory their arrays are in temporary files, mapped into memory.
+
+_CLASSES = (FrameCloud, RelativePose, Degeneracy, Device)
+
+
+class LargeClouds:
+    """Takes clouds, also from several threads. Files are gone with the process, whatever ends it."""
+
+    def __init__(self, most_bytes: int | None = None) -> None:
+        """`most_bytes` of clouds stay in memory; default: a share of it."""
+        self._left = largest_in_memory() if most_bytes is None else most_bytes
+        self._counting = threading.Lock()
+
+    def kept(self, cloud: FrameCloud) -> FrameCloud:
+        """An equal cloud. Raises UserError if there is no space for the file."""
+        return with_arrays(cloud, _CLASSES, self._arrays)
+
+    def _arrays(self, arrays: Sequence[ndarray]) -> Sequence[ndarray]:
+        with self._counting:
+            self._left -= sum(array.nbytes for array in arrays)
+            fits = self._left >= 0
+        return arrays if fits else in_file(arrays)

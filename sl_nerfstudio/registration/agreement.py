@@ -1,0 +1,366 @@
+"""How well the surfaces of two frames agree under a similarity, and how to improve it: sums over looked-up points.
+
+Points of one frame are projected into the other's camera and compared with the tangent plane of the surface seen
+there, both ways. Unlike nearest neighbours this also finds contradictions: a point in front of a surface that the other
+camera saw would have hidden that surface.
+
+A similarity maps the source's points to the target's axes. Increments (v, w, l) act there, about the target's centroid
+c: `p <- c + exp(l) exp(w) (p - c) + v`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.devices import pixel_of
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.parallel import compiled, compiled_range, compiled_sums
+from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
+from sl_nerfstudio.registration.surfaces import SurfaceMap
+
+# The compiled loops of `surface_agreement`.
+#
+# Most of the time that registration takes is spent here. So each step does one thing for all points, without
+# branches
+# that a processor would have to guess: they are mapped (several at once), then looked up, then compared, then
+# summed up;
+# of those that are still of interest, the numbers are kept.
+
+_kernel_weight = compiled(geman_mcclure_weight)
+_kernel_cost = compiled(geman_mcclure_cost)
+
+
+@compiled_range
+def agreement_sums(
+    first, last, points, sigma, scale, R, t, reverse, plane, valid, code, camera, c, tolerances, least_facing, cutoff,
+    empty, light, least_lit, H, g, counts
+):  # fmt: skip
+    """Adds to H, g and counts (agreeing, in front, behind, squares, cost, absent); `reverse`: points are the target's.
+
+    `points` are (6, n): points and normals. For every similarity, they are compared with the other frame's surface.
+    """
+    h, w = valid.shape
+    n = points.shape[1]
+    mapped, place, some, rows = np.empty((6, n)), np.empty(n), np.empty(n, np.int64), np.empty((9, n))
+    flat_plane, flat_valid = plane.reshape(h * w, 5), valid.reshape(h * w)
+    M, shift, turn = np.empty((3, 3)), np.empty(3), np.eye(3)
+    for k in range(first, last):
+        s = scale[k]
+        M[:] = R[k].T if reverse else R[k]
+        for i in range(3):
+            shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
+        _map(points, M, 1 / s if reverse else s, shift, code, camera, h, w, mapped, place)
+        counts[k, 5] += _absent(mapped, place, empty.reshape(h * w), light, least_lit)
+        count = _on_surface(place, flat_valid, some)
+        scales = (1.0, s, s) if reverse else (s, 1.0, 1.0)  # of sigma, of the surface's sigma and of distances
+        count = _compare(
+            mapped, sigma, place, flat_plane, scales, tolerances, least_facing, cutoff, some, count, rows, counts[k]
+        )
+        if reverse:  # the normal, in the target's axes and against the motion of the source
+            turn[:] = -R[k]
+        _derive(points if reverse else mapped, turn, c, some, count, rows)
+        _add_normal_equations(rows, count, H[k], g[k])
+
+
+@compiled
+def _map(points, M, scale, shift, code, camera, h, w, mapped, place):
+    """Points and normals in the other frame's axes, and their place in its map; -1 where it cannot see them."""
+    # Numbers of their own: an array might be the one that is written to, as far as the compiler knows.
+    r00, r01, r02 = M[0, 0], M[0, 1], M[0, 2]
+    r10, r11, r12 = M[1, 0], M[1, 1], M[1, 2]
+    r20, r21, r22 = M[2, 0], M[2, 1], M[2, 2]
+    tx, ty, tz = shift[0], shift[1], shift[2]
+    for n in range(points.shape[1]):
+        x, y, z, a, b, d = points[0, n], points[1, n], points[2, n], points[3, n], points[4, n], points[5, n]
+        X = scale * (r00 * x + r01 * y + r02 * z) + tx
+        Y = scale * (r10 * x + r11 * y + r12 * z) + ty
+        Z = scale * (r20 * x + r21 * y + r22 * z) + tz
+        A = r00 * a + r01 * b + r02 * d
+        B = r10 * a + r11 * b + r12 * d
+        C = r20 * a + r21 * b + r22 * d
+        mapped[0, n], mapped[1, n], mapped[2, n] = X, Y, Z
+        mapped[3, n], mapped[4, n], mapped[5, n] = A, B, C
+        column, row, in_front = pixel_of(code, X, Y, Z, camera)
+        towards = A * X + B * Y + C * Z <= 0
+        seen = towards & in_front & (column >= 0) & (row >= 0) & (column < w) & (row < h)
+        place[n] = np.floor(row) * w + np.floor(column) if seen else -1.0
+
+
+@compiled
+def _on_surface(place, valid, some):
+    """Puts the indices of points whose place has a surface into `some`, and returns how many they are."""
+    seen = 0
+    for n in range(len(place)):
+        some[seen] = n
+        seen += place[n] >= 0
+    count = 0
+    for m in range(seen):
+        n = some[m]
+        some[count] = n
+        count += valid[int(place[n])]
+    return count
+
+
+@compiled
+def _absent(mapped, place, empty, light, least_cosine):
+    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
+    code, projector, T, reach = light
+    h, w = reach.shape
+    count = 0
+    for n in range(len(place)):
+        if place[n] < 0 or not empty[int(place[n])]:
+            continue
+        x, y, z, a, b, c = mapped[0, n], mapped[1, n], mapped[2, n], mapped[3, n], mapped[4, n], mapped[5, n]
+        if -(a * x + b * y + c * z) < least_cosine * np.sqrt(x * x + y * y + z * z):
+            continue
+        X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        A = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
+        B = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
+        C = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+        distance = np.sqrt(X * X + Y * Y + Z * Z)
+        if least_cosine * distance > -(A * X + B * Y + C * Z):
+            continue
+        column, row, in_front = pixel_of(code, X, Y, Z, projector)
+        if in_front and column >= 0 and row >= 0 and column < w and row < h:
+            count += distance < reach[int(row), int(column)]
+    return count
+
+
+@compiled
+def _compare(mapped, sigma, place, plane, scales, tolerances, least_facing, cutoff, some, count, rows, counts):
+    """Adds to the counts; leaves in `some` the points that move the alignment, returns how many they are.
+
+    Their normals are put into the first three of `rows`, weights and distances into the last two.
+    """
+    used, agreeing, ahead, behind, squares, cost = 0, 0, 0, 0, 0.0, 0.0
+    for m in range(count):
+        n = some[m]
+        at = int(place[n])
+        na, nb, nc = plane[at, 0], plane[at, 1], plane[at, 2]
+        r = scales[2] * (na * mapped[0, n] + nb * mapped[1, n] + nc * mapped[2, n] - plane[at, 3])
+        spread = np.sqrt((scales[0] * sigma[n]) ** 2 + (scales[1] * plane[at, 4]) ** 2)
+        tau, width = max(tolerances[0], tolerances[3] * spread), max(tolerances[1], tolerances[4] * spread)
+        facing = na * mapped[3, n] + nb * mapped[4, n] + nc * mapped[5, n]
+        agrees = (abs(r) < tau) & (facing > least_facing)
+        in_front = (r > tau) & ~agrees
+        judged = r > -tolerances[2]
+        agreeing += agrees
+        ahead += in_front
+        behind += judged & ~agrees & ~in_front
+        squares += (r / spread) ** 2 if agrees else 0.0
+        x = (r / width) ** 2
+        cost += _kernel_cost(x) if judged else 0.0
+        rows[0, used], rows[1, used], rows[2, used] = na, nb, nc
+        rows[7, used], rows[8, used] = _kernel_weight(x) * facing, r
+        some[used] = n
+        used += (facing >= least_facing) & (abs(r) <= cutoff * width)
+    counts[0] += agreeing
+    counts[1] += ahead
+    counts[2] += behind
+    counts[3] += squares
+    counts[4] += cost
+    return used
+
+
+@compiled
+def _derive(points, turn, c, some, count, rows):
+    """Derivatives of the distances by the increment, into the first seven of `rows`; `turn` turns the normals."""
+    for m in range(count):
+        n = some[m]
+        na, nb, nc = rows[0, m], rows[1, m], rows[2, m]
+        a = turn[0, 0] * na + turn[0, 1] * nb + turn[0, 2] * nc
+        b = turn[1, 0] * na + turn[1, 1] * nb + turn[1, 2] * nc
+        d = turn[2, 0] * na + turn[2, 1] * nb + turn[2, 2] * nc
+        X, Y, Z = points[0, n] - c[0], points[1, n] - c[1], points[2, n] - c[2]
+        rows[0, m], rows[1, m], rows[2, m] = a, b, d
+        rows[3, m], rows[4, m], rows[5, m] = Y * d - Z * b, Z * a - X * d, X * b - Y * a
+        rows[6, m] = a * X + b * Y + d * Z
+
+
+@compiled_sums
+def _add_normal_equations(rows, count, H, g):
+    """Of derivatives, weights and distances."""
+    for i in range(7):
+        total = 0.0
+        for n in range(count):
+            total += rows[7, n] * rows[i, n] * rows[8, n]
+        g[i] += total
+        for j in range(i + 1):
+            total = 0.0
+            for n in range(count):
+                total += rows[7, n] * rows[i, n] * rows[j, n]
+            H[i, j] += total
+    for i in range(7):
+        for j in range(i):
+            H[j, i] = H[i, j]
+
+
+# Several similarities between two frames at once, as arrays.
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Similarities `p_target = scale R p_source + t`."""
+
+    scale: Float64[ndarray, "k"]
+    R: Float64[ndarray, "k 3 3"]
+    t: Float64[ndarray, "k 3"]
+    log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
+
+    @staticmethod
+    def of(S: Similarity) -> "Hypotheses":
+        """One similarity alone."""
+        return Hypotheses(np.array([S.scale]), S.R[None], S.t[None], np.log([S.scale]))
+
+    @staticmethod
+    def joined(parts: Sequence["Hypotheses"]) -> "Hypotheses":
+        """Several sets as one."""
+        return Hypotheses(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Hypotheses)))
+
+    def __len__(self) -> int:
+        """Number of similarities."""
+        return len(self.scale)
+
+    def __getitem__(self, index: list[int]) -> "Hypotheses":
+        """Some of them."""
+        return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
+
+    def incremented(
+        self, v: Float64[ndarray, "k 3"], w: Float64[ndarray, "k 3"], growth: Float64[ndarray, "k"],
+        centre: Float64[ndarray, "3"],
+    ) -> "Hypotheses":  # fmt: skip
+        """Each followed by `p <- centre + growth exp(w) (p - centre) + v`."""
+        turn = Rotation.from_rotvec(w).as_matrix()
+        t = centre + growth[:, None] * np.einsum("kij,kj->ki", turn, self.t - centre) + v
+        return Hypotheses(self.scale * growth, turn @ self.R, t, self.log_scale_prior)
+
+    def similarity(self, k: int) -> Similarity:
+        """One of them."""
+        return Similarity(float(self.scale[k]), self.R[k], self.t[k])
+
+    def difference(self, a: int, b: int, centre: Float64[ndarray, "3"]) -> tuple[float, float]:
+        """Angle between two of them, in degrees, and how far apart they map the point that b maps to `centre`."""
+        angle = np.arccos(np.clip((np.trace(self.R[a] @ self.R[b].T) - 1) / 2, -1, 1))
+        p = (self.R[b].T @ (centre - self.t[b])) / self.scale[b]
+        shift = np.linalg.norm(self.scale[a] * self.R[a] @ p + self.t[a] - centre)
+        return float(np.degrees(angle)), float(shift)
+
+
+@dataclass(frozen=True)
+class Side:
+    """One frame of a pair: its map, and some of its points with normals."""
+
+    map: SurfaceMap
+    points: Float64[ndarray, "n 3"]
+    normals: Float64[ndarray, "n 3"]
+    sigma: Float64[ndarray, "n"]  # along the normals
+
+    @cached_property
+    def rows(self) -> Float64[ndarray, "6 n"]:
+        """Points and normals, for compiled loops."""
+        return np.ascontiguousarray(np.concatenate([self.points, self.normals], 1).T)
+
+    @staticmethod
+    def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
+        """With about `count` points spread evenly over the image."""
+        return Side(surface, *surface.sample(count, rng))
+
+    def thinned(self, most: int) -> "Side":
+        """With every n-th of its points, at most about `most`."""
+        some = slice(None, None, max(1, len(self.points) // most))
+        return Side(self.map, *(np.ascontiguousarray(part[some]) for part in (self.points, self.normals, self.sigma)))
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """A distance between two surfaces: the larger of a length and a multiple of their standard deviation."""
+
+    radii: float  # of the target's points
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Sums for each of k similarities; distances in units of the target's baseline."""
+
+    H: Float64[ndarray, "k 7 7"]  # of robustly weighted point-to-plane distances
+    g: Float64[ndarray, "k 7"]
+    agreeing: Float64[ndarray, "k"]  # fraction of the points that lie on the other surface
+    in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
+    behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
+    squares: Float64[ndarray, "k"]  # mean squared distance of those that agree, in units of its variance
+    absent: Float64[ndarray, "k"]  # fraction that would be seen and lit where the other camera saw nothing
+    cost: Float64[ndarray, "k"]  # mean robust cost of the points that could be judged: 0 exact, 1 far beyond the kernel
+
+    @property
+    def fitness(self) -> Float64[ndarray, "k"]:
+        """Of the points that could be judged, or should be seen and are not, the fraction that agree."""
+        return self.agreeing / self.expected.clip(1e-9)
+
+    @property
+    def judged(self) -> Float64[ndarray, "k"]:
+        """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
+        return self.agreeing + self.in_front + self.behind
+
+    @property
+    def expected(self) -> Float64[ndarray, "k"]:
+        """Fraction of the points that the other camera should have seen: what could be judged, and absent ones."""
+        return self.judged + self.absent
+
+    def contradicting(self, behind: float) -> Float64[ndarray, "k"]:
+        """Fraction that contradicts, of which points behind count as `behind`."""
+        return self.in_front + self.absent + behind * self.behind
+
+    def score(self, penalty: float, behind: float) -> Float64[ndarray, "k"]:
+        """Points that agree less `penalty` times those that contradict, of which points behind count as `behind`."""
+        return self.agreeing - penalty * self.contradicting(behind)
+
+
+def agreement(
+    source: Side,
+    target: Side,
+    hypotheses: Hypotheses,
+    tolerance: Tolerance,
+    width: Tolerance,
+    settings: AgreementSettings = REGISTRATION_DEFAULTS.pair.agreement,
+) -> Agreement:
+    """Both ways, for k similarities `p_target = scale R p_source + t`.
+
+    `tolerance` is the distance within which points agree, `width` that of the robust kernel.
+    """
+    k, radius = len(hypotheses), target.map.radius
+    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 6))
+    tolerances = np.array([tolerance.radii * radius, width.radii * radius, settings.hidden_depth * radius,
+                           tolerance.sigmas, width.sigmas])  # fmt: skip
+    scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
+    for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
+        m = seen.map
+        agreement_sums(
+            len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid, m.model_code,
+            m.parameters, target.map.centroid, tolerances, settings.least_facing_cosine, settings.kernel_cutoff,
+            m.nothing.empty, m.nothing.light, settings.least_lit_cosine, H, g, counts[reverse],
+        )  # fmt: skip
+    shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
+    squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
+    cost = counts[..., 4].sum(0) / np.maximum(counts[..., :3].sum((0, 2)), 1)
+    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares, shares[:, 5], cost)
+
+
+def agreement_at(
+    maps: tuple[SurfaceMap, SurfaceMap],
+    S_target_source: Similarity,
+    rng: np.random.Generator,
+    tolerance: Tolerance,
+    settings: PairSettings,
+) -> Agreement:
+    """How two frames agree under one similarity."""
+    source, target = (Side.sampled(m, settings.coarse_points, rng) for m in maps)
+    return agreement(source, target, Hypotheses.of(S_target_source), tolerance, tolerance, settings.agreement)

@@ -1,0 +1,574 @@
+"""The surface of a frame as a small image of points and normals, in which points of other frames are looked up."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from numpy import ndarray
+from scipy.ndimage import distance_transform_edt
+
+from sl_nerfstudio.geometry.devices import MODELS, Device, Intrinsics, for_loops
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, nearest_distances, solve_plane
+from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.parallel import compiled_range
+from sl_nerfstudio.registration.settings import (
+    FRAME_CLOUD_DEFAULTS,
+    REGISTRATION_DEFAULTS,
+    EmptyPlaceSettings,
+    FrameCloudSettings,
+    SurfaceMapSettings,
+    ToneSettings,
+)
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
+from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, agreeing_coords
+from sl_nerfstudio.relative_pose.intrinsics import camera_depth_by_pose
+
+# The surface of one frame in camera axes, in units of its own baseline, with the uncertainty of every point.
+
+
+@dataclass(frozen=True)
+class FrameCloud:
+    """Points of one frame in camera axes (looking along -z), baseline one, and the maps they come from."""
+
+    name: str
+    camera: Device
+    projector: Device
+    pose: RelativePose
+    coords: Float32[ndarray, "h w 2"]  # decoded coordinates that agree with the pose; NaN elsewhere
+    uv_camera: Float64[ndarray, "n 2"]  # of the points: `correspondences_of(coords)`
+    points: Float64[ndarray, "n 3"]
+    sigma_noise: Float64[ndarray, "n"]  # along the camera ray, from decoding noise: independent of other cells
+    pose_errors: Float64[ndarray, "n 5"]  # along the camera ray, by one sigma of each principal error of the pose
+    light: Float32[ndarray, "h w"] | None = None  # of the projector that each pixel returns; None: not measured
+    seen: Bool[ndarray, "h w"] | None = None  # where the camera saw the pattern, decoded or not; None: not known
+    alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
+
+    def with_pose(self, projector: Device, pose: RelativePose) -> "FrameCloud":
+        """The same coordinates with another projector, or another pose of it. Raises as `frame_cloud` does."""
+        return frame_cloud(self.name, self.coords, self.camera, projector, pose, light=self.light, seen=self.seen)
+
+    @property
+    def sigma(self) -> Float64[ndarray, "n"]:
+        """One standard deviation along the camera ray, without that of the unknown length of the baseline."""
+        return np.hypot(self.sigma_noise, self.sigma_pose)
+
+    @property
+    def sigma_pose(self) -> Float64[ndarray, "n"]:
+        """Along the camera ray, from the pose's covariance: points err together."""
+        return np.linalg.norm(self.pose_errors, axis=1)
+
+    @property
+    def centroid(self) -> Float64[ndarray, "3"]:
+        """Mean of the points."""
+        return self.points.mean(0)
+
+    @property
+    def radius(self) -> float:
+        """Root mean square distance of the points from their mean."""
+        return float(np.sqrt(((self.points - self.centroid) ** 2).sum(-1).mean()))
+
+
+def frame_cloud(
+    name: str,
+    coords: Float32[ndarray, "h w 2"],
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+    settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
+    light: Float32[ndarray, "h w"] | None = None,
+    seen: Bool[ndarray, "h w"] | None = None,
+) -> FrameCloud:
+    """Triangulate one frame, with each pose that explains it. `coords` are those from which `pose` was found.
+
+    `light` is how much of the projector's light each pixel returns, NaN where that is unknown;
+    `seen` is where the camera saw the pattern.
+
+    Raises RelativePoseError where hardly any point agrees with the pose.
+    """
+    uv_camera, uv_projector = correspondences_of(coords)
+    keep = pose.inliers
+    if keep.sum() < settings.fewest_points:
+        raise RelativePoseError(
+            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {settings.fewest_points})\n"
+            "    cause:  too little of the pattern was decoded\n"
+            "    remedy: capture this view again"
+        )
+    T = torch.from_numpy(pose.T_camera_projector)
+    found = triangulate(
+        Intrinsics.of(camera, torch.float64),
+        torch.eye(4, dtype=torch.float64),
+        torch.from_numpy(uv_camera[keep]),
+        Intrinsics.of(projector, torch.float64),
+        T,
+        torch.from_numpy(uv_projector[keep]),
+    )
+    # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
+    points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
+    return FrameCloud(
+        name,
+        camera,
+        projector,
+        pose,
+        agreeing_coords(coords, camera, projector, pose),
+        uv_camera[keep],
+        points,
+        sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
+        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+        light=light,
+        seen=seen,
+        alternatives=tuple(
+            frame_cloud(name, coords, camera, projector, other, settings, light, seen)
+            for other in pose.alternatives
+            if other.inliers.sum() >= settings.fewest_points
+        ),
+    )
+
+
+def _pose_errors(
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+    pose: RelativePose,
+) -> Float64[ndarray, "n 5"]:
+    """Changes of depth by one sigma of the pose along each principal axis of its covariance."""
+    R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
+    slopes = camera_depth_by_pose(R, t, directions(camera, uv_camera), directions(projector, uv_projector))
+    variance, axes = np.linalg.eigh(pose.covariance)
+    return slopes @ (axes * np.sqrt(variance.clip(0)))
+
+
+def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
+    """What one sigma of each principal error of the pose mostly amounts to: a similarity of the whole surface.
+
+    Increments (v, w, l) about the centroid: `p <- c + exp(l) exp(w) (p - c) + v`, lengths in baselines.
+    """
+    some = slice(None, None, max(1, len(cloud.points) // 500))
+    points = cloud.points[some]
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    moved = ray[:, :, None] * cloud.pose_errors[some, None, :]
+    p = points - cloud.centroid
+    turns = np.cross(np.eye(3), p[:, None, :]).transpose(0, 2, 1)  # columns e_k x p
+    similarity = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns, p[:, :, None]], 2)
+    return np.linalg.lstsq(similarity.reshape(-1, 7), moved.reshape(-1, 5), rcond=None)[0]
+
+
+def reliable_points(
+    cloud: FrameCloud, largest_ratio: float = REGISTRATION_DEFAULTS.surface_map.largest_sigma_ratio
+) -> Bool[ndarray, "n"]:
+    """Points whose uncertainty is not far above the frame's median: those next to an epipole are left out."""
+    sigma = cloud.sigma
+    return sigma < largest_ratio * np.median(sigma)
+
+
+# How much darker or brighter a surface is than around it: prints, grain and dirt, which stay where they are on it.
+#
+# A vase may be turned about its axis without its shape telling. Its tone tells, because hardly any real surface is
+# equally bright everywhere.
+
+
+def surface_tone(
+    light: Float64[ndarray, "h w"],
+    point: Float64[ndarray, "h w 3"],
+    normal: Float64[ndarray, "h w 3"],
+    p_projector: Float64[ndarray, "3"],
+    settings: ToneSettings,
+) -> Float32[ndarray, "h w"]:
+    """Logarithm of the reflectance against its surroundings, NaN where unknown; all vectors in camera axes.
+
+    `light` is what the surface returns of the projector's light, NaN where unknown. It is divided by what arrives there
+    (Lambert's cosine over the squared distance). What functions of the angles to light and camera explain is taken out,
+    because it is light that this view sees, such as gloss, and so is what changes slowly over the image, such as the
+    projector's own fall-off.
+    """
+    ray = p_projector - point
+    distance = np.linalg.norm(ray, axis=-1)
+    to_light = ray / np.maximum(distance, 1e-300)[..., None]
+    to_camera = -point / np.maximum(np.linalg.norm(point, axis=-1, keepdims=True), 1e-300)
+    cosine = (to_light * normal).sum(-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        known = (light > 0) & (cosine > settings.least_cosine) & ((to_camera * normal).sum(-1) > settings.least_cosine)
+        known = _inside(known, settings.border)
+        tone = np.where(known, np.log(light * distance**2 / cosine), np.nan)
+    if known.sum() < settings.fewest_pixels:
+        return np.full(light.shape, np.nan, dtype=np.float32)
+    tone = _cut(tone, settings.largest)
+    tone[known] -= _explained(tone[known], normal[known], to_light[known], to_camera[known], settings)
+    tone = _against_surroundings(tone, settings)
+    return _cut(tone, settings.largest).astype(np.float32)
+
+
+def _inside(known: Bool[ndarray, "h w"], border: int) -> Bool[ndarray, "h w"]:
+    """Without a strip along the border, where the light was measured beside something else."""
+    square = np.ones((2 * border + 1,) * 2, dtype=np.uint8)
+    return cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
+
+
+def _cut(tone: Float64[ndarray, "h w"], largest: float) -> Float64[ndarray, "h w"]:
+    """Less the median, and at most so many robust standard deviations."""
+    if np.isnan(tone).all():
+        return tone
+    centred = tone - np.nanmedian(tone)
+    reach = largest * MAD_TO_SIGMA * float(np.nanmedian(np.abs(centred)))
+    return np.clip(centred, -reach, reach)
+
+
+def _explained(
+    tone: Float64[ndarray, "n"],
+    normal: Float64[ndarray, "n 3"],
+    to_light: Float64[ndarray, "n 3"],
+    to_camera: Float64[ndarray, "n 3"],
+    settings: ToneSettings,
+) -> Float64[ndarray, "n"]:
+    """What the directions of light and camera against the normal explain: a sum of three functions, least squares."""
+    middle = to_light + to_camera
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    angles = (np.degrees(np.arccos((normal * v).sum(-1).clip(-1, 1))) for v in (to_light, to_camera, middle))
+    terms = np.concatenate([_hats(angle, settings.knots_deg) for angle in angles], 1)
+    H = terms.T @ terms + settings.ridge * len(tone) * np.eye(terms.shape[1])
+    return terms @ np.linalg.solve(H, terms.T @ tone)
+
+
+def _hats(angle: Float64[ndarray, "n"], knots: Sequence[float]) -> Float64[ndarray, "n k"]:
+    """Piecewise linear functions of angles, each 1 at its knot and 0 at the others."""
+    number = np.arange(len(knots))
+    return np.maximum(1 - np.abs(np.interp(angle, knots, number)[:, None] - number), 0)
+
+
+def _against_surroundings(tone: Float64[ndarray, "h w"], settings: ToneSettings) -> Float64[ndarray, "h w"]:
+    """The tone less its mean around each place, on the same connected part of the surface."""
+    known = np.isfinite(tone)
+    sigma = settings.window * max(tone.shape)
+    count, label = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
+    out = np.full(tone.shape, np.nan)
+    for number in range(1, count):
+        part: Bool[ndarray, "h w"] = label == number
+        if part.sum() < settings.fewest_pixels:
+            continue
+        weight = part.astype(np.float32)
+        values = np.where(part, tone, 0).astype(np.float32)
+        mean = cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) / np.maximum(
+            cv2.GaussianBlur(weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT), 1e-6
+        )
+        out[part] = tone[part] - mean[part]
+    return out
+
+
+# Where a frame saw nothing of the pattern, although it would have fallen on a surface there.
+#
+# A camera that looks into empty space says as much of an object as one that sees its surface. Two faces of a box
+# agree
+# wherever one lies on the other; but where the larger one ends, the frame of the smaller one saw nothing.
+
+
+@dataclass(frozen=True)
+class EmptyPlaces:
+    """Of one frame; lengths in units of its baseline."""
+
+    empty: Bool[ndarray, "h w"]  # places of the surface map around which the camera saw nothing of the pattern
+    projector: Device  # of the lattice of `reach`: the frame's projector, scaled
+    T_projector_camera: Float64[ndarray, "4 4"]
+    reach: Float64[ndarray, "a b"]  # how far from the projector a surface would be lit: up to what was seen; see below
+
+    @cached_property
+    def light(self) -> tuple[int, Float64[ndarray, "8"], Float64[ndarray, "4 4"], Float64[ndarray, "a b"]]:
+        """The projector, its pose and `reach`, for compiled loops."""
+        return *for_loops(self.projector), self.T_projector_camera, self.reach
+
+
+def find_empty_places(cloud: FrameCloud, camera: Device, settings: EmptyPlaceSettings) -> EmptyPlaces:
+    """Of a frame on the lattice of `camera`; none if it is not known where the frame saw the pattern.
+
+    `reach` is infinite where the camera saw nothing of what the projector lit, and 0 beside the pattern: there, and
+    behind what was seen, a surface may be dark.
+    """
+    T = np.linalg.inv(cloud.pose.T_camera_projector)
+    factor = min(1.0, settings.projector_side / max(cloud.projector.w, cloud.projector.h))
+    projector = cloud.projector.scaled(factor)
+    if cloud.seen is None:
+        nowhere = np.zeros((camera.h, camera.w), dtype=bool)
+        return EmptyPlaces(nowhere, projector, T, np.zeros((projector.h, projector.w)))
+    empty = _empty(cloud.seen, camera, settings.margin)
+    return EmptyPlaces(empty, projector, T, _reach(cloud, projector, T, factor))
+
+
+def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device, margin: float) -> Bool[ndarray, "h w"]:
+    seen = np.zeros((camera.h, camera.w), dtype=bool)
+    factor = max(camera.w, camera.h) / max(pattern_seen.shape)
+    row, column = np.nonzero(pattern_seen)
+    seen[_cell(row + 0.5, factor, camera.h), _cell(column + 0.5, factor, camera.w)] = True
+    around = np.pad(seen, 1, constant_values=True)  # what is beside the image is not known
+    return np.asarray(distance_transform_edt(~around))[1:-1, 1:-1] > margin * max(camera.w, camera.h)
+
+
+def _reach(
+    cloud: FrameCloud, projector: Device, T_projector_camera: Float64[ndarray, "4 4"], factor: float
+) -> Float64[ndarray, "a b"]:
+    uv = correspondences_of(cloud.coords)[1]
+    distance = np.linalg.norm(cloud.points @ T_projector_camera[:3, :3].T + T_projector_camera[:3, 3], axis=1)
+    cells = _cell(uv[:, 1], factor, projector.h), _cell(uv[:, 0], factor, projector.w)
+    reach = nearest_distances(cells, distance, (projector.h, projector.w))
+    reach[[0, -1]] = reach[:, [0, -1]] = 0.0
+    return reach
+
+
+def _cell(place: Float64[ndarray, "n"], factor: float, count: int) -> ndarray:
+    return np.minimum(np.floor(place * factor).astype(np.int64), count - 1)
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A guess of which part of a frame other frames see too, as a start of registration."""
+
+    centre: Float64[ndarray, "3"]  # about the centre of the object, which lies behind what is seen of it
+    size: float  # a length that is about the same in frames that see the same object from about as far
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Points and normals of a frame on a regular lattice of camera pixels; lengths in units of its baseline."""
+
+    camera: Device  # of the map: the frame's camera, scaled
+    point: Float64[ndarray, "h w 3"]  # camera axes
+    plane: Float64[ndarray, "h w 5"]  # see tangent_planes
+    valid: Bool[ndarray, "h w"]
+    tone: Float32[ndarray, "h w"]  # see surface_tone; NaN where unknown
+    nothing: EmptyPlaces
+    weight: Float64[ndarray, "m"]  # of each valid place when places are drawn: large where few look its way
+    centroid: Float64[ndarray, "3"]
+    radius: float  # RMS distance of the points from the centroid
+    views: tuple[FrameView, ...]  # what may be the object that this and other frames see
+
+    @property
+    def normal(self) -> Float64[ndarray, "h w 3"]:
+        """Unit normals, towards the camera."""
+        return self.plane[..., :3]
+
+    @property
+    def sigma(self) -> Float64[ndarray, "h w"]:
+        """One standard deviation of the surface along its normal."""
+        return self.plane[..., 4]
+
+    @property
+    def parameters(self) -> Float64[ndarray, "8"]:
+        """PARAMETERS of the map's camera, for compiled loops."""
+        return self.camera.parameters
+
+    @property
+    def model_code(self) -> int:
+        """Model of the map's camera, for compiled loops."""
+        return MODELS[self.camera.model].code
+
+    def sample(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"], Float64[ndarray, "n"]]:
+        """Points, normals and sigma of `count` places spread over the image and over the surface's orientations.
+
+        A table says little about where a frame is, however much of the image it fills: orientations that are rare count
+        more (normal-space sampling, Rusinkiewicz and Levoy, 3DIM 2001).
+        """
+        index = np.flatnonzero(self.valid)
+        if not len(index):
+            return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+        place = (np.arange(count) + rng.uniform(0, 1)) / count
+        chosen = index[np.searchsorted(np.cumsum(self.weight), place * self.weight.sum()).clip(0, len(index) - 1)]
+        return self.point.reshape(-1, 3)[chosen], self.normal.reshape(-1, 3)[chosen], self.sigma.reshape(-1)[chosen]
+
+
+def tangent_planes(
+    point: Float64[ndarray, "h w 3"], normal: Float64[ndarray, "h w 3"], sigma: Float64[ndarray, "h w"]
+) -> Float64[ndarray, "h w 5"]:
+    """Normal n, n . p and sigma, side by side in memory: all that is asked about a place, found at once."""
+    return np.concatenate([normal, (normal * point).sum(-1, keepdims=True), sigma[..., None]], -1)
+
+
+def build_surface_map(
+    cloud: FrameCloud, settings: SurfaceMapSettings = REGISTRATION_DEFAULTS.surface_map
+) -> SurfaceMap:
+    """Average a cloud on a lattice of camera pixels and fit planes to windows of inverse depth.
+
+    The inverse depth of a plane is linear in the pixel, so steep parts are not biased by the averaging.
+    """
+    factor = min(1.0, settings.largest_side / max(cloud.camera.w, cloud.camera.h))
+    camera = cloud.camera.scaled(factor)
+    keep = reliable_points(cloud, settings.largest_sigma_ratio)
+    column, row = np.floor(cloud.uv_camera[keep] * factor).astype(np.int64).T
+    index = np.minimum(row, camera.h - 1) * camera.w + np.minimum(column, camera.w - 1)
+    size = camera.w * camera.h
+    weight = np.bincount(index, minlength=size)
+    shape = (camera.h, camera.w)
+    mean = np.bincount(index, -1 / cloud.points[keep, 2], size) / np.maximum(weight, 1)
+    inverse_depth = np.where(weight > 0, mean, np.nan).reshape(shape)
+    sigma_noise, *pose_errors = (
+        (np.bincount(index, values, size) / np.maximum(weight, 1)).reshape(shape)
+        for values in (cloud.sigma_noise[keep], *cloud.pose_errors[keep].T)
+    )
+    fitted = np.full((camera.h, camera.w, 3), np.nan)
+    _fit_inverse_depth(
+        camera.h,
+        inverse_depth.astype(np.float32),
+        settings.half_window,
+        settings.fewest_pixels,
+        settings.largest_relief,
+        fitted,
+    )
+    uv = np.stack(np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5), -1).reshape(-1, 2)
+    ray = directions(camera, uv).reshape(camera.h, camera.w, 3)
+    ray = ray / -ray[..., 2:]
+    point = ray / fitted[..., :1]
+    normal = _normals(fitted, ray, camera)
+    cosine = -(normal * ray).sum(-1) / np.linalg.norm(ray, axis=-1)
+    with np.errstate(invalid="ignore"):
+        valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > settings.least_cosine)
+    depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
+    points, place = (point[valid], uv.reshape(*shape, 2)[valid]) if valid.any() else (cloud.points, None)
+    centroid, radius = _centre_and_radius(points)
+    along_normal = np.nan_to_num(np.abs(cosine))
+    sigma = np.hypot(sigma_noise * along_normal, settings.lattice_error * depth / camera.fl_x)
+    if valid.any():
+        errors = np.stack(pose_errors, -1)[valid] * along_normal[valid][:, None]
+        shape_errors = _beyond_similarity(errors, (point[valid] - centroid) / radius, normal[valid])
+        sigma[valid] = np.hypot(sigma[valid], np.linalg.norm(shape_errors, axis=-1))
+    return SurfaceMap(
+        camera,
+        np.ascontiguousarray(np.nan_to_num(point)),
+        tangent_planes(np.nan_to_num(point), np.nan_to_num(normal), sigma),
+        valid,
+        _tone(cloud, keep, index, point, normal, valid, settings),
+        find_empty_places(cloud, camera, settings.empty),
+        _orientation_weights(normal[valid], settings.orientations),
+        centroid,
+        radius,
+        _views(points, place, camera, settings),
+    )
+
+
+def _tone(
+    cloud: FrameCloud,
+    keep: Bool[ndarray, "n"],
+    index: Int64[ndarray, "m"],
+    point: Float64[ndarray, "h w 3"],
+    normal: Float64[ndarray, "h w 3"],
+    valid: Bool[ndarray, "h w"],
+    settings: SurfaceMapSettings,
+) -> Float32[ndarray, "h w"]:
+    """The surface's tone on the lattice; `index` is the place in the lattice of each point that is kept."""
+    if cloud.light is None:
+        return np.full(valid.shape, np.nan, dtype=np.float32)
+    column, row = np.floor(cloud.uv_camera[keep]).astype(np.int64).T
+    light = cloud.light[row, column]
+    known = np.isfinite(light)
+    count = np.bincount(index[known], minlength=valid.size)
+    mean = np.bincount(index[known], light[known], valid.size) / np.maximum(count, 1)
+    light = np.where(valid & (count.reshape(valid.shape) > 0), mean.reshape(valid.shape), np.nan)
+    return surface_tone(light, point, normal, cloud.pose.T_camera_projector[:3, 3], settings.tone)
+
+
+def _beyond_similarity(
+    errors: Float64[ndarray, "m k"], p: Float64[ndarray, "m 3"], normal: Float64[ndarray, "m 3"]
+) -> Float64[ndarray, "m k"]:
+    """What remains of displacements along the normals after the similarity that takes up most of each.
+
+    An error of the projector's pose mostly moves, turns and scales the surface as a whole. Registration finds that
+    similarity anyway; only the rest keeps two surfaces apart.
+    """
+    moves = np.concatenate([normal, np.cross(p, normal), (p * normal).sum(-1, keepdims=True)], 1)
+    return errors - moves @ np.linalg.lstsq(moves, errors, rcond=None)[0]
+
+
+def _orientation_weights(normal: Float64[ndarray, "m 3"], count: int) -> Float64[ndarray, "m"]:
+    """One over the square root of how many normals have about the same direction."""
+    if not len(normal):
+        return np.zeros(0)
+    k = np.arange(count) + 0.5
+    height, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k  # a lattice of directions (Vogel's spiral)
+    flat = np.sqrt(1 - height**2)
+    nearest = (normal @ np.stack([flat * np.cos(turn), flat * np.sin(turn), height])).argmax(1)
+    return 1 / np.sqrt(np.bincount(nearest, minlength=count)[nearest])
+
+
+def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "3"], float]:
+    centroid = points.mean(0)
+    return centroid, float(np.sqrt(((points - centroid) ** 2).sum(-1).mean()))
+
+
+def _views(
+    points: Float64[ndarray, "n 3"],
+    uv: Float64[ndarray, "n 2"] | None,
+    camera: Device,
+    settings: SurfaceMapSettings,
+) -> tuple[FrameView, ...]:
+    """Everything that the frame sees; and what lies in the middle of its image, at what depth that is.
+
+    With nothing but the object in view, its visible parts are about equally large in all frames. A wall that only some
+    frames see changes size and centre of everything; cameras that look at the object have it in the middle all the
+    same, and are about equally far from it.
+    """
+    centroid, radius = _centre_and_radius(points)
+    behind = settings.centre_depth * radius
+    views = [FrameView(centroid * (1 + behind / np.linalg.norm(centroid)), radius)]
+    if uv is None:
+        return tuple(views)
+    off = np.abs(uv - (camera.cx, camera.cy)).max(-1) / min(camera.w, camera.h)
+    central = np.sort(off)[min(len(off), settings.fewest_central) - 1]
+    middle = points[off <= max(central, settings.middle)]
+    depth = np.linalg.norm(middle, axis=1)
+    place = np.median(middle / depth[:, None], axis=0)
+    near = float(np.quantile(depth, settings.near_quantile))
+    views.append(FrameView(place / np.linalg.norm(place) * (near + min(behind, settings.nearness * near)), near))
+    return tuple(views)
+
+
+def _normals(
+    fitted: Float64[ndarray, "h w 3"], ray: Float64[ndarray, "h w 3"], camera: Device
+) -> Float64[ndarray, "h w 3"]:
+    """Normals of planes from inverse depth q and its slopes: q = n . ray / (n . p), ray = (x, -y, -1).
+
+    The slope of the lens distortion is neglected.
+    """
+    q, q_u, q_v = np.moveaxis(fitted, -1, 0)
+    a, b = q_u * camera.fl_x, q_v * camera.fl_y  # by the normalised pixel (x, y)
+    x, y = ray[..., 0], -ray[..., 1]
+    n = -np.stack([a, -b, -(q - a * x - b * y)], -1)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True).clip(1e-300)
+
+
+@compiled_range
+def _fit_inverse_depth(first, last, q, half_window, fewest, largest_relief, fitted):
+    """Planes `q = c + u du + v dv` in windows around every pixel with a value; NaN at edges and where too sparse."""
+    h, w = q.shape
+    for row in range(first, last):
+        for column in range(w):
+            if not np.isfinite(q[row, column]):
+                continue
+            n = sx = sy = sxx = sxy = syy = s0 = s1 = s2 = ss = 0.0
+            origin = float(q[row, column])
+            for y in range(max(row - half_window, 0), min(row + half_window + 1, h)):
+                for x in range(max(column - half_window, 0), min(column + half_window + 1, w)):
+                    if not np.isfinite(q[y, x]):
+                        continue
+                    d, dx, dy = float(q[y, x]) - origin, float(x - column), float(y - row)
+                    n += 1.0
+                    sx += dx
+                    sy += dy
+                    sxx += dx * dx
+                    sxy += dx * dy
+                    syy += dy * dy
+                    s0 += d
+                    s1 += d * dx
+                    s2 += d * dy
+                    ss += d * d
+            if n < fewest:
+                continue
+            solvable, c, u, v = solve_plane(n, sx, sy, sxx, sxy, syy, s0, s1, s2, 1e-3 * n)
+            if not solvable:
+                continue
+            relief2 = (ss - c * s0 - u * s1 - v * s2) / n
+            if relief2 < (largest_relief * origin) ** 2:
+                fitted[row, column, 0] = c + origin
+                fitted[row, column, 1] = u
+                fitted[row, column, 2] = v

@@ -1,0 +1,431 @@
+"""Blocks of frames that contradict the others are turned to where they do not, if the pairs there confirm it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.parallel import tracked
+from sl_nerfstudio.registration.agreement import Hypotheses, Side, Tolerance, agreement
+from sl_nerfstudio.registration.assembly import Component, Nodes, PoseGraphSolution, node_at
+from sl_nerfstudio.registration.pairs import PairMatch, is_accepted, quality, register_pair
+from sl_nerfstudio.registration.settings import EdgeSettings, RegistrationSettings, Search
+from sl_nerfstudio.registration.surfaces import SurfaceMap
+from sl_nerfstudio.registration.view_graph import ViewGraph
+
+# Objects that look the same after a turn, placed by the order of capture: surfaces do not tell their sides apart.
+#
+# Each frame of a sequence is turned little against the one before. So every pair of successive frames is searched
+# for
+# among small rotations only, and the chain of them says which side each frame shows. All other pairs then start
+# there.
+
+
+def typical_step_deg(matches: Sequence[PairMatch], settings: RegistrationSettings) -> float | None:
+    """By how much successive frames are turned, in degrees (median); None if few of them hold each other in place."""
+    steps = [m for m in matches if m.target - m.source == 1]
+    said = [angle_deg(m.S_target_source.R) for m in steps if _holds(m, settings)]
+    return float(np.median(said)) if len(said) > settings.order.least_steps * len(steps) else None
+
+
+def sides_are_open(matches: Sequence[PairMatch], settings: RegistrationSettings) -> bool:
+    """Whether a pair of frames of a sequence fits nearly as well after a clearly different rotation."""
+    return any(
+        rival.ratio > settings.edge.ambiguous_ratio
+        and angle_deg(rival.S_target_source.R @ m.S_target_source.R.T) > settings.order.different_sides_deg
+        for m in matches
+        if m.target - m.source <= max(settings.selection.sequence_gaps) and _holds(m, settings)
+        for rival in m.rivals
+    )
+
+
+def _holds(match: PairMatch, settings: RegistrationSettings) -> bool:
+    """Whether two surfaces agree, and hold each other in place."""
+    return is_accepted(match, settings.edge) and match.shape_slip_deg <= settings.pair.bounded_slip_deg
+
+
+def chain_of_small_steps(
+    maps: Sequence[SurfaceMap], step_deg: float, rng: np.random.Generator, settings: RegistrationSettings
+) -> Nodes:
+    """`S_world_camera` of the longest run of successive frames that small steps connect; None for all others."""
+    largest = settings.order.largest_step * step_deg
+    search = Search(largest, settings.order.spacing * step_deg)
+    tasks = [
+        partial(register_pair, (maps[k], maps[k + 1]), (k, k + 1), search, own, None, settings.pair)
+        for k, own in enumerate(rng.spawn(len(maps) - 1))
+    ]
+    steps = [_small(match, largest, settings) for match in tracked(tasks, "following the order of capture")]
+    return _longest_run(steps)
+
+
+def _longest_run(steps: Sequence[Similarity | None]) -> Nodes:
+    """Frames one after the other from the first of them; `steps[k]` maps frame k to the next, None where unknown."""
+    nodes = [Similarity.identity()]
+    runs = [[0]]
+    for k, S_next_this in enumerate(steps, start=1):
+        if S_next_this is None:
+            runs.append([])
+        nodes.append(Similarity.identity() if S_next_this is None else nodes[-1] @ S_next_this.inverse())
+        runs[-1].append(k)
+    longest = max(runs, key=len)
+    return [S if k in longest and len(longest) > 1 else None for k, S in enumerate(nodes)]
+
+
+def _small(match: PairMatch | None, largest_deg: float, settings: RegistrationSettings) -> Similarity | None:
+    """The best of a pair's results, or one that clearly turns less; None if it is larger than a step can be."""
+    if match is None or not is_accepted(match, settings.edge):
+        return None
+    S = match.S_target_source
+    for rival in match.rivals:
+        less = angle_deg(S.R) - angle_deg(rival.S_target_source.R)
+        if rival.ratio >= settings.order.least_ratio and less > settings.order.different_sides_deg:
+            S = rival.S_target_source
+    return S if angle_deg(S.R) <= largest_deg else None
+
+
+# How much of the frames agrees, and contradicts, if each is moved by a turn of the world and the others stay.
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Points of pairs of frames, in frames: 1 is all points of one. Row i is moved, column j stays.
+
+    Only frames that have a pose have a row.
+    """
+
+    agreeing: Float64[ndarray, "n n"]
+    contradicting: Float64[ndarray, "n n"]
+
+    def across(self, block: Bool[ndarray, "n"]) -> tuple[float, float]:
+        """Those that agree and those that contradict, of the pairs of a frame of the block and another."""
+        pairs = np.ix_(block, ~block)
+        return float(self.agreeing[pairs].sum()), float(self.contradicting[pairs].sum())
+
+    @property
+    def total(self) -> float:
+        """All points that agree."""
+        return float(self.agreeing.sum())
+
+    @property
+    def share(self) -> float:
+        """Of all points that could be judged, those that contradict."""
+        return share(self.total, float(self.contradicting.sum()))
+
+
+def share(agreeing: float, contradicting: float) -> float:
+    """Of points that contradict; 1 if there are none at all."""
+    return contradicting / (agreeing + contradicting) if agreeing + contradicting else 1.0
+
+
+def judged(
+    sides: Sequence[Side], nodes: Nodes, turn: Similarity, neighbours: int, settings: RegistrationSettings
+) -> Judged:
+    """Every frame that has a pose, moved, against `neighbours` others that then look most nearly its way."""
+    row = {k: n for n, k in enumerate(k for k, S in enumerate(nodes) if S is not None)}
+    agreeing, contradicting = np.zeros((2, len(row), len(row)))
+    width, agrees = Tolerance(0.0, settings.assembly.tolerance_sigmas), settings.pair.agreement
+    for i, j, S in facing(nodes, turn, neighbours, settings):
+        found = agreement(sides[i], sides[j], Hypotheses.of(S), width, width, agrees)
+        agreeing[row[i], row[j]] = found.agreeing[0]
+        contradicting[row[i], row[j]] = found.contradicting(agrees.behind)[0]
+    return Judged(agreeing, contradicting)
+
+
+def facing(
+    nodes: Nodes, turn: Similarity, neighbours: int, settings: RegistrationSettings
+) -> Iterator[tuple[int, int, Similarity]]:
+    """A moved frame, another that looks nearly its way, and the first in the second's axes."""
+    least_cosine = np.cos(np.radians(settings.selection.largest_view_angle_deg))
+    frames = [k for k, S in enumerate(nodes) if S is not None]
+    sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
+    for n, i in enumerate(frames):
+        moved = turn @ node_at(nodes, i)
+        cosine = np.asarray(sight @ moved.R[:, 2], dtype=np.float64)
+        cosine[n] = -np.inf
+        for k in np.argsort(-cosine, kind="stable")[:neighbours].tolist():
+            if cosine[k] > least_cosine:
+                yield i, frames[k], node_at(nodes, frames[k]).inverse() @ moved
+
+
+# A turn that a pair of frames says, made as exact as all frames together know it.
+#
+# A pair is off by degrees and by per cents of scale, which moves edges of the object past each other. A turn that
+# leaves
+# an object as it is has no scale, and every frame says something of it.
+
+
+def exact_turn(sides: Sequence[Side], nodes: Nodes, turn: Similarity, settings: RegistrationSettings) -> Similarity:
+    """Gauss-Newton from `turn`: rigid, by the point-to-plane distances of every frame, moved, from those it faces."""
+    s = settings.symmetry
+    centre = _centre(sides, nodes)
+    turn = Similarity(1.0, turn.R, turn.points(centre[None])[0] - turn.R @ centre)
+    for radii in s.exact_widths:
+        width = Tolerance(radii, settings.pair.kernel_sigmas)
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        for i, j, S in facing(nodes, turn, s.neighbours, settings):
+            sums = agreement(sides[i], sides[j], Hypotheses.of(S), width, width, settings.pair.agreement)
+            M = _motion_in_camera(node_at(nodes, j), sides[j].map.centroid, centre)
+            H += M.T @ sums.H[0] @ M
+            g += M.T @ sums.g[0] * node_at(nodes, j).scale
+        step = -np.linalg.lstsq(H, g, rcond=s.exact_rcond)[0]
+        R = Rotation.from_rotvec(step[3:]).as_matrix()
+        turn = Similarity(1.0, R, centre - R @ centre + step[:3]) @ turn
+    return turn
+
+
+def _centre(sides: Sequence[Side], nodes: Nodes) -> Float64[ndarray, "3"]:
+    """Of what the frames see."""
+    seen = [S.points(sides[k].map.centroid[None])[0] for k, S in enumerate(nodes) if S is not None]
+    return np.mean(seen, axis=0)
+
+
+def _motion_in_camera(
+    S_world_camera: Similarity, c_camera: Float64[ndarray, "3"], centre: Float64[ndarray, "3"]
+) -> Float64[ndarray, "7 6"]:
+    """How a motion (v, w) of the world about `centre` moves a camera's points, (v, w, l) about its own centre.
+
+    Weighted by the camera's unit, so that distances of all cameras count alike.
+    """
+    to_camera = S_world_camera.R.T
+    arm = S_world_camera.points(c_camera[None])[0] - centre
+    M = np.zeros((7, 6))
+    M[:3, :3] = to_camera / S_world_camera.scale
+    M[:3, 3:] = to_camera @ np.cross(np.eye(3), arm).T / S_world_camera.scale
+    M[3:6, 3:] = to_camera
+    return M * S_world_camera.scale
+
+
+# By which motions of the world pairs of frames differ from the poses that were found.
+
+
+def distinct_turns(
+    edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
+) -> list[Similarity]:
+    """Clearly different turns of the world; those that the best pairs say come first."""
+    s, found = settings.symmetry, list[Similarity]()
+    for turn in _said(edges, solution, settings.edge):
+        if abs(np.log(turn.scale)) < s.largest_log_scale and not is_known(turn, found, settings):
+            found.append(turn)
+    return found
+
+
+def is_known(turn: Similarity, found: Sequence[Similarity], settings: RegistrationSettings) -> bool:
+    """Whether a turn is none, or about one of those found, forwards or backwards."""
+    known = (Similarity.identity(), *found, *(T.inverse() for T in found))
+    return any(angle_deg((turn @ T.inverse()).R) <= settings.symmetry.same_rotation_deg for T in known)
+
+
+def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: EdgeSettings) -> Iterator[Similarity]:
+    """By which motions of the world pairs, or their rivals, differ from the solution."""
+    nodes = solution.S_world_camera
+    placed = [
+        (e, used)
+        for e, used in zip(edges, solution.consistent, strict=True)
+        if nodes[e.source] is not None and nodes[e.target] is not None
+    ]
+    for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0], settings))):
+        target, source = node_at(nodes, e.target), node_at(nodes, e.source).inverse()
+        results = [*([] if used else [e.S_target_source]), *(rival.S_target_source for rival in e.rivals)]
+        yield from (target @ S @ source for S in results)
+
+
+# Turns after which the surface looks the same, so that pairs of frames contradict each other (a nut, a gear, a
+# box).
+#
+# Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say
+# different
+# things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the
+# surface to
+# where it contradicts; a symmetry does not. Nor does any turn about the axis of something round, a vase or a medal:
+# but
+# parts of that turn contradict no more, so it is no other side. Nor does half a turn of a leaf on a table, which
+# covers
+# most of its place: parts of it contradict only twice as much. Half the turn of a nut contradicts forty times as
+# much.
+
+
+def symmetric_turns_deg(
+    sides: Sequence[Side],
+    edges: Sequence[PairMatch],
+    solution: PoseGraphSolution,
+    settings: RegistrationSettings,
+    others: Sequence[PairMatch] = (),
+) -> tuple[float, ...]:
+    """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is.
+
+    `others`: pairs that are not edges of the solution, which may say turns as well.
+    """
+    s, nodes = settings.symmetry, solution.S_world_camera
+    fitness = [e.fitness for e, used in zip(edges, solution.consistent, strict=True) if used]
+    unused = np.zeros(len(others), dtype=bool)
+    with_others = replace(solution, consistent=np.append(solution.consistent, unused))
+    said = distinct_turns([*edges, *others], with_others, settings)[: s.most_compared]
+    if not fitness or not said:
+        return ()
+    usual = float(np.quantile(fitness, settings.edge.good_quantile))
+    as_it_is = judged(sides, nodes, Similarity.identity(), s.neighbours, settings)
+    by_errors = as_it_is.share if as_it_is.total else 0.0
+    # as much as a good connection may have: what assembly would take for right is not told from what is
+    misfit = by_errors + settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
+    turns: list[Similarity] = []
+    for one in said:
+        turn = exact_turn(sides, nodes, one, settings)
+        if angle_deg(turn.R @ one.R.T) > s.same_rotation_deg or is_known(turn, turns, settings):
+            continue
+        turned = judged(sides, nodes, turn, s.neighbours, settings)
+        if turned.total < s.least_agreeing * as_it_is.total or turned.share > misfit:
+            continue
+        within = max(judged(sides, nodes, part, s.neighbours, settings).share for part in _parts(turn))
+        if within - by_errors > s.least_excess * max(turned.share - by_errors, 0.0):
+            turns.append(turn)
+    return tuple(sorted(angle_deg(turn.R) for turn in turns))
+
+
+def _parts(turn: Similarity) -> tuple[Similarity, Similarity]:
+    """Half of a turn and three eighths of it, about the same axis."""
+    half = _half(turn)
+    quarter = _half(half)
+    return half, quarter @ _half(quarter)
+
+
+def _half(turn: Similarity) -> Similarity:
+    """The turn that gives `turn` if it is made twice: about the same axis, by half the angle."""
+    scale = turn.scale**0.5
+    R = Rotation.from_rotvec(Rotation.from_matrix(turn.R).as_rotvec() / 2).as_matrix()
+    return Similarity(scale, R, np.linalg.solve(np.eye(3) + scale * R, turn.t))
+
+
+# Blocks of frames at the wrong one of several sides from which an object looks nearly the same.
+#
+# Components grow pair by pair. Half a bearing block fits on its other half but for an oil cup: two blocks of frames
+# that
+# were joined like this agree over most of their surface. But all pairs across the two contradict each other more
+# than
+# those inside, and there is a turn of the world after which one block contradicts the other no more. Which frames
+# belong
+# to it is the cut of a graph: weights of its edges are what pairs contradict before the turn, less what they do
+# after it.
+
+
+@dataclass(frozen=True)
+class TurnedBlock:
+    """Frames that contradict the others less after a turn of the world."""
+
+    frames: tuple[int, ...]
+    turn: Similarity
+    relief: float  # by how much less, in frames: 1 is all points of one frame
+
+
+def turned_blocks(
+    sides: Sequence[Side],
+    edges: Sequence[PairMatch],
+    solution: PoseGraphSolution,
+    before: Judged,
+    settings: RegistrationSettings,
+) -> list[TurnedBlock]:
+    """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first.
+
+    `before`: the frames of the solution as they are.
+    """
+    s, nodes = settings.blocks, solution.S_world_camera
+    frames = [k for k, S in enumerate(nodes) if S is not None]
+    if len(frames) < s.fewest_frames:
+        return []
+    usual = _usual(before, settings)
+    contradicting, found = _excess(before, usual), list[TurnedBlock]()
+    if contradicting.sum() < s.least_contradicting:
+        return []
+    for turn in distinct_turns(edges, solution, settings)[: s.most_compared]:
+        after = judged(sides, nodes, turn, s.neighbours, settings)
+        block = _best_cut(contradicting - _excess(after, usual), s.starts)
+        if block is None:
+            continue
+        agreed, contradicted = before.across(block)
+        agrees, contradicts = after.across(block)
+        if agrees < max(s.least_agreeing, s.least_overlap * agreed):
+            continue
+        if share(agrees, contradicts) < s.largest_remainder * share(agreed, contradicted):
+            inside = tuple(np.array(frames)[block].tolist())
+            found.append(TurnedBlock(inside, turn, contradicted - contradicts))
+    return sorted(found, key=lambda one: -one.relief)
+
+
+def _usual(found: Judged, settings: RegistrationSettings) -> float:
+    """Share of the points that may contradict: a little more than in the better part of the pairs."""
+    s, total = settings.blocks, found.agreeing + found.contradicting
+    shares = found.contradicting[total > s.least_judged] / total[total > s.least_judged]
+    better = float(np.quantile(shares, s.better_quantile)) if len(shares) else 0.0
+    return s.usual_factor * max(better, s.least_misfit)
+
+
+def _excess(found: Judged, usual: float) -> Float64[ndarray, "n n"]:
+    """What contradicts beyond the usual."""
+    return np.maximum(found.contradicting - usual * (found.agreeing + found.contradicting), 0.0)
+
+
+def _best_cut(relief: Float64[ndarray, "n n"], starts: int) -> Bool[ndarray, "n"] | None:
+    """The frames whose turn relieves the pairs across most; None if none does.
+
+    Blocks grow from each of the frames that would be relieved most alone, by the frame that is best then, until all but
+    one are in it (as in Kernighan and Lin, 1970).
+    """
+    n, most, best = len(relief), 0.0, None
+    for first in np.argsort(-relief.sum(1), kind="stable")[:starts].tolist():
+        block = np.zeros(n, dtype=bool)
+        gain, sum_, nearest = relief.sum(1), 0.0, first  # gain: of each frame outside, if it came in
+        for _ in range(n - 1):
+            sum_ += float(gain[nearest])
+            block[nearest] = True
+            gain -= relief[:, nearest] + relief[nearest]
+            if sum_ > most:
+                most, best = sum_, block.copy()
+            nearest = int(np.where(block, -np.inf, gain).argmax())
+    return best
+
+
+def turn_blocks_back(graph: ViewGraph) -> None:
+    """Register pairs across turned blocks anew, in all components, until no block contradicts the rest of its own."""
+    for _ in range(graph.settings.blocks.most_turned):
+        if not any(turned_back(graph, component) for component in graph.assemble()):
+            return
+
+
+def turned_back(graph: ViewGraph, component: Component) -> bool:
+    """Turn the block of a component back that contradicts most; whether there was one."""
+    solution, settings = graph.solve(component), graph.settings
+    before = _as_they_are(graph, solution)
+    blocks = turned_blocks(graph.sides, graph.holding(component), solution, before, settings)
+    for block in blocks[: settings.blocks.most_tried]:
+        moved = {k: node_at(solution.S_world_camera, k) for k in component}
+        moved |= {k: block.turn @ moved[k] for k in block.frames}
+        known = graph.snapshot()
+        _register_across(graph, moved, block)
+        if _confirmed(graph, moved, before.share):
+            return True
+        graph.restore(known)
+    return False
+
+
+def _register_across(graph: ViewGraph, moved: Component, block: TurnedBlock) -> None:
+    """Set pairs aside that put the block where it was, and register those that now overlap."""
+    graph.set_aside(moved, [(i, j) for i in block.frames for j in moved if j not in block.frames])
+    graph.try_overlapping([moved.get(k) for k in range(len(graph.maps))])
+
+
+def _confirmed(graph: ViewGraph, moved: Component, before: float) -> bool:
+    """Whether pairs hold all frames together where they are now, and less contradicts."""
+    solution = graph.solve(moved)
+    if not graph.connected(moved, solution.consistent):
+        return False
+    return _as_they_are(graph, solution).share < graph.settings.blocks.least_improvement * before
+
+
+def _as_they_are(graph: ViewGraph, solution: PoseGraphSolution) -> Judged:
+    """How the frames of a solution agree and contradict each other."""
+    neighbours = graph.settings.blocks.neighbours
+    return judged(graph.sides, solution.S_world_camera, Similarity.identity(), neighbours, graph.settings)

@@ -1,0 +1,588 @@
+"""Robust non-linear fit of a projector's pose relative to its camera, with its covariance.
+
+The length of the baseline is one. Residuals and unknowns are those of `sampson`.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from numpy import ndarray
+
+from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.parallel import compiled
+
+# Settings of relative pose estimation.
+
+
+@dataclass(frozen=True)
+class SeparationSettings:
+    """How far two relative poses must differ to count as two solutions: in rotation or in direction."""
+
+    rotation_rad: float
+    """angle between the rotations, radian (to first order)"""
+    direction: float
+    """distance between the unit baselines"""
+
+
+@dataclass(frozen=True)
+class FivePointSettings:
+    """Random minimal samples, and the choice of the best solutions."""
+
+    samples: int = 100
+    """samples of five correspondences; with a third of them wrong, no sample is good with probability 1e-6"""
+    scoring_rays: int = 300
+    """correspondences on which the solutions of all samples are scored"""
+    outlier_px: float = 4.0
+    """residual, in projector pixels, beyond which a correspondence counts as wrong in the score"""
+    least_cosine: float = 1e-3
+    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
+    starts: int = 8
+    """number of solutions that are kept"""
+    separation: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.05, 0.1))
+    """by how much they differ from each other"""
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """The plane that holds most correspondences, and its two reconstructions."""
+
+    fewest: int = 20
+    """correspondences with which a plane is looked for"""
+    outlier_px: float = 4.0
+    """distance from the plane's image, in projector pixels, within which a correspondence lies in the plane"""
+    least_cosine: float = 1e-3
+    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
+    least_translation: float = 1e-6
+    """translation, in distances of the plane, below which two devices differ by a rotation alone"""
+
+
+@dataclass(frozen=True)
+class CandidateSettings:
+    """Refinement and ranking of the first solutions."""
+
+    polishing_rays: int = 800
+    """correspondences with which solutions are refined before they are compared"""
+    polishing_iterations: int = 12
+    """iterations of that refinement"""
+    ranking_rays: int = 4000
+    """correspondences by which the refined solutions are compared"""
+    inlier_sigmas: float = 3.0
+    """standard deviations of the noise within which a correspondence votes on which side the surface lies"""
+    least_in_front: float = 0.5
+    """share of these that must lie in front of both devices"""
+    separation: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.02, 0.05))
+    """by how much the refined solutions differ from each other"""
+    rival_share: float = 0.03
+    """share of the correspondences that a solution may explain less than the best one and still be a rival"""
+    rival_errors: float = 3.0
+    """standard errors of the difference within which a solution is a rival"""
+    most: int = 3
+    """solutions of a frame, the best one included, at most"""
+
+
+@dataclass(frozen=True)
+class EpipolarFitSettings:
+    """Levenberg-Marquardt on the distances from the epipolar curves."""
+
+    noise_floor_px: float = 1e-3
+    """noise that is assumed at least, in projector pixels"""
+    kernel_sigmas: float = 3.0
+    """width of the robust kernel, in standard deviations of the residuals"""
+    iterations: int = 30
+    """iterations at most"""
+    converged_rad: float = 1e-10
+    """size of a step, in radian, below which the fit has converged"""
+    damping: float = 1e-4
+    """damping of the first step, relative to the diagonal of the normal equations"""
+    damping_factor: float = 10.0
+    """factor by which the damping falls after a good step and rises after a bad one"""
+    least_damping: float = 1e-12
+    """below this the damping does not fall"""
+    tries: int = 8
+    """dampings that are tried before the fit ends"""
+
+
+@dataclass(frozen=True)
+class PatternBlocks:
+    """Squares of the pattern within which decoding errors may depend on each other."""
+
+    along_longer_side: int = 25
+    """squares along the longer side of the pattern: with 50 grid lines, two periods each"""
+
+
+@dataclass(frozen=True)
+class LatticeSettings:
+    """Which pixels of large images the pose is found from, and where points are."""
+
+    most_pixels: int = 600_000
+    """pixels of an image of which every one is used; of larger ones, every second, third, .. row and column"""
+    rows: int = 64
+    """rows whose other pixels are compared with the pose at a time, which bounds the memory"""
+
+
+@dataclass(frozen=True)
+class DegeneracyLimits:
+    """When a frame's correspondences count as degenerate."""
+
+    least_points: int = 200
+    """correspondences that agree with the pose, at least"""
+    least_block_share: float = 30 / 625
+    """share of the squares of the pattern that must hold points, so that their errors can be judged"""
+    least_relief_sigmas: float = 6.0
+    """standard deviations of the noise by which points must depart from a plane, and from a pure rotation"""
+    least_parallax_deg: float = 2.0
+    """angle between camera ray and projector ray, in degrees, below which depth hangs on tiny errors"""
+    largest_outlier_share: float = 0.3
+    """share of the correspondences that may disagree with the pose"""
+    largest_noise_px: float = 2.0
+    """noise of the residuals, in projector pixels"""
+    largest_sigma_rotation_deg: float = 0.5
+    """standard deviation of the rotation, in degrees"""
+    largest_sigma_direction_deg: float = 1.5
+    """standard deviation of the direction of the baseline, in degrees"""
+    relief_iterations: int = 10
+    """iterations of the robust fits of a plane and of a pure rotation"""
+    relief_kernel_medians: float = 3.0
+    """width of their kernel, in medians of the residuals"""
+    relief_share: float = 0.9
+    """share of the smallest residuals that the relief is measured on: wrong coordinates are among the others"""
+    epipole_sectors: int = 8
+    """sectors around the baseline that must all hold rays for an epipole to be in view"""
+
+
+@dataclass(frozen=True)
+class RelativePoseSettings:
+    """All settings of the relative pose of one frame."""
+
+    fewest: int = 20
+    """correspondences: enough for five unknowns and a judgement of the result"""
+    most: int = 20000
+    """correspondences in the fit at most; neighbouring pixels add nothing new"""
+    inlier_sigmas: float = 4.0
+    """standard deviations of the noise within which a correspondence agrees with the pose"""
+    least_inlier_share: float = 0.3
+    """share of the correspondences that must agree with the pose"""
+    largest_noise_share: float = 0.02
+    """noise beyond which nothing fits, as a share of the pattern's width"""
+    fewest_in_block: int = 20
+    """correspondences in a square of the pattern from which its own noise is measured"""
+    largest_local_noise: float = 3.0
+    """noise in a square of the pattern at most, relative to that of the whole frame"""
+    solutions: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.0354, 0.1))
+    """by how much two solutions of a frame differ: by more than unfinished refinements do"""
+    blocks: PatternBlocks = field(default_factory=PatternBlocks)
+    """squares of the pattern"""
+    lattice: LatticeSettings = field(default_factory=LatticeSettings)
+    """pixels of large images"""
+    five_point: FivePointSettings = field(default_factory=FivePointSettings)
+    """first solutions from random samples"""
+    plane: PlaneSettings = field(default_factory=PlaneSettings)
+    """first solutions from the dominant plane"""
+    candidates: CandidateSettings = field(default_factory=CandidateSettings)
+    """their refinement and ranking"""
+    fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
+    """the fit of the best one"""
+    degeneracy: DegeneracyLimits = field(default_factory=DegeneracyLimits)
+    """when a frame is degenerate"""
+
+
+RELATIVE_POSE_DEFAULTS = RelativePoseSettings()
+
+
+@dataclass(frozen=True)
+class CameraEstimateSettings:
+    """Refinement of a camera whose focal length is only roughly known."""
+
+    most: int = 3000
+    """correspondences of each frame"""
+    iterations: int = 12
+    """Gauss-Newton steps, at most"""
+    largest_step: float = 0.05
+    """change of any unknown in one step"""
+    difference_step: float = 1e-5
+    """the same for derivatives"""
+    converged: float = 1e-8
+    """step below which the search ends"""
+    sigma_centre: float = 0.01
+    """how far principal points are from the middle, as a share of the image's longer side"""
+    sigma_k1: float = 0.03
+    """first term of the distortion of a usual lens"""
+    kernel_sigmas: float = 3.0
+    """width of the robust kernel, in standard deviations of the residuals"""
+
+
+CAMERA_ESTIMATE_DEFAULTS = CameraEstimateSettings()
+
+# Squares of the pattern: decoding errors of neighbouring pixels depend on each other, those of two squares do not.
+
+
+def blocks_of(uv_projector: Float[ndarray, "n 2"], projector: Device, settings: PatternBlocks) -> Int64[ndarray, "n"]:
+    """Number of the square in which each coordinate lies; the same number, the same square."""
+    n = settings.along_longer_side
+    side_px = max(projector.w, projector.h) / n
+    # Coordinates outside the pattern have squares too, out to four times its longer side.
+    column, row = np.floor(uv_projector / side_px).astype(np.int64).clip(-1, 4 * n).T
+    return (row + 1) * (5 * n) + column + 1
+
+
+def block_numbers(settings: PatternBlocks) -> int:
+    """All numbers that `blocks_of` gives are below this."""
+    return (5 * settings.along_longer_side) ** 2
+
+
+def block_count(projector: Device, settings: PatternBlocks) -> int:
+    """Number of squares of the whole pattern, with those that its border cuts."""
+    n, (shorter, longer) = settings.along_longer_side, sorted((projector.w, projector.h))
+    return n * -(-n * shorter // longer)
+
+
+# Correspondences of one frame as pairs of rays, with what is needed to measure errors in projector pixels.
+
+
+@dataclass(frozen=True)
+class RayPairs:
+    """Unit rays in each device's own axes."""
+
+    d_camera: Float64[ndarray, "n 3"]
+    d_projector: Float64[ndarray, "n 3"]
+    d_projector_by_uv: Float64[ndarray, "n 3 2"]  # derivative by the projector's pixel
+    block: Int64[ndarray, "n"]  # square of the pattern; errors within one may depend on each other
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.d_camera)
+
+    def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"] | slice) -> "RayPairs":
+        """Some of the pairs."""
+        return RayPairs(self.d_camera[index], self.d_projector[index], self.d_projector_by_uv[index], self.block[index])
+
+    def block_sums(self, values: Float64[ndarray, "n *k"]) -> Float64[ndarray, "blocks *k"]:
+        """Sums of values over the pairs of each square of the pattern that holds any."""
+        found, group = np.unique(self.block, return_inverse=True)
+        sums = np.zeros((len(found), *values.shape[1:]))
+        np.add.at(sums, group, values)
+        return sums
+
+
+def lattice_step(h: int, w: int) -> int:
+    """Of large images every second, third, .. row and column is enough: neighbouring coordinates err together."""
+    return max(1, math.ceil(math.sqrt(h * w / RELATIVE_POSE_DEFAULTS.lattice.most_pixels)))
+
+
+def correspondences_of(
+    coords: Float32[ndarray, "h w 2"],
+) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
+    """Camera pixel centres and pattern coordinates of the decoded pixels; of large images, of those on a lattice."""
+    step = lattice_step(*coords.shape[:2])
+    some = coords[::step, ::step]
+    row, column = np.nonzero(np.isfinite(some).all(-1))
+    return np.stack([column, row], -1) * step + 0.5, some[row, column].astype(np.float64)
+
+
+def ray_pairs(
+    uv_camera: Float[ndarray, "n 2"],
+    uv_projector: Float[ndarray, "n 2"],
+    camera: Device,
+    projector: Device,
+    blocks: PatternBlocks = RELATIVE_POSE_DEFAULTS.blocks,
+) -> tuple[RayPairs, Int64[ndarray, "m"]]:
+    """Rays of correspondences, and the indices of those that have a ray in both devices.
+
+    A DOE has no ray beyond 90 degrees; coordinates that are not finite have none at all.
+    """
+    d_camera, (d_projector, by_uv) = directions(camera, uv_camera), directions_by_uv(projector, uv_projector)
+    usable = np.flatnonzero(np.isfinite(d_camera).all(-1) & np.isfinite(d_projector).all(-1))
+    block = blocks_of(uv_projector[usable], projector, blocks)
+    return RayPairs(d_camera[usable], d_projector[usable], by_uv[usable], block), usable
+
+
+def directions(device: Device, uv: Float[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
+    """Unit directions of pixels in the device's axes; NaN where there is none."""
+    d = np.empty((len(uv), 3))
+    _directions(*for_loops(device), np.ascontiguousarray(uv, dtype=np.float64), d)
+    return d
+
+
+def directions_by_uv(
+    device: Device, uv: Float[ndarray, "n 2"]
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3 2"]]:
+    """Unit directions of pixels, and their derivatives by the pixels; NaN where there is none."""
+    d, by_uv = directions(device, uv), np.empty((len(uv), 3, 2))
+    _by_uv(*for_loops(device), d, by_uv)
+    return d, by_uv
+
+
+def subsample(index: Int64[ndarray, "n"], most: int, rng: np.random.Generator) -> Int64[ndarray, "m"]:
+    """All of the indices, or a random choice of `most` of them."""
+    return index if len(index) <= most else rng.choice(index, most, replace=False)
+
+
+@compiled
+def _directions(code, parameters, uv, d):
+    for i in range(len(uv)):
+        d[i, 0], d[i, 1], d[i, 2] = ray_of(code, uv[i, 0], uv[i, 1], parameters)
+
+
+@compiled
+def _by_uv(code, parameters, d, by_uv):
+    """Pseudo-inverse of the derivative J of the projection.
+
+    Projection does not depend on the length of a ray: J d = 0, and the columns of J's inverse are perpendicular to d.
+    """
+    for i in range(len(d)):
+        _, _, _, ux, uy, uz, vx, vy, vz = view_of(code, d[i, 0], d[i, 1], d[i, 2], parameters)
+        uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+        inverse = 1 / (uu * vv - uv * uv)
+        a, b, c = vv * inverse, -uv * inverse, uu * inverse
+        by_uv[i, 0, 0], by_uv[i, 1, 0], by_uv[i, 2, 0] = a * ux + b * vx, a * uy + b * vy, a * uz + b * vz
+        by_uv[i, 0, 1], by_uv[i, 1, 1], by_uv[i, 2, 1] = b * ux + c * vx, b * uy + c * vy, b * uz + c * vz
+
+
+# Sampson's residual of a relative pose, and increments of the pose.
+#
+# The residual is the distance, to first order, of a decoded coordinate from the epipolar curve of its camera pixel,
+# in
+# projector pixels. Only the projector's side has an error, because camera pixels are exact centres. It is computed
+# from
+# rays alone and therefore holds for pinhole, distorted and diffractive projectors.
+#
+# Five unknowns (w, b): `R <- exp(w) R` rotates the projector about its own centre, in camera axes, and
+# `t <- exp(B b) t` rotates the unit baseline, where B = `direction_basis(t)` spans the plane perpendicular to it.
+
+
+def direction_basis(t: Float64[ndarray, "3"]) -> Float64[ndarray, "3 2"]:
+    """Two unit vectors perpendicular to `t` and to each other, the same ones for the same `t`."""
+    B = np.empty((3, 2))
+    _basis(t, B)
+    return B
+
+
+def moved(
+    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], step: Float64[ndarray, "5"]
+) -> tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]:
+    """The pose after an increment (w, b)."""
+    R_moved, t_moved = np.empty((3, 3)), np.empty(3)
+    _move(R, t, step, R_moved, t_moved)
+    return R_moved, t_moved
+
+
+def sampson(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs) -> Float64[ndarray, "n"]:
+    """Signed distances of the coordinates from their epipolar curves, in projector pixels."""
+    return sampson_of_frames(R[None], t[None], rays, np.zeros(len(rays), dtype=np.int64))
+
+
+def sampson_of_frames(
+    R: Float64[ndarray, "frames 3 3"], t: Float64[ndarray, "frames 3"], rays: RayPairs, frame: Int64[ndarray, "n"]
+) -> Float64[ndarray, "n"]:
+    """The same of rays in several frames, each with a pose of its own."""
+    r = np.empty(len(rays))
+    _residuals(np.ascontiguousarray(R), t, frame, rays.d_camera, rays.d_projector, rays.d_projector_by_uv, r)
+    return r
+
+
+def sampson_jacobian(
+    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs
+) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n 5"]]:
+    """Residuals and their derivatives by (w, b).
+
+    For a vector q in projector axes, q . m changes with w by R q x n and with b by (R q x d) A, where m is the normal n
+    in projector axes and A = t x B = (B2, -B1). The residual a / g has two such products: a, and each part of h, of
+    which g is the length; so its change is that of one vector p.
+    """
+    r, J = np.empty(len(rays)), np.empty((len(rays), 5))
+    A = direction_basis(t)[:, ::-1] * [1, -1]
+    _derivatives(np.ascontiguousarray(R), t, A, rays.d_camera, rays.d_projector, rays.d_projector_by_uv, r, J)
+    return r, J
+
+
+@compiled
+def _basis(t, B):
+    x, y, z = t[0], t[1], t[2]
+    u, v, w = abs(x), abs(y), abs(z)
+    if u <= v and u <= w:  # of the axes, that which is most nearly perpendicular to t
+        a, b, c = 0.0, z, -y
+    elif v <= w:
+        a, b, c = -z, 0.0, x
+    else:
+        a, b, c = y, -x, 0.0
+    inverse = 1 / np.sqrt(a * a + b * b + c * c)
+    a, b, c = a * inverse, b * inverse, c * inverse
+    B[0, 0], B[1, 0], B[2, 0] = a, b, c
+    B[0, 1], B[1, 1], B[2, 1] = y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@compiled
+def _turned(x, y, z, u, v, w):
+    """The vector (u, v, w) rotated by a rotation vector (Rodrigues' formula)."""
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    half = np.sin(angle / 2) / angle if angle > 1e-8 else 0.5
+    a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+    k = 2 * half * half
+    return (
+        u + sine * a + k * (y * c - z * b), v + sine * b + k * (z * a - x * c), w + sine * c + k * (x * b - y * a)
+    )  # fmt: skip
+
+
+@compiled
+def _move(R, t, step, R_moved, t_moved):
+    B = np.empty((3, 2))
+    _basis(t, B)
+    u, v, w = step[0], step[1], step[2]
+    for k in range(3):
+        R_moved[0, k], R_moved[1, k], R_moved[2, k] = _turned(u, v, w, R[0, k], R[1, k], R[2, k])
+    p, q = step[3], step[4]
+    x, y, z = B[0, 0] * p + B[0, 1] * q, B[1, 0] * p + B[1, 1] * q, B[2, 0] * p + B[2, 1] * q
+    x, y, z = _turned(x, y, z, t[0], t[1], t[2])
+    inverse = 1 / np.sqrt(x * x + y * y + z * z)
+    t_moved[0], t_moved[1], t_moved[2] = x * inverse, y * inverse, z * inverse
+
+
+@compiled
+def _plane(R, t, d):
+    """Normal of the epipolar plane of a camera ray: in camera axes, and in those of the projector."""
+    nx, ny, nz = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2], t[0] * d[1] - t[1] * d[0]
+    mx = nx * R[0, 0] + ny * R[1, 0] + nz * R[2, 0]
+    my = nx * R[0, 1] + ny * R[1, 1] + nz * R[2, 1]
+    mz = nx * R[0, 2] + ny * R[1, 2] + nz * R[2, 2]
+    return nx, ny, nz, mx, my, mz
+
+
+@compiled
+def distance_from_curve(mx, my, mz, e, by):
+    """Residual of a projector ray `e` whose derivative is `by`; direction of its gradient, and one over its length."""
+    a = mx * e[0] + my * e[1] + mz * e[2]
+    h = mx * by[0, 0] + my * by[1, 0] + mz * by[2, 0]
+    k = mx * by[0, 1] + my * by[1, 1] + mz * by[2, 1]
+    inverse = 1 / max(np.sqrt(h * h + k * k), 1e-300)
+    return a * inverse, h * inverse, k * inverse, inverse
+
+
+@compiled
+def _residuals(R, t, frame, d_camera, d_projector, by_uv, r):
+    for i in range(len(r)):
+        _, _, _, mx, my, mz = _plane(R[frame[i]], t[frame[i]], d_camera[i])
+        r[i] = distance_from_curve(mx, my, mz, d_projector[i], by_uv[i])[0]
+
+
+@compiled
+def _derivatives(R, t, A, d_camera, d_projector, by_uv, r, J):
+    for i in range(len(r)):
+        d, e, by = d_camera[i], d_projector[i], by_uv[i]
+        nx, ny, nz, mx, my, mz = _plane(R, t, d)
+        s, h, k, inverse = distance_from_curve(mx, my, mz, e, by)
+        r[i] = s
+        u = (e[0] - s * (by[0, 0] * h + by[0, 1] * k)) * inverse
+        v = (e[1] - s * (by[1, 0] * h + by[1, 1] * k)) * inverse
+        w = (e[2] - s * (by[2, 0] * h + by[2, 1] * k)) * inverse
+        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
+        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
+        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
+        J[i, 0], J[i, 1], J[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        p, q, o = y * d[2] - z * d[1], z * d[0] - x * d[2], x * d[1] - y * d[0]
+        J[i, 3] = p * A[0, 0] + q * A[1, 0] + o * A[2, 0]
+        J[i, 4] = p * A[0, 1] + q * A[1, 1] + o * A[2, 1]
+
+
+@dataclass(frozen=True)
+class EpipolarFit:
+    """A relative pose with unit baseline, and how well it fits."""
+
+    R: Float64[ndarray, "3 3"]  # projector to camera
+    t: Float64[ndarray, "3"]  # unit direction from the camera to the projector, in camera axes
+    residual: Float64[ndarray, "n"]  # projector pixels
+    noise_px: float  # robust standard deviation of the residuals
+    cost: float  # robust sum of squared residuals over that of outliers alone: 0 perfect, 1 nothing fits
+
+
+def noise_of(residual: Float64[ndarray, "n"], floor_px: float = RELATIVE_POSE_DEFAULTS.fit.noise_floor_px) -> float:
+    """Robust standard deviation about zero."""
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), floor_px)
+
+
+def distinct(
+    a: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]],
+    b: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]],
+    separation: SeparationSettings,
+) -> bool:
+    """Whether two poses (R, t) are two solutions rather than one."""
+    rotation_rad = np.linalg.norm(a[0] - b[0]) / np.sqrt(2)  # for small angles
+    return bool(rotation_rad > separation.rotation_rad or np.linalg.norm(a[1] - b[1]) > separation.direction)
+
+
+def distinct_fits(fits: Iterable[EpipolarFit], separation: SeparationSettings) -> list[EpipolarFit]:
+    """Without those that are close to an earlier one: unfinished refinements may have the same end."""
+    kept: list[EpipolarFit] = []
+    for fit in fits:
+        if all(distinct((fit.R, fit.t), (other.R, other.t), separation) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def fit_epipolar(
+    R: Float64[ndarray, "3 3"],
+    t: Float64[ndarray, "3"],
+    rays: RayPairs,
+    settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit,
+) -> EpipolarFit:
+    """Levenberg-Marquardt from a start that is right to within a few degrees.
+
+    The kernel follows the noise as it falls, and never widens again (graduated non-convexity).
+    """
+    damping, step_size = settings.damping, np.inf
+    width = np.inf
+    for _ in range(settings.iterations):
+        r, J = sampson_jacobian(R, t, rays)
+        width = min(width, settings.kernel_sigmas * noise_of(r, settings.noise_floor_px))
+        w = geman_mcclure_weight((r / width) ** 2)
+        H, g = (J * w[:, None]).T @ J, J.T @ (w * r)
+        cost = _cost(r, width)
+        for _ in range(settings.tries):
+            step = -np.linalg.lstsq(H + damping * np.diag(np.diag(H)), g, rcond=1e-14)[0]
+            R_new, t_new = moved(R, t, step)
+            if _cost(sampson(R_new, t_new, rays), width) <= cost:
+                R, t, step_size = R_new, t_new, float(np.abs(step).max())
+                damping = max(damping / settings.damping_factor, settings.least_damping)
+                break
+            damping *= settings.damping_factor
+        else:
+            break
+        if step_size < settings.converged_rad:
+            break
+    r = sampson(R, t, rays)
+    return EpipolarFit(R, t, r, noise_of(r, settings.noise_floor_px), _cost(r, width) / (len(r) * width**2))
+
+
+def _cost(r: Float64[ndarray, "n"], width: float) -> float:
+    return width**2 * float(geman_mcclure_cost((r / width) ** 2).sum())
+
+
+def covariance(
+    found: EpipolarFit, rays: RayPairs, settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit
+) -> Float64[ndarray, "5 5"]:
+    """Covariance of (w, b), robust against errors that depend on each other (the cluster-robust sandwich estimator).
+
+    Within a square of the pattern residuals may depend on each other in any way: their gradients are summed before
+    they are squared (Liang and Zeger, Biometrika 1986). Errors that are shared over longer distances, such as wrong
+    lens parameters, cannot be seen in any frame alone and are not included.
+    """
+    r, J = sampson_jacobian(found.R, found.t, rays)
+    width = settings.kernel_sigmas * found.noise_px
+    x = (r / width) ** 2
+    w = geman_mcclure_weight(x)
+    curvature = w - 4 * x / (1 + x) ** 3  # of the kernel: what a residual adds to the cost's second derivative
+    bread = (J * curvature[:, None]).T @ J
+    if np.linalg.eigvalsh(bread)[0] <= 0:
+        bread = (J * w[:, None]).T @ J
+    gradients = rays.block_sums(J * (w * r)[:, None])
+    blocks = len(gradients)
+    meat = gradients.T @ gradients * (blocks / max(blocks - 5, 1))
+    # Where everything fits exactly, the least noise is assumed.
+    meat = meat + settings.noise_floor_px**2 * (J.T @ J)
+    inverse = np.linalg.pinv(bread, rcond=1e-14, hermitian=True)
+    return inverse @ meat @ inverse

@@ -1,0 +1,523 @@
+"""Figures of cross-frame agreement: of pairs of frames, of each frame, and of the scan."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+from numpy import ndarray
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inverse, rotate, transform
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels, evenly_spaced, geman_mcclure_weight
+from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
+from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.scan.types import Frame, PoseSigma, Scan
+
+# Limits of the verdict: multiples of the measured noise, shares of pixels and of frames; no lengths.
+
+
+@dataclass(frozen=True)
+class CrossFrameSettings:
+    """When the coordinates of two frames agree."""
+
+    pixels_per_frame: int = 500
+    """Decoded pixels of each frame that are looked up in the others."""
+    most_pixels: int = 12000
+    """The same over all frames, at most."""
+    least_pixels_per_frame: int = 60
+    """The same of each frame, at least, however many frames there are."""
+    partners: int = 32
+    """Other frames that a frame is compared with, about, where there are more than `compared_frames`."""
+    compared_frames: int = 150
+    """Most frames of which each is compared with every other."""
+    least_cosine: float = 0.2
+    """Cosine between surface normal and ray below which a device counts as not seeing a point."""
+    sigmas: float = 4.0
+    """Standard deviations of a residual, from noise and stated uncertainty of the poses, up to which a point agrees:
+    chance alone exceeds it once in 3000 points."""
+    footprint: float = 0.25
+    """Error that no calibration and no look-up is assumed to be free of, 1 sigma, in camera pixels."""
+    largest_noise_ratio: float = 3.0
+    """Noise of a frame relative to the median frame's, beyond which it does not count as noise: a wrong pose of its
+    projector makes it."""
+    fewest_judged: int = 30
+    """Judged points below which a pair of frames shares too little to say anything."""
+    typical_quantile: float = 0.8
+    """Quantile of a pair's residuals by which it is compared with other pairs: wrong decodings do not reach it, and a
+    plane on which two frames agree by chance rarely holds so much of them."""
+    least_typical: float = 0.5
+    """Smallest such residual that counts, in units of the noise: below, look-ups decide, not poses."""
+    largest_typical: float = 1.5
+    """Largest such residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
+    dimensions have 1.8, and the expected sigma is generous."""
+    rough_factor: float = 1.6
+    """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
+    of a pose is common to all points of a pair, so right pairs differ by chance."""
+    reference_quantile: float = 0.25
+    """Quantile of those residuals over all pairs with which each is compared: a quarter of the pairs must be right."""
+    contradicting_excess: float = 2.5
+    """Residual of a pair relative to that reference, beyond which the two frames contradict each other."""
+
+    def pixels_of_each(self, frames: int) -> int:
+        """Decoded pixels of each of so many frames that are looked up."""
+        return max(self.least_pixels_per_frame, min(self.pixels_per_frame, self.most_pixels // frames))
+
+
+@dataclass(frozen=True)
+class MissingSurfaceSettings:
+    """When a frame should have seen a surface."""
+
+    margin: float = 0.02
+    """Distance from all that a frame saw of the pattern, as a share of the image's longer side, beyond which it saw
+    nothing; as far inside the image and the pattern must a point lie."""
+    least_cosine: float = 0.35
+    """Cosine between a surface's normal and its rays to both devices above which it would be lit and seen."""
+    cells: int = 60
+    """Places along the longer side of an image at which it is known what lies nearest to the device."""
+    thickness: float = 0.08
+    """Distance behind what is nearest from which points count as hidden, as a share of the surface's radius."""
+    fewest_judged: int = 30
+    """Points below which nothing is said of a frame."""
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """What makes a scan good, acceptable or poor. A single frame beyond a limit keeps it from being good."""
+
+    most_frames: float = 0.25
+    """Share of the frames that may be left out, undecided, unconfirmed or weakly decoded before the scan is poor."""
+    least_decoded: float = 0.5
+    """Share of the surface that other frames show which must be decoded in every frame; of the visible pattern, where
+    others show too little."""
+    most_missing: float = 0.05
+    """Share of the surface that others show, and that a frame should have seen, of which it may have seen nothing; in a
+    single frame, something may have cast a shadow."""
+    least_own_share: float = 0.5
+    """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
+    pose could explain the majority."""
+    good_sigma_deg: float = 1.0
+    """Standard deviation of a frame's rotation, in degrees, up to which a scan is good, and beyond which it is
+    acceptable: edges of the object may be smeared by a hundredth of its size."""
+    largest_sigma_deg: float = 3.0
+    """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong and the scan is
+    poor."""
+    least_seen: float = 0.15
+    """Share of a frame's points that other frames must be able to judge: registration demands the same overlap."""
+    good_share: float = 0.95
+    """Share of the judged points that must agree for a scan to be good, in every frame and over all."""
+    least_share: float = 0.85
+    """The same for an acceptable scan."""
+    good_excess: float = 2.0
+    """Residual of a frame relative to the better pairs of the scan, up to which a scan is good; frames beyond
+    `cross.contradicting_excess` make it poor."""
+    cross: CrossFrameSettings = field(default_factory=CrossFrameSettings)
+    """When frames agree with each other."""
+
+
+# The decoding noise of every frame, measured so that an error of its pose does not count as noise.
+
+_ROUNDS = 4  # of reweighted least squares
+_FEWEST = 20  # points from which a noise can be measured: three for each of the six unknowns
+
+
+def frame_noise(linear: Linearisation, anchors: Anchors, frames: int) -> Float[Tensor, "frames"]:
+    """Robust 1 sigma of each frame's epipolar residuals after the best small change of its relative pose.
+
+    Pattern pixels, NaN for frames with few points. A wrong relative pose makes residuals that change smoothly over the
+    image, and a first-order change of the pose explains these. What is left is the noise of look-ups.
+    """
+    along = torch.nn.functional.normalize(linear.own_depth, dim=-1)
+    across = torch.stack([-along[:, 1], along[:, 0]], -1)
+    residual = (across * linear.residuals.own).sum(-1)
+    columns = (across[:, :, None] * linear.own).sum(1)
+    out = torch.full((frames,), float("nan"), dtype=torch.float64)
+    for k in range(frames):
+        mine = anchors.frame == k
+        if int(mine.sum()) >= _FEWEST:
+            out[k] = _remaining_sigma(residual[mine], columns[mine])
+    return out
+
+
+def _remaining_sigma(r: Float[Tensor, "n"], J: Float[Tensor, "n 6"]) -> float:
+    """Robust sigma of `r` less the combination of columns that fits it best."""
+    J = J / J.norm(dim=0).clamp_min(1e-300)  # translations and rotations have different units
+    left, sigma = r, _sigma(r)
+    for _ in range(_ROUNDS):
+        if sigma == 0:
+            break
+        w = geman_mcclure_weight((left / (3 * sigma)) ** 2).sqrt()
+        # The length of the baseline changes no epipolar line, so one direction is free: the shortest solution.
+        x = torch.linalg.lstsq(w[:, None] * J, (w * r)[:, None], rcond=1e-8, driver="gelsd").solution[:, 0]
+        left = r - J @ x
+        sigma = _sigma(left)
+    return sigma
+
+
+def _sigma(values: Float[Tensor, "n"]) -> float:
+    return MAD_TO_SIGMA * float(values.abs().median())
+
+
+@dataclass(frozen=True)
+class LookUps:
+    """Points of one frame that another frame can judge."""
+
+    frames: int
+    source: Int[ndarray, "points"]  # frame of every point that was tried
+    anchor: Int[ndarray, "n"]  # the point that was judged
+    viewer: Int[ndarray, "n"]  # by which frame
+    px: Float[ndarray, "n"]  # residual, pattern pixels
+    normalised: Float[ndarray, "n"]  # in units of what noise and stated uncertainty explain, 1 sigma
+    by_poses: Float[ndarray, "n"]  # share of the expected variance that comes from the stated uncertainty of the poses
+
+
+@dataclass(frozen=True)
+class PairAgreement:
+    """Two frames that saw some of the same surface."""
+
+    frames: tuple[int, int]
+    judged: int  # points of one that the other can judge, both ways
+    share: float  # of these, how many agree
+    px_median: float  # residual, pattern pixels
+    px_p95: float
+    excess: float  # residual in units of what is expected, relative to the scan's better pairs
+
+
+@dataclass(frozen=True)
+class FrameCrossAgreement:
+    """One frame against all others: medians over its pairs, weighted by judged points; NaN where it has no pair."""
+
+    points: int  # that were looked up
+    seen: float  # share of these that at least one other frame can judge
+    share: float  # of its judged points, how many agree
+    px_median: float  # pattern pixels
+    px_p95: float
+    excess: float
+
+
+@dataclass(frozen=True)
+class CrossFrameAgreement:
+    """All frames against each other, in the order of the frames; NaN where nothing could be judged."""
+
+    noise_px: float  # of one look-up: the median over the frames, pattern pixels
+    share: float  # of all judged points, how many agree
+    px_median: float
+    px_p95: float
+    frames: tuple[FrameCrossAgreement, ...]
+    pairs: tuple[PairAgreement, ...]  # with enough judged points
+
+
+def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> CrossFrameAgreement:
+    """Figures of the pairs, the frames and all together."""
+    pairs = _pairs(found, settings)
+    seen = np.zeros(len(found.source), bool)
+    seen[found.anchor] = True
+    of_frame: list[list[PairAgreement]] = [[] for _ in range(found.frames)]
+    for pair in pairs:
+        for k in pair.frames:
+            of_frame[k].append(pair)
+    return CrossFrameAgreement(
+        noise_px=noise_px,
+        share=_mean(found.normalised < settings.sigmas),
+        px_median=_quantile(found.px, 0.5),
+        px_p95=_quantile(found.px, 0.95),
+        frames=tuple(_frame(seen[found.source == k], of_frame[k]) for k in range(found.frames)),
+        pairs=tuple(pairs),
+    )
+
+
+def _pairs(found: LookUps, settings: CrossFrameSettings) -> list[PairAgreement]:
+    first, second = np.sort(np.stack([found.source[found.anchor], found.viewer]), 0)
+    pair = first * found.frames + second
+    order = np.argsort(pair, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []
+    groups = [mine for mine in groups if len(mine) >= settings.fewest_judged]
+    residuals = [_residual(found, mine, settings) for mine in groups]
+    allowed = settings.largest_typical * _quantile(np.array([t.stated for t in residuals]), 0.5)
+    reference = min(_quantile(np.array([t.noises for t in residuals]), settings.reference_quantile), allowed)
+    return [
+        PairAgreement(
+            frames=(int(first[mine[0]]), int(second[mine[0]])),
+            judged=len(mine),
+            share=_mean(found.normalised[mine] < settings.sigmas),
+            px_median=_quantile(found.px[mine], 0.5),
+            px_p95=_quantile(found.px[mine], 0.95),
+            excess=t.noises / (reference * t.chance),
+        )
+        for mine, t in zip(groups, residuals, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _PairResidual:
+    """The residual of a pair at the typical quantile."""
+
+    noises: float  # in units of the noise, but not below what look-ups decide
+    stated: float  # expected sigma, with the stated uncertainty of the poses, in the same units
+    chance: float  # factor by which right pairs may differ: an error of a pose is common to all points of a pair
+
+
+def _residual(found: LookUps, mine: Int[ndarray, "m"], settings: CrossFrameSettings) -> _PairResidual:
+    by_noise = np.sqrt(1 - found.by_poses[mine])  # share of the expected sigma
+    return _PairResidual(
+        max(_quantile(found.normalised[mine] / by_noise, settings.typical_quantile), settings.least_typical),
+        float(np.median(1 / by_noise)),
+        1 + (settings.rough_factor - 1) * _mean(found.by_poses[mine]),
+    )
+
+
+def _frame(seen: ndarray, pairs: list[PairAgreement]) -> FrameCrossAgreement:
+    weight = np.array([p.judged for p in pairs], np.float64)
+    figures = (
+        _weighted_median(np.array([getattr(p, key) for p in pairs]), weight)
+        for key in ("share", "px_median", "px_p95", "excess")
+    )
+    return FrameCrossAgreement(len(seen), _mean(seen) if len(seen) else 0.0, *figures)
+
+
+def _weighted_median(values: Float[ndarray, "n"], weight: Float[ndarray, "n"]) -> float:
+    if not len(values):
+        return float("nan")
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(total, total[-1] / 2)]])
+
+
+def _mean(values: ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _quantile(values: ndarray, q: float) -> float:
+    return float(np.quantile(values, q)) if len(values) else float("nan")
+
+
+# Whether frames agree with each other: coordinates of one, through its own two devices into those of another.
+#
+# A point is triangulated in one frame and projected into another camera; the coordinate decoded *there* is compared
+# with
+# where that frame's projector has the point. A point in front of what the other camera saw contradicts it: it would
+# have
+# been seen instead. One behind it may be hidden and is not judged; if it is a contradiction, that shows the other
+# way
+# round, where the other frame's points then lie in front.
+
+
+@one_library_thread()
+def cross_frame_agreement(
+    rig: Rig,
+    maps: CoordinateMaps,
+    sigma: Float[Tensor, "frames 12"],
+    settings: CrossFrameSettings | None = None,
+) -> CrossFrameAgreement:
+    """Compare all frames. The scene must be normalised: origin at the object's centre, radius about one.
+
+    `sigma` is 1 sigma of each frame's pose as a whole and of its projector against its camera (translation xyz and
+    rotation xyz each), in the scene's unit and radian: what these explain is no contradiction.
+    """
+    s = settings or CrossFrameSettings()
+    generator = torch.Generator().manual_seed(0)
+    anchors = place_anchors(rig, maps, s.pixels_of_each(rig.frames), generator)
+    most = rig.frames if rig.frames <= s.compared_frames else s.partners
+    together = partners(rig, anchors, maps, most, s.least_cosine, generator)
+    rows = observe(rig, anchors, maps, rig.frames, float("inf"), s.least_cosine, generator, together)
+    linear = linearise(rig, anchors, rows, maps)
+    noise = frame_noise(linear, anchors, rig.frames)
+    usual = float(noise.nanmedian())
+    noise = noise.nan_to_num(usual).clamp_max(s.largest_noise_ratio * usual)
+    size = linear.residuals.cross.norm(dim=-1)
+    by_noise = _variance_by_noise(linear, anchors, rows, noise**2 + (s.footprint * _footprint(rig, anchors, maps)) ** 2)
+    by_poses = _variance_by_poses(linear, anchors, rows, sigma)
+    normalised = size / (by_noise + by_poses).sqrt()
+    judged = linear.residuals.cross_valid & ((normalised < s.sigmas) | _in_front(rig, anchors, rows, maps))
+    looked_up = LookUps(
+        frames=rig.frames,
+        source=anchors.frame.numpy(),
+        anchor=rows.anchor[judged].numpy(),
+        viewer=rows.frame[judged].numpy(),
+        px=size[judged].numpy(),
+        normalised=normalised[judged].numpy(),
+        by_poses=(by_poses / (by_noise + by_poses))[judged].numpy(),
+    )
+    return summarise(looked_up, usual, s)
+
+
+def _footprint(rig: Rig, anchors: Anchors, maps: CoordinateMaps) -> Float[Tensor, "frames"]:
+    """Pattern pixels under one camera pixel: the median over each frame's points."""
+    uv, _ = project(rig.camera[anchors.frame], anchors.d_camera)
+    size = maps.look_up(anchors.frame, uv).jacobian.flatten(1).norm(dim=-1) / 2**0.5
+    found = [size[anchors.frame == k] for k in range(rig.frames)]
+    return torch.stack([x.median() if len(x) else torch.zeros((), dtype=size.dtype) for x in found])
+
+
+def _variance_by_noise(
+    linear: Linearisation, anchors: Anchors, rows: Observations, variance: Float[Tensor, "frames"]
+) -> Float[Tensor, "rows"]:
+    """Variance of a coordinate of each cross residual from the `variance` of look-ups in both frames, px^2.
+
+    An error of the anchor's own coordinate changes its depth, and that the residual.
+    """
+    own2, cross2 = (linear.own_depth**2).sum(-1).clamp_min(1e-300), (linear.cross_depth**2).sum(-1)
+    source = anchors.frame[rows.anchor]
+    return variance[rows.frame] + variance[source] * cross2 / own2[rows.anchor]
+
+
+def _variance_by_poses(
+    linear: Linearisation, anchors: Anchors, rows: Observations, sigma: Float[Tensor, "frames 12"]
+) -> Float[Tensor, "rows"]:
+    """Variance of each cross residual, both coordinates together, from the stated sigma of the poses, px^2."""
+    variance = sigma**2
+    length2 = (linear.own_depth**2).sum(-1).clamp_min(1e-300)
+    depth = (linear.own_depth[:, :, None] * linear.own).sum(1) / length2[:, None]  # by the projector's pose
+    through_depth = (depth**2 * variance[anchors.frame, 6:]).sum(-1)[rows.anchor] * (linear.cross_depth**2).sum(-1)
+    source, viewer = rows.pairs(anchors)
+    of_poses = torch.cat([variance[source, :6], variance[viewer]], 1)
+    return (linear.cross**2 * of_poses[:, None, :]).sum((1, 2)) + through_depth
+
+
+def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:
+    """Whether a point is nearer to the other camera than what that camera saw in its place."""
+    j, a = rows.frame, rows.anchor
+    p_world = transform(rig.T_world_camera[anchors.frame[a]], (anchors.depth[:, None] * anchors.d_camera)[a])
+    p_j = transform(inverse(rig.T_world_camera)[j], p_world)
+    uv, _ = project(rig.camera[j], p_j)
+    d_camera = unproject(rig.camera[j], uv)
+    T = rig.T_camera_projector[j]
+    d_projector = rotate(T, unproject(rig.projector, maps.look_up(j, uv).uv_projector))
+    depth, beyond = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
+    return (beyond > 0) & (p_j.norm(dim=-1) < depth)  # False where the rays do not meet
+
+
+# Cross-frame agreement of a scan, from its devices, poses and coordinate images in any world and unit.
+
+_POINTS_PER_FRAME = 500
+_EDGE = 2.0  # per cent of the points on each side that may lie outside the object's box: wrong decodings
+
+
+def compare_scan_frames(
+    scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None], settings: CrossFrameSettings | None = None
+) -> CrossFrameAgreement:
+    """The same as `compare_frames`, with the coordinates read from the scan's files, where the masks allow them."""
+    images = (_masked_coords(frame) for frame in scan.frames)
+    return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma, settings)
+
+
+def _masked_coords(frame: Frame) -> Float32[ndarray, "h w 2"]:
+    coords = frame.read_coords()
+    coords[~frame.read_mask()] = np.nan
+    return coords
+
+
+def compare_frames(
+    cameras: Sequence[Device],
+    projector: Device,
+    poses: DevicePoses,
+    coords: Iterable[Float32[ndarray, "_h _w 2"]],
+    sigma: Sequence[PoseSigma | None],
+    settings: CrossFrameSettings | None = None,
+) -> CrossFrameAgreement:
+    """Cross-frame agreement with the given poses; `sigma` in the poses' unit, None where poses count as exact."""
+    maps = CoordinateMaps.of(torch.from_numpy(image) for image in coords)
+    S_scene_world = _scene(cameras, projector, poses, maps)
+    rig = Rig.of(cameras, projector, poses, S_scene_world)
+    rows = [_four(s, S_scene_world.scale) for s in sigma]
+    stated = torch.tensor(rows, dtype=torch.float64).repeat_interleave(3, 1)
+    return cross_frame_agreement(rig, maps, stated, settings)
+
+
+def _four(s: PoseSigma | None, scale: float) -> tuple[float, float, float, float]:
+    """Translation and rotation of the frame, then of its projector against its camera; scene's unit and radian."""
+    if s is None:
+        return 0.0, 0.0, 0.0, 0.0
+    turns = np.radians([s.camera_rotation_deg, s.relative_rotation_deg]).tolist()
+    return s.camera_translation * scale, turns[0], s.relative_translation * scale, turns[1]
+
+
+def _scene(
+    cameras: Sequence[Device],
+    projector: Device,
+    poses: DevicePoses,
+    maps: CoordinateMaps,
+) -> Similarity:
+    """World to scene: the centre of the decoded surface becomes the origin, its radius one."""
+    parts = [np.zeros((0, 3))]
+    for k, (camera, T_c, T_p) in enumerate(zip(cameras, poses.T_world_camera, poses.T_world_projector, strict=True)):
+        image = maps.image(k).numpy()
+        decoded = np.flatnonzero(np.isfinite(image).all(-1))
+        some = decoded[evenly_spaced(len(decoded), min(_POINTS_PER_FRAME, len(decoded)))]
+        row, column = np.divmod(some, image.shape[1])
+        found = triangulate(
+            Intrinsics.of(camera, torch.float64),
+            torch.from_numpy(T_c),
+            torch.from_numpy(np.stack([column, row], -1) + 0.5),
+            Intrinsics.of(projector, torch.float64),
+            torch.from_numpy(T_p),
+            torch.from_numpy(image[row, column].astype(np.float64)),
+        )
+        good = found.p_world.isfinite().all(-1) & (found.depth_camera > 0) & (found.depth_projector > 0)
+        parts.append(found.p_world[good].numpy())
+    points: Float[ndarray, "n 3"] = np.concatenate(parts)
+    if len(points) < 2:
+        return Similarity.identity()
+    return centred_on(points, _EDGE)
+
+
+# Groups of frames: those that agree with each other, and weak places in a graph of pairs.
+
+Pair = tuple[int, int]
+
+
+def agreeing_groups(found: CrossFrameAgreement, settings: CrossFrameSettings | None = None) -> list[list[int]]:
+    """Groups of frames that agree with each other and contradict the other groups, the largest first.
+
+    Frames that no other frame can judge are in no group. Greedy correlation clustering: the two groups with the most
+    judged points in agreeing pairs, less those in contradicting pairs, are joined as long as the agreeing ones prevail.
+    All pairs between two groups thus count together: a pair that agrees by accident joins nothing.
+    """
+    s = settings or CrossFrameSettings()
+    frames = sorted({k for p in found.pairs for k in p.frames})
+    votes = np.zeros((len(frames), len(frames)))
+    for p in found.pairs:
+        i, j = (frames.index(k) for k in p.frames)
+        agrees = p.excess <= s.contradicting_excess
+        votes[i, j] = votes[j, i] = p.judged if agrees else -p.judged
+    groups = [[k] for k in frames]
+    while len(groups) > 1 and (pair := _best(votes)) is not None:
+        i, j = pair
+        groups[i] += groups.pop(j)
+        votes[i] += votes[j]
+        votes[:, i] += votes[:, j]
+        votes = np.delete(np.delete(votes, j, 0), j, 1)
+    return sorted((sorted(group) for group in groups), key=lambda group: (-len(group), group[0]))
+
+
+def _best(votes: Float[ndarray, "n n"]) -> Pair | None:
+    """The two groups (i < j) with the most votes for joining them; None if no two have any."""
+    i, j = np.unravel_index(int(np.argmax(np.triu(votes, 1))), votes.shape)
+    return (int(i), int(j)) if i < j and votes[i, j] > 0 else None
+
+
+def components(edges: Sequence[Pair], nodes: Iterable[int]) -> list[list[int]]:
+    """Groups of nodes that edges connect, the largest first."""
+    names = list(nodes)
+    index = {k: n for n, k in enumerate(names)}
+    ends = np.array([(index[a], index[b]) for a, b in edges], dtype=np.int64).reshape(-1, 2)
+    label = component_labels(ends[:, 0], ends[:, 1], len(names))
+    groups = [[names[n] for n in np.flatnonzero(label == c)] for c in np.unique(label)]
+    return sorted(groups, key=lambda group: (-len(group), group[0]))
+
+
+def bridges(edges: Sequence[Pair], nodes: Iterable[int]) -> list[tuple[Pair, list[int]]]:
+    """Edges whose removal splits the graph, each with the nodes of the smaller part."""
+    names = list(nodes)
+    whole = len(components(edges, names))
+    found = []
+    for edge in dict.fromkeys(edges):
+        parts = components([e for e in edges if e != edge], names)
+        if len(parts) > whole:
+            found.append((edge, min((part for part in parts if set(part) & set(edge)), key=len)))
+    return found

@@ -1,0 +1,476 @@
+"""Good, acceptable or poor, with the reasons."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sl_nerfstudio.calibration.board import BoardCalibration
+from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
+from sl_nerfstudio.review.agreement import (
+    CrossFrameAgreement,
+    FrameCrossAgreement,
+    VerdictSettings,
+    agreeing_groups,
+    bridges,
+)
+from sl_nerfstudio.scan import Scan
+
+Band = Literal["good", "acceptable", "poor"]
+BANDS: tuple[Band, ...] = ("good", "acceptable", "poor")
+_LISTED = 6  # names in a sentence
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Something that keeps a scan from being good, and how far it does."""
+
+    band: Band
+    sentence: str  # names frames and figures
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The worst of all judgements."""
+
+    band: Band
+    reasons: tuple[str, ...]  # the worst first; empty for a good scan
+
+
+def worst(reasons: Iterable[Reason]) -> Verdict:
+    """The verdict that some reasons lead to; good if there are none."""
+    ordered = sorted((r for r in reasons if r.band != "good"), key=lambda r: -BANDS.index(r.band))
+    return Verdict(ordered[0].band if ordered else "good", tuple(r.sentence for r in ordered))
+
+
+def listed(names: Sequence[str], most: int = _LISTED) -> str:
+    """Names for a sentence: the first few, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+# Frames that ended farther from their starting poses than these were stated to be off.
+
+_MOST_SIGMA = 6.0  # for each axis, RMS: by chance less than once in 10^20 frames
+
+
+@dataclass(frozen=True)
+class DepartedFrame:
+    """A frame whose starting pose and result exclude each other: one of them is wrong."""
+
+    name: str
+    turned_deg: float  # of the camera, from its starting pose
+    stated_deg: float  # 1 sigma of that, about each axis
+
+
+def departed_frames(scan: Scan, poses: DevicePoses) -> list[DepartedFrame]:
+    """Frames whose cameras are turned by far more than the stated uncertainty of their starts.
+
+    Positions are not compared: they depend on turns by as much as the camera is away from what it sees.
+    """
+    found = []
+    for frame, T_start, T_end in zip(scan.frames, scan.poses.T_world_camera, poses.T_world_camera, strict=True):
+        if frame.pose_sigma is None:
+            continue
+        turned, stated = angle_deg(T_start[:3, :3].T @ T_end[:3, :3]), frame.pose_sigma.camera_rotation_deg
+        if turned > _MOST_SIGMA * np.sqrt(3) * stated:
+            found.append(DepartedFrame(frame.name, turned, stated))
+    return found
+
+
+def describe_departed(found: Sequence[DepartedFrame]) -> str:
+    """Each frame in a few words."""
+    return ", ".join(f"{one.name} ({one.turned_deg:.1f} deg, stated {one.stated_deg:.2g})" for one in found)
+
+
+def departed_reasons(found: Sequence[DepartedFrame]) -> list[Reason]:
+    """A result that excludes what it started from is not good, whichever of them is wrong."""
+    return [
+        Reason("acceptable", f"{describe_departed([one])}: far from its starting pose; look at it") for one in found
+    ]
+
+
+# The verdict on a calibration from boards, and why.
+
+
+@dataclass(frozen=True)
+class CalibrationLimits:
+    """What makes a calibration good, acceptable or poor."""
+
+    good_focal: float = 0.003
+    """Standard deviation of a focal length, relative to it."""
+    acceptable_focal: float = 0.01
+    """The same for an acceptable calibration."""
+    determined_focal: float = 0.05
+    """The same, beyond which the poses do not determine the focal length and no result is written."""
+    good_centre: float = 0.005
+    """Standard deviation of a principal point, relative to the focal length."""
+    acceptable_centre: float = 0.015
+    """The same for an acceptable calibration."""
+    good_rms_px: float = 0.6
+    """RMS of the corners in either device, in pixels."""
+    acceptable_rms_px: float = 1.5
+    """The same for an acceptable calibration."""
+    good_excess: float = 2.0
+    """Error of predicted corners in left-out poses, relative to the RMS of the fit."""
+    good_coverage: float = 0.3
+    """Share of the image's cells that hold corners."""
+    least_tilt_deg: float = 20.0
+    """Largest angle between two boards, below which they count as parallel."""
+    least_depth_ratio: float = 1.15
+    """Distance of the farthest board over that of the nearest, below which all stand at one distance."""
+
+
+LIMITS = CalibrationLimits()
+DEVICES = ("camera", "projector")
+
+
+def judge_calibration(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> Verdict:
+    """The worst of all judgements."""
+    return worst(_reasons(found, limits))
+
+
+def undetermined(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> tuple[str, ...]:
+    """The devices whose focal length the poses do not determine."""
+    return tuple(
+        name
+        for name, device, sigma in zip(DEVICES, found.adjusted.rig.devices, found.sigmas, strict=False)
+        if sigma.focal() > limits.determined_focal * device.fl_x
+    )
+
+
+def shortcomings(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> tuple[str, ...]:
+    """What the poses lack, in half sentences."""
+    c, out = found.coverage, []
+    if c.tilt_deg < limits.least_tilt_deg:
+        out.append(f"the boards are nearly parallel (the largest angle between two is {c.tilt_deg:.0f} degrees)")
+    if c.depth_ratio < limits.least_depth_ratio:
+        out.append("all boards stand at one distance")
+    if c.camera < limits.good_coverage:
+        out.append(f"corners fill only {c.camera:.0%} of the camera's image")
+    if c.projector is not None and c.projector < limits.good_coverage:
+        out.append(f"corners fill only {c.projector:.0%} of the pattern")
+    return tuple(out)
+
+
+def _reasons(found: BoardCalibration, limits: CalibrationLimits) -> Iterator[Reason]:
+    lacking = shortcomings(found, limits)
+    because = f"; {', and '.join(lacking)}" if lacking else ""
+    for k, (device, sigma) in enumerate(zip(found.adjusted.rig.devices, found.sigmas, strict=True)):
+        name = DEVICES[k]
+        focal, centre = sigma.focal() / device.fl_x, sigma.centre() / device.fl_x
+        if focal > limits.good_focal:
+            band = "acceptable" if focal <= limits.acceptable_focal else "poor"
+            yield Reason(band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}")
+        if centre > limits.good_centre:
+            band = "acceptable" if centre <= limits.acceptable_centre else "poor"
+            yield Reason(
+                band, f"the principal point of the {name} is uncertain by {sigma.centre():.0f} px (1 sigma){because}"
+            )
+        if found.rms_px[k] > limits.good_rms_px:
+            band = "acceptable" if found.rms_px[k] <= limits.acceptable_rms_px else "poor"
+            yield Reason(band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them")
+        if found.left_out.error_px[k] > limits.good_excess * max(found.rms_px[k], found.adjusted.sigma_px[k]):
+            yield Reason(
+                "acceptable",
+                f"corners of left-out poses are predicted to {found.left_out.error_px[k]:.2f} px in the {name}, "
+                f"fitted ones to {found.rms_px[k]:.2f} px: more poses would help",
+            )
+
+
+# What a scan is judged by, as facts. What a command does not know is None, and is not judged.
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """One capture."""
+
+    name: str
+    in_scan: bool = True
+    component: int | None = 0  # group of frames that registration connects: 0 the largest; None: none
+    undecided: bool = False  # registration could not decide its pose
+    sigma_rotation_deg: float | None = None  # of the camera in the scan, 1 sigma per axis
+    decoded_share: float | None = None  # of the visible pattern
+    shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
+    missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
+    own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
+    degenerate: bool = False  # the pose of its projector is determined weakly by the frame itself
+
+
+@dataclass(frozen=True)
+class PairFacts:
+    """Two frames that registration connected."""
+
+    frames: tuple[str, str]
+    used: bool  # False: contradicted by other pairs
+    support: float = 1.0  # how much their surfaces share, and how little of that contradicts: from 0 to 1
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """All captures of a scan, in order."""
+
+    frames: tuple[FrameFacts, ...]
+    pairs: tuple[PairFacts, ...] | None = None  # of registration
+    cross: CrossFrameAgreement | None = None  # of the frames in the scan, in their order
+    wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
+    turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
+    by_order: bool = False  # frames fit at several sides, and the order of capture decided
+    adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
+
+    @property
+    def in_scan(self) -> tuple[FrameFacts, ...]:
+        """Frames in the scan."""
+        return tuple(frame for frame in self.frames if frame.in_scan)
+
+
+# The verdict on a scan: the worst of everything that is known of it, not an average.
+
+
+def judge_scan(facts: ScanFacts, settings: VerdictSettings | None = None) -> Verdict:
+    """The verdict with all reasons; facts that are not known are not judged."""
+    return worst(reasons_of(facts, settings or VerdictSettings()))
+
+
+def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Everything that keeps the scan from being good."""
+    if len(facts.in_scan) < 2:
+        yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used")
+        return
+    yield from _left_out(facts, settings)
+    yield from _undecided(facts, settings)
+    if facts.by_order:
+        yield _placed_by_order(facts.turns_deg)
+    elif facts.turns_deg:
+        yield Reason("poor", symmetry_sentence(facts.turns_deg))
+    if facts.pairs is not None:
+        yield from _weak_connections(facts, settings)
+    if facts.cross is not None:
+        yield from cross_reasons([f.name for f in facts.in_scan], facts.cross, settings)
+    yield from _decoding(facts, settings)
+    yield from _missing(facts, settings)
+    degenerate = [f.name for f in facts.in_scan if f.degenerate]
+    if len(degenerate) > settings.most_frames * len(facts.in_scan):
+        yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
+    if not facts.adjusted:
+        yield Reason(
+            "acceptable", "the poses are those of the registration alone (--no-adjust); frames were compared within "
+            "its uncertainty only",
+        )  # fmt: skip
+    if facts.wrong_intrinsics:
+        yield Reason("acceptable", "the captures contradict the stated intrinsics")
+
+
+def _left_out(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Frames that are not in the scan: those that form groups of their own, and single ones."""
+    lost = [f for f in facts.frames if not f.in_scan]
+    band = _share_band(len(lost), len(facts.frames), settings)
+    apart = sorted({f.component for f in lost if f.component})
+    for number in apart:
+        names = [f.name for f in lost if f.component == number]
+        yield Reason(
+            band,
+            f"{listed(names)}: {'form a group of their own' if len(names) > 1 else 'stands alone'}; the connection to "
+            "the other frames is not certain, so they are not in the scan",
+        )
+    single = [f.name for f in lost if not f.component]
+    if single:
+        yield Reason(band, f"{len(single)} of {len(facts.frames)} frames were left out: {listed(single)}")
+
+
+def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Frames in the scan whose pose is not certain."""
+    good, largest = settings.good_sigma_deg, settings.largest_sigma_deg
+    lost = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > largest]
+    if lost:
+        yield Reason("poor", _known_only(lost, largest))
+    loose = [f for f in facts.in_scan if good < (f.sigma_rotation_deg or 0.0) <= largest]
+    if loose and facts.adjusted:  # without the adjustment, it is so in every frame of any scan
+        yield Reason("acceptable", _known_only(loose, good))
+    names = [f.name for f in facts.in_scan if f.undecided and f not in lost + loose]
+    if names:
+        band = _share_band(len(names), len(facts.in_scan), settings)
+        yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well")
+
+
+def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
+    """That the rotation of frames is uncertain, with the most uncertain one."""
+    sigma = max(f.sigma_rotation_deg or 0.0 for f in frames)
+    said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
+    return (
+        f"{listed([f.name for f in frames])}: rotation known only to {said} degrees (1 sigma of the least certain; at "
+        f"most {limit_deg:g})"
+    )
+
+
+def symmetry_sentence(turns_deg: Sequence[float]) -> str:
+    """That the surface looks the same after turns, and what it means."""
+    return (
+        f"{_same_after(turns_deg)}, and pairs of frames contradict each other by it: frames may be placed at another "
+        "side than they show. The surface is right if the object really is that symmetric; for the poses, capture in "
+        "small steps around it, or put something beside it that looks different from all sides"
+    )
+
+
+def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
+    """What it means that the order of capture decided which side each frame shows."""
+    how = "each was placed by the order of capture, turned as little as possible against the one before"
+    if not turns_deg:
+        return Reason(
+            "acceptable",
+            f"frames fit at several sides of the object; {how}. Unless they were captured in this order, in small "
+            "steps, they are at other sides than they show",
+        )
+    return Reason(
+        "poor",
+        f"{_same_after(turns_deg)}, so nothing tells which side a frame shows; {how}. That is right if the frames were "
+        f"captured in this order, in steps of less than {min(turns_deg) / 2:.0f} degrees; to be certain, put something "
+        "beside it that looks different from all sides",
+    )
+
+
+def _same_after(turns_deg: Sequence[float]) -> str:
+    return f"the object looks the same after a turn by {listed([f'{angle:.0f}' for angle in turns_deg])} degrees"
+
+
+def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Pairs of frames that contradict other pairs, and single pairs that hold the scan together."""
+    pairs, names = facts.pairs or (), [f.name for f in facts.in_scan]
+    inside = [p for p in pairs if set(p.frames) <= set(names)]
+    used = [p.frames for p in inside if p.used]
+    # frames from opposite sides are compared, too, where no order is known, and fit somewhere, though not well
+    doubtful = [name for name in names if _support(name, inside, False) > _support(name, inside, True)]
+    if doubtful:
+        yield Reason(
+            _share_band(len(doubtful), len(names), settings),
+            f"{listed(doubtful)}: most pairs with other frames contradict the pose found",
+        )
+    index = {name: k for k, name in enumerate(names)}
+    if len(names) < 3:
+        return  # the only pair: nothing could confirm it but the agreement of its coordinates, which is judged
+    for (a, b), part in bridges([(index[a], index[b]) for a, b in used], range(len(names))):
+        yield Reason(
+            "acceptable",
+            f"only the pair {names[a]} and {names[b]} connects {listed([names[k] for k in part])} to the other frames; "
+            "no other pair confirms it",
+        )
+
+
+def _support(name: str, pairs: Iterable[PairFacts], used: bool) -> float:
+    """Of the pairs of a frame that are used, or are not, together."""
+    return math.fsum(p.support for p in pairs if name in p.frames and p.used == used)
+
+
+def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement, settings: VerdictSettings) -> Iterator[Reason]:
+    """What the coordinates of the frames say about each other; `names` in the order of `cross.frames`."""
+    alone = [name for name, f in zip(names, cross.frames, strict=True) if not f.seen >= settings.least_seen]
+    if alone:
+        yield Reason(
+            _share_band(len(alone), len(names), settings),
+            f"{listed(alone)}: no other frame shows enough of the same surface (at least {settings.least_seen:.0%}) to "
+            "confirm the pose",
+        )
+    if not cross.pairs:
+        return
+    groups = agreeing_groups(cross, settings.cross)
+    named = {k for group in groups[1:] for k in group}
+    yield from _contradicting_groups(names, cross, groups)
+    for k, (name, frame) in enumerate(zip(names, cross.frames, strict=True)):
+        band = frame_band(frame, settings)
+        if band != "good" and k not in named:
+            yield Reason(band, _frame_sentence(name, frame, cross, band))
+    if cross.share < settings.good_share:
+        yield Reason(
+            "poor" if cross.share < settings.least_share else "acceptable",
+            f"of all points that two frames saw, {cross.share:.0%} agree: 95 % lie within {cross.px_p95:.2g} px, the "
+            f"noise is {cross.noise_px:.2g} px",
+        )
+
+
+def frame_band(frame: FrameCrossAgreement, settings: VerdictSettings) -> Band:
+    """The judgement on one frame by its agreement with the others."""
+    if frame.share < settings.least_share or frame.excess > settings.cross.contradicting_excess:
+        return "poor"
+    return "acceptable" if frame.share < settings.good_share or frame.excess > settings.good_excess else "good"
+
+
+def _contradicting_groups(
+    names: Sequence[str], cross: CrossFrameAgreement, groups: Sequence[Sequence[int]]
+) -> Iterator[Reason]:
+    if len(groups) > 1 and len(groups[0]) <= len(names) / 4:
+        yield Reason(
+            "poor",
+            f"the frames contradict each other: at most {len(groups[0])} of {len(names)} agree, and 95 % of the points "
+            f"that two frames saw lie only within {cross.px_p95:.2g} px",
+        )
+        return
+    for group in groups[1:]:
+        between = [p.px_p95 for p in cross.pairs if len(set(p.frames) & set(group)) == 1]
+        if not between:
+            yield Reason(
+                "poor",
+                f"{listed([names[k] for k in group])}: no surface in common with the other frames, so nothing confirms "
+                "how the two parts lie to each other",
+            )
+            continue
+        if len(group) == 1:
+            yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross, "poor"))
+            continue
+        yield Reason(
+            "poor",
+            f"{listed([names[k] for k in group])}: agree with each other and contradict the other frames: 95 % of the "
+            f"points that both saw lie only within {_median(between):.2g} px (in the whole scan: noise "
+            f"{cross.noise_px:.2g} px)",
+        )
+
+
+def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgreement, band: Band) -> str:
+    usual = _median([f.px_p95 for f in cross.frames if math.isfinite(f.px_p95)])
+    return (
+        f"{name}: {'contradicts' if band == 'poor' else 'agrees less well with'} the frames that saw the same surface: "
+        f"{frame.excess:.2g} times the usual residual, {frame.share:.0%} of its points within the noise, 95 % within "
+        f"{frame.px_p95:.2g} px (usual in this scan: {usual:.2g} px)"
+    )
+
+
+def _decoding(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Frames with little decoded, and frames whose coordinates contradict their own pose."""
+    own = "of the decoded pixels agree with the pose of the projector"
+    seen = [(f.shared_decoded, f) for f in facts.in_scan]
+    alone = [(f.decoded_share, f) for f in facts.in_scan if f.shared_decoded is None]
+    for shares, least, words in (
+        (seen, settings.least_decoded, "of the surface that other frames show was decoded"),
+        (alone, settings.least_decoded, "of the visible pattern was decoded"),
+        ([(f.own_share, f) for f in facts.in_scan], settings.least_own_share, own),
+    ):
+        weak = [(value, f.name) for value, f in shares if value is not None and value < least]
+        if weak:
+            share, name = min(weak)
+            others = f"; also little in {listed([n for _, n in weak if n != name])}" if len(weak) > 1 else ""
+            band = _share_band(len(weak), len(facts.in_scan), settings)
+            yield Reason(band, f"{name}: only {share:.0%} {words} (at least {least:.0%}){others}")
+
+
+def _missing(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+    """Frames that saw nothing where others show a surface."""
+    most = settings.most_missing
+    found = [(f.missing_share, f.name) for f in facts.in_scan if f.missing_share is not None and f.missing_share > most]
+    if found:
+        worst_share = max(found)[0]
+        yield Reason(
+            _share_band(len(found), len(facts.in_scan), settings),
+            f"{listed([name for _, name in found])}: saw nothing of the pattern where other frames show a surface in "
+            f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {most:.0%}): something "
+            "cast a shadow, or frames are at the wrong place",
+        )
+
+
+def _share_band(count: int, total: int, settings: VerdictSettings) -> Band:
+    return "poor" if count > settings.most_frames * total else "acceptable"
+
+
+def _median(values: Sequence[float]) -> float:
+    ordered = sorted(values)
+    return ordered[len(ordered) // 2] if ordered else math.nan

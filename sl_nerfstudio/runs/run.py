@@ -1,0 +1,451 @@
+"""What a run's folder holds, without running anything from it: for runs from elsewhere, and before an export."""
+
+import enum
+import json
+import types
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from itertools import product
+from pathlib import Path, PosixPath
+from typing import Any, Literal, Protocol, Union, cast, get_args, get_origin, get_type_hints, runtime_checkable
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
+from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
+from sl_nerfstudio.dataparser.dataparser import scan_fingerprint, scan_root
+from sl_nerfstudio.errors import UserError, first_line, last_line
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.late_imports import compiler_on_demand, shapes_without_symbols
+from sl_nerfstudio.model.model import SLModelConfig
+from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
+from sl_nerfstudio.model.pipeline import SLPipelineConfig, require_together
+from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
+from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.scan import Scan, read_scan
+
+# config.yml of a run, read without running anything from it: only the settings of this package's runs are made.
+#
+# nerfstudio writes config.yml with YAML tags that name Python classes, and its own loader calls whatever they
+# name. Here a tag may name a class of `_expected()`, a path or an enumeration's value; anything else is refused.
+
+_MOST_BYTES = 1 << 20  # a configuration has some ten thousand
+_PYTHON = "tag:yaml.org,2002:python/"
+
+
+def read_config(path: Path) -> SLTrainerConfig:
+    """The settings of a run. Raises UserError, with the line, for anything else and for names that are not settings."""
+    if not path.is_file():
+        raise UserError(
+            f"--load-config {path}: no such file\n"
+            "    cause:  the path is mistyped, or the training never started\n"
+            "    remedy: give the config.yml that ns-train prints at the end: outputs/SCAN/sl-neus/DATE/config.yml"
+        )
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it has {path.stat().st_size / 1e6:.0f} MB")
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
+    except _NotExpected as error:
+        raise UserError(
+            f"{path}, line {error.line}: {error.problem}\n"
+            "    cause:  it is not a run of sl-neus or sl-neus-paper, is of another version of this package, or "
+            "was edited, perhaps to run code here\n"
+            "    remedy: give an untouched config.yml of ns-train sl-neus; use ns-export for other methods, if you "
+            "trust where the file comes from"
+        ) from error
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OSError) as error:
+        raise UserError(
+            f"{path}{_line(error)}: cannot be read as a training configuration ({_reason(error)})\n"
+            "    cause:  the file is damaged, or something else\n"
+            "    remedy: give an untouched config.yml that ns-train wrote"
+        ) from error
+    if not isinstance(config, SLTrainerConfig):
+        raise UserError(f"{path}: is not a training configuration\n    remedy: give the config.yml that ns-train wrote")
+    return config
+
+
+def _line(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return "" if mark is None else f", line {mark.line + 1}"
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    words = getattr(error, "problem", None) or first_line(error)
+    return str(words)[:200]
+
+
+class _NotExpected(Exception):
+    """A tag, a setting or a value that no configuration of this package has."""
+
+    def __init__(self, node: yaml.Node, problem: str) -> None:
+        self.line, self.problem = node.start_mark.line + 1, problem
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """What may be named, by "module.name"."""
+
+    settings: Mapping[str, Any]  # an instance with its defaults
+    targets: Mapping[str, type]  # what settings are for: models, optimisers, loggers
+    enums: Mapping[str, type[enum.Enum]]
+
+
+@cache
+def _expected() -> _Expected:
+    """Everything that occurs in a configuration with every kind of setting."""
+    groups = (FusedAdamOptimizerConfig(), RowAdamOptimizerConfig(), DecaySchedulerConfig())
+    pipeline = SLPipelineConfig(datamanager=SLDataManagerConfig(), model=SLModelConfig())
+    whole = SLTrainerConfig(pipeline=pipeline, optimizers={str(i): group for i, group in enumerate(groups)})
+    found = list(_parts(whole))
+    return _Expected(
+        {_name(type(part)): part for part in found if is_dataclass(part) and not isinstance(part, type)},
+        {_name(part): part for part in found if isinstance(part, type)},
+        {_name(type(part)): type(part) for part in found if isinstance(part, enum.Enum)},
+    )
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__name__}"
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    yield value
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _parts(getattr(value, field.name))
+    elif isinstance(value, dict | types.MappingProxyType):
+        for item in value.values():
+            yield from _parts(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _parts(item)
+
+
+class _ConfigLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, which knows plain values only, and the classes above."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Refuse merge keys (`<<`): ns-train writes none, and nested ones grow without bound."""
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                raise _NotExpected(key, "`<<` is not a setting")
+
+    def settings(self, name: str, node: yaml.Node) -> Any:
+        """An instance of an expected class, with exactly its fields and with values of their types."""
+        if name not in _expected().settings or not isinstance(node, yaml.MappingNode):
+            raise _NotExpected(node, f"{name} is not a class of settings that is expected here")
+        kind = type(_expected().settings[name])
+        values = self.construct_mapping(node, deep=True)
+        names, hints = [field.name for field in fields(kind)], _hints(name)
+        for key, item in node.value:
+            if key.value not in names:
+                raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}")
+            if not _fits(values[key.value], hints[key.value]):
+                raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise _NotExpected(node, f"{kind.__name__} lacks the setting {missing[0]!r}")
+        made = object.__new__(kind)
+        made.__dict__.update(values)
+        return made
+
+    def called(self, name: str, node: yaml.Node) -> Any:
+        """A path, or the value of an enumeration."""
+        given = self.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else None
+        if given is not None and all(isinstance(part, str) for part in given):
+            if name in ("pathlib.PosixPath", "pathlib._local.PosixPath"):
+                return PosixPath(*given)
+            if name in _expected().enums and len(given) == 1:
+                return _expected().enums[name](given[0])
+        raise _NotExpected(node, f"{name} is not a part of a training's settings")
+
+    def named(self, name: str, node: yaml.Node) -> type:
+        """One of the classes that settings are for."""
+        if name not in _expected().targets:
+            raise _NotExpected(node, f"{name} is not a class that is expected here")
+        return _expected().targets[name]
+
+    def other(self, tag: str, node: yaml.Node) -> Any:
+        """Any other tag for Python."""
+        raise _NotExpected(node, f"{tag} is not a part of a training's settings")
+
+
+_ConfigLoader.add_constructor(
+    f"{_PYTHON}tuple", lambda loader, node: tuple(loader.construct_sequence(cast(Any, node), deep=True))
+)
+_ConfigLoader.add_multi_constructor(f"{_PYTHON}object:", _ConfigLoader.settings)
+_ConfigLoader.add_multi_constructor(f"{_PYTHON}object/apply:", _ConfigLoader.called)
+_ConfigLoader.add_multi_constructor(f"{_PYTHON}name:", _ConfigLoader.named)
+_ConfigLoader.add_multi_constructor("", _ConfigLoader.other)
+
+
+@cache
+def _hints(name: str) -> dict[str, Any]:
+    """Types of a class's fields; for `_target`, the one class that belongs there."""
+    default = _expected().settings[name]
+    found = get_type_hints(type(default))
+    return {**found, "_target": Literal[default._target]} if "_target" in found else found
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value has a type; unknown kinds of types are not checked."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, part) for part in arguments)
+    if origin is Literal:
+        return any(value == part and type(value) is type(part) for part in arguments)
+    if origin is dict:
+        return isinstance(value, dict) and all(_fits(item, arguments[1]) for item in value.values())
+    if origin is tuple:
+        each = [arguments[0]] * len(value) if isinstance(value, tuple) and Ellipsis in arguments else arguments
+        return isinstance(value, tuple) and len(value) == len(each) and all(map(_fits, value, each))
+    if hint is Any:
+        return True
+    if hint is None:
+        return value is None
+    if hint is float:
+        return isinstance(value, float | int) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, hint) if isinstance(hint, type) and origin is None else True
+
+
+# A finished training run, loaded for export on the GPU if there is one, else on the CPU.
+
+_SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
+
+
+@runtime_checkable
+class TrainedModel(Protocol):
+    """What an export needs from a model; poses are in the scan's world and unit, the field is in the scene frame."""
+
+    scan: Scan
+    S_scene_world: Similarity
+
+    @property
+    def cell(self) -> float:
+        """Length of the field's finest cells, in the scan's unit."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field is evaluated."""
+        ...
+
+    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance in scene units."""
+        ...
+
+    def poses(self) -> DevicePoses:
+        """Poses of cameras and projectors."""
+        ...
+
+    def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
+        """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
+        ...
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
+        ...
+
+    def unplaced(self) -> list[bool]:
+        """Of each frame, whether it does not agree with the others."""
+        ...
+
+    def self_calibration(self) -> SelfCalibration | None:
+        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
+        ...
+
+    def history(self) -> dict[str, list[float]]:
+        """Convergence curves, with the steps under `step`."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A model with the settings it was trained under."""
+
+    model: TrainedModel
+    config: Any  # nerfstudio's TrainerConfig
+    step: int
+
+
+def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
+    """Load the last checkpoint of the run that `config_path` (config.yml) describes.
+
+    nerfstudio's own `eval_setup` fails with assertions or tracebacks if files were moved or truncated. Here a run whose
+    folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
+    Raises UserError for anything missing, broken or made by another method.
+    """
+    with warnings.catch_warnings(), compiler_on_demand():
+        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
+        from sl_nerfstudio.dataparser.dataparser import load_scan
+        from sl_nerfstudio.model.pipeline import SLPipeline, require_together
+
+    path = config_file(config_path)
+    config: Any = read_config(path)
+    checkpoint = read_checkpoint(last_checkpoint(config, path))
+    if checkpoint.step < 0:
+        raise UserError(
+            f"{checkpoint.path}: holds adjusted poses, but no surface yet\n"
+            "    cause:  the training was interrupted before its first step\n"
+            f"    remedy: go on: ns-train {config.method_name} --load-config {path}"
+        )
+    require_settings(path, config)
+    root = _scan_folder(config, data)
+    config.pipeline.datamanager.data = root
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
+    require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
+    with shapes_without_symbols():
+        pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
+    _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
+    try:
+        pipeline.load_pipeline(checkpoint.weights, checkpoint.step)
+    except RuntimeError as error:
+        raise UserError(
+            f"{checkpoint.path}: does not fit the settings in {path} ({last_line(error)})\n"
+            "    cause:  another version of this package was used\n"
+            "    remedy: use the version that trained it, or train again"
+        ) from error
+    pipeline.eval()
+    _require_same_scene(path.absolute().parent / "dataparser_transforms.json", pipeline.model.S_scene_world)
+    return TrainedRun(pipeline.model, config, checkpoint.step)
+
+
+def config_file(path: Path) -> Path:
+    """The config.yml of a run, given it or its folder."""
+    return path / "config.yml" if path.is_dir() else path
+
+
+def require_settings(path: Path, config: Any) -> None:
+    """Raise UserError if settings in config.yml that decide the result were edited after the run began."""
+    if settings_fingerprint(config) != config.pipeline.settings_fingerprint:
+        raise UserError(
+            f"{path}: its settings are not those that the run was started with\n"
+            "    cause:  the file was edited, or written by another version of this package\n"
+            "    remedy: put back the original file, or train again with the settings that you want"
+        )
+
+
+def last_checkpoint(config: Any, path: Path) -> Path:
+    """The last checkpoint next to config.yml, or where the settings put it if there is none. Raises UserError."""
+    folders = [path.absolute().parent / config.relative_model_dir, config.get_checkpoint_dir()]
+    for folder in folders:
+        found = checkpoints_in(folder)
+        if found:
+            return found[-1]
+    raise UserError(
+        f"{folders[0]}: no checkpoint step-*.ckpt\n"
+        "    cause:  the training was interrupted before its first checkpoint, or its folder was moved\n"
+        "    remedy: train again, or put nerfstudio_models/ back next to config.yml"
+    )
+
+
+def _scan_folder(config: Any, data: Path | None) -> Path:
+    from sl_nerfstudio.dataparser.dataparser import scan_root
+
+    stated = data or config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data
+    root = scan_root(stated)
+    if not (root / "transforms.json").is_file():
+        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted after the training"
+        raise UserError(
+            f"{root}: has no transforms.json, so it is not the scan that the run was trained on\n"
+            f"    cause:  {cause}\n    remedy: give its folder: --data FOLDER"
+        )
+    return root
+
+
+def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str]) -> None:
+    """Raise UserError if weights are missing: nerfstudio would silently keep their initial values."""
+    missing = {_plain(key) for key in wanted} - {_plain(key) for key in stored}
+    if missing:
+        raise UserError(
+            f"{path}: lacks {len(missing)} of the model's weights, such as {min(missing)}\n"
+            "    cause:  it was written by another version of this package, or with other settings\n"
+            "    remedy: use the version that trained it, or train again"
+        )
+
+
+def _require_same_scene(path: Path, S_scene_world: Similarity) -> None:
+    """Raise UserError if the scan now gives another scene frame than the one nerfstudio stored in training."""
+    try:
+        stated = json.loads(path.read_text(encoding="utf-8"))
+        trained = stated["scale"] * np.array(stated["transform"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # without that file there is nothing to compare with
+    corners = S_scene_world.inverse().points(np.array(list(product((-1.0, 1.0), repeat=3))))
+    moved = corners @ trained[:, :3].T + trained[:, 3] - S_scene_world.points(corners)
+    if np.abs(moved).max() > _SAME_SCENE:
+        raise UserError(
+            f"{path}: the scan has another place in the scene than in the training "
+            f"(off by {np.abs(moved).max():.2g} of the scene's radius)\n"
+            "    cause:  the file was edited, or another version of this package made the run\n"
+            "    remedy: put back the file, use the version that trained it, or train again"
+        )
+
+
+def _plain(key: str) -> str:
+    return key.replace("module.", "")  # added by training on several GPUs
+
+
+@dataclass(frozen=True)
+class RunCheck:
+    """A run without faults."""
+
+    folder: Path
+    config: Any  # SLTrainerConfig
+    last: Checkpoint
+    checkpoints: int
+    scan: Path
+    has_scan: bool  # False: the scan is not on this machine, and was not compared
+
+
+def check_run(path: Path) -> RunCheck:
+    """Check the config.yml at `path` or in that folder, its checkpoints, and that they and the scan belong together.
+
+    Raises UserError, with everything that is wrong once config.yml could be read.
+    """
+    file = config_file(path)
+    config = read_config(file)
+    saved = checkpoints_in(last_checkpoint(config, file).parent)
+    faults: list[str] = []
+    good: list[Checkpoint] = []
+    for checkpoint in saved:
+        try:
+            good.append(read_checkpoint(checkpoint))
+        except UserError as error:
+            faults.append(str(error))
+    scan, found = _scan_there(config)
+    try:
+        require_settings(file, config)
+        for checkpoint in good:
+            _require_together(config, checkpoint, scan, found)
+    except UserError as error:
+        faults.append(str(error))
+    if faults:
+        raise UserError("\n".join(faults))
+    return RunCheck(file.absolute().parent, config, good[-1], len(saved), scan, found is not None)
+
+
+def _scan_there(config: Any) -> tuple[Path, str | None]:
+    """The scan's folder, and its fingerprint if it is there."""
+    scan = scan_root(config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data)
+    return scan, scan_fingerprint(read_scan(scan)) if (scan / "transforms.json").is_file() else None
+
+
+def _require_together(config: Any, checkpoint: Checkpoint, scan: Path, found: str | None) -> None:
+    try:
+        require_together(config.pipeline, checkpoint.weights, scan, found or config.pipeline.scan_fingerprint)
+    except UserError as error:
+        raise UserError(f"{checkpoint.path}: {error}") from error

@@ -1,0 +1,410 @@
+"""Do poses and coordinates follow the conventions of this format? Decided by triangulating correspondences.
+
+Starting poses may be rough: frames wrong by 10 degrees, relative poses by a few. A mistake is therefore reported only
+if the poses as given fit badly *and* undoing one known mistake makes them fit several times better; or if nearly all
+frames are worse than any calibration error can make them.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64
+from numpy import ndarray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.numerics import evenly_spaced
+from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
+from sl_nerfstudio.scan.document import Problem
+
+# A few hundred correspondences of each frame, kept while the frames are read one by one.
+
+SAMPLES = 400  # per frame; enough for a median, few enough to try dozens of interpretations
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Camera pixels and pattern coordinates of one frame, with everything needed to triangulate them."""
+
+    name: str
+    camera: Device
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    uv_camera: Float64[ndarray, "n 2"]
+    uv_projector: Float64[ndarray, "n 2"]
+
+
+def sample_pixels(
+    coords: Float32[ndarray, "h w 2"], where: Bool[ndarray, "h w"]
+) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
+    """Pixel centres and coordinates at SAMPLES pixels spread evenly over `where` (some twice if it has fewer)."""
+    flat = np.flatnonzero(where)
+    chosen = flat[evenly_spaced(len(flat), SAMPLES)]
+    rows, columns = np.divmod(chosen, where.shape[1])
+    return np.stack([columns, rows], -1) + 0.5, coords.reshape(-1, 2)[chosen].astype(np.float64)
+
+
+# How far a frame's points are from those of all other frames, without a search tree for every frame.
+
+_FEWEST_POINTS = 10
+
+
+class OtherClouds:
+    """Point clouds of frames, to be searched without the cloud of one frame.
+
+    Two numbers differ in at least one binary digit. So the clouds whose number differs from k are those that differ
+    in the first digit, in the second, and so on: two trees for each digit serve all frames.
+    """
+
+    def __init__(self, clouds: Sequence[Float64[ndarray, "_ 3"]]) -> None:
+        """`clouds` are numbered in their order."""
+        points = np.concatenate([np.empty((0, 3)), *clouds])
+        number = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+        self._sizes = [len(cloud) for cloud in clouds]
+        self._total = len(points)
+        digits = range(max(1, (len(clouds) - 1).bit_length()))
+        self._trees = [[KDTree(points[number >> digit & 1 == value]) for value in (0, 1)] for digit in digits]
+
+    def distance(self, cloud: Float64[ndarray, "n 3"], index: int) -> float:
+        """Median distance from the points of `cloud` to the nearest one of any cloud but number `index`.
+
+        Infinite where either side has too few points.
+        """
+        if len(cloud) < _FEWEST_POINTS or self._total - self._sizes[index] < _FEWEST_POINTS:
+            return np.inf
+        trees = [pair[1 - (index >> digit & 1)] for digit, pair in enumerate(self._trees)]
+        nearest = np.min([tree.query(cloud)[0] for tree in trees if tree.n], axis=0)
+        return float(np.median(nearest))
+
+
+# Other conventions that poses and coordinates may follow by mistake, and how well each of them fits.
+
+PoseConvention = Literal["as given", "inverted", "OpenCV axes", "inverted, OpenCV axes"]
+POSE_CONVENTIONS: tuple[PoseConvention, ...] = ("as given", "inverted", "OpenCV axes", "inverted, OpenCV axes")
+_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # device axes of OpenCV <-> of this format
+_CLOUD_POINTS = 100  # of a frame, for distances between frames
+_FEWEST_CLOUD_POINTS = 20  # the same in a scan of very many frames
+_MOST_POINTS = 200_000  # of all frames together
+
+
+@dataclass(frozen=True)
+class Interpretation:
+    """One way to interpret a scan. Coordinates are first swapped, then mirrored."""
+
+    camera: PoseConvention = "as given"
+    projector: PoseConvention = "as given"
+    projector_unit: float = 1.0  # factor on the projector's position
+    swapped: bool = False
+    mirrored_x: bool = False
+    mirrored_y: bool = False
+
+
+@dataclass(frozen=True)
+class GeometricFit:
+    """How well rays meet and frames agree under one interpretation, frame by frame."""
+
+    residual_px: Float64[ndarray, "n"]  # median epipolar residual; inf: most points are behind a device
+    spread: Float64[ndarray, "n"]  # median distance to the points of other frames, in depths; inf: too few points
+    depth: float  # median distance of all points from their cameras; 0: no points
+    clouds: tuple[Float64[ndarray, "_ 3"], ...]  # some triangulated points of each frame
+
+    @property
+    def typical_px(self) -> float:
+        """Median of the frames' residuals."""
+        return float(np.median(self.residual_px))
+
+    @property
+    def typical_spread(self) -> float:
+        """Median of the frames' spreads."""
+        return float(np.median(self.spread))
+
+
+def other_interpretations() -> Iterator[Interpretation]:
+    """Every known mistake, the more common ones first."""
+    for both in POSE_CONVENTIONS[1:]:
+        yield Interpretation(camera=both, projector=both)
+    for camera, projector in product(POSE_CONVENTIONS, POSE_CONVENTIONS):
+        if camera != projector:
+            yield Interpretation(camera=camera, projector=projector)
+    for swapped, x, y in product((False, True), (False, True), (False, True)):
+        if swapped or x or y:
+            yield Interpretation(swapped=swapped, mirrored_x=x, mirrored_y=y)
+    yield Interpretation(projector_unit=1e3)
+    yield Interpretation(projector_unit=1e-3)
+
+
+def apply_interpretation(interpretation: Interpretation, frame: Correspondences, projector: Device) -> Correspondences:
+    """The frame with its poses and coordinates interpreted that way, in the conventions of this format."""
+    T_world_projector = _converted_pose(frame.T_world_projector, interpretation.projector).copy()
+    T_world_projector[:3, 3] *= interpretation.projector_unit
+    return replace(
+        frame,
+        T_world_camera=_converted_pose(frame.T_world_camera, interpretation.camera),
+        T_world_projector=T_world_projector,
+        uv_projector=_converted_coords(frame.uv_projector, interpretation, projector),
+    )
+
+
+def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
+    """Triangulate all frames; measure how well rays meet and how well frames agree."""
+    camera = Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1)
+    geometry = (
+        camera,
+        _stack(f.T_world_camera for f in frames)[:, None],
+        _stack(f.uv_camera for f in frames),
+        Intrinsics.of(projector, torch.float64),
+        _stack(f.T_world_projector for f in frames)[:, None],
+        _stack(f.uv_projector for f in frames),
+    )
+    residual = epipolar_residual(*geometry).abs().nan_to_num(nan=torch.inf)
+    in_front = residual.isfinite()
+    points = triangulate(*geometry)
+    depth = float(points.depth_camera[in_front].median()) if in_front.any() else 0.0
+    count = max(_FEWEST_CLOUD_POINTS, min(_CLOUD_POINTS, _MOST_POINTS // len(frames)))
+    clouds = tuple(_thin(p[ok].numpy(), count) for p, ok in zip(points.p_world, in_front, strict=True))
+    others = OtherClouds(clouds)
+    spread = [others.distance(cloud, index) for index, cloud in enumerate(clouds)]
+    return GeometricFit(residual.median(-1).values.numpy(), np.array(spread) / max(depth, 1e-300), depth, clouds)
+
+
+def _thin(cloud: Float64[ndarray, "n 3"], count: int) -> Float64[ndarray, "_ 3"]:
+    return cloud[:: max(1, len(cloud) // count)]
+
+
+def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> Float64[ndarray, "4 4"]:
+    out = np.linalg.inv(T) if convention.startswith("inverted") else T
+    return out @ _OPENCV if convention.endswith("OpenCV axes") else out
+
+
+def _converted_coords(uv: Float64[ndarray, "n 2"], how: Interpretation, projector: Device) -> Float64[ndarray, "n 2"]:
+    x, y = uv.T[::-1] if how.swapped else uv.T
+    return np.stack([projector.w - x if how.mirrored_x else x, projector.h - y if how.mirrored_y else y], -1)
+
+
+def _stack(arrays: Iterator[Float64[ndarray, "..."]]) -> Tensor:
+    return torch.from_numpy(np.stack(list(arrays)))
+
+
+# The words in which wrong conventions are reported.
+
+APART = 0.2  # suspicious distance between the surfaces of frames, in working distances
+
+_CAUSES = {
+    "inverted": "map world to device instead of device to world",
+    "OpenCV axes": "have OpenCV's device axes (y down, looking along +z)",
+    "inverted, OpenCV axes": "are OpenCV extrinsics (world to device, y down, looking along +z)",
+}
+_REMEDIES = {
+    "inverted": "invert them",
+    "OpenCV axes": "multiply them on the right by diag(1, -1, -1, 1)",
+    "inverted, OpenCV axes": "invert them, then multiply on the right by diag(1, -1, -1, 1)",
+}
+
+
+def key_of(interpretation: Interpretation) -> str:
+    """The key of transforms.json that a mistake concerns."""
+    if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
+        return "sl_coords_path"
+    return "projector_transform_matrix" if interpretation.camera == "as given" else "transform_matrix"
+
+
+def describe(interpretation: Interpretation, given: GeometricFit, index: int | None = None) -> Problem:
+    """The mistake that `interpretation` undoes, in all frames or in frame `index`; `given` is the fit before."""
+    residual = given.typical_px if index is None else float(given.residual_px[index])
+    spread = given.typical_spread if index is None else float(given.spread[index])
+    which = "all frames" if index is None else "this frame"
+    symptom = _symptom(residual, spread)
+    if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
+        return describe_coords(interpretation, f"do not fit the poses in {which}: {symptom}")
+    problem = f"does not fit the coordinates in {which}: {symptom}"
+    if interpretation.projector_unit != 1:
+        return Problem(
+            problem,
+            f"the projector's position is in another unit than the camera's: multiplied by "
+            f"{interpretation.projector_unit:g} it fits",
+            "give all positions in the scan's unit",
+        )
+    whose: list[tuple[str, PoseConvention]]
+    if interpretation.camera == interpretation.projector:
+        whose = [("camera and projector matrices", interpretation.camera)]
+    else:
+        whose = [("the camera matrices", interpretation.camera), ("the projector matrices", interpretation.projector)]
+    wrong = [(who, how) for who, how in whose if how != "as given"]
+    cause = " and ".join(f"{who} {_CAUSES[how]}" for who, how in wrong)
+    remedy = "; ".join(f"{who}: {_REMEDIES[how]}" for who, how in wrong)
+    return Problem(
+        problem, f"{cause}: interpreted that way they fit", f"store device to world in OpenGL axes ({remedy})"
+    )
+
+
+def _symptom(residual: float, spread: float) -> str:
+    if np.isinf(residual):
+        return "most points triangulate behind the camera or the projector"
+    if spread > APART:
+        return f"the surfaces of the frames are {spread:.1f} times the working distance apart"
+    return f"camera rays and projector rays miss each other by {residual:.0f} px"
+
+
+def describe_coords(interpretation: Interpretation, problem: str) -> Problem:
+    """Coordinates with exchanged or mirrored axes; `problem` says how it shows."""
+    done = [
+        *(["x and y swapped"] if interpretation.swapped else []),
+        *(["x counted from the right"] if interpretation.mirrored_x else []),
+        *(["y counted from below"] if interpretation.mirrored_y else []),
+    ]
+    undo = [
+        *(["swap the two channels"] if interpretation.swapped else []),
+        *(["x := projector w - x"] if interpretation.mirrored_x else []),
+        *(["y := projector h - y"] if interpretation.mirrored_y else []),
+    ]
+    return Problem(
+        problem,
+        f"the coordinates have {' and '.join(done)}: interpreted that way they fit",
+        f"store (x, y), x to the right and y down from the pattern's upper left corner: {', then '.join(undo)}",
+    )
+
+
+def hopeless(given: GeometricFit, bad: int, count: int) -> Problem:
+    """Poses that no known mistake explains, in `bad` of `count` frames."""
+    symptom = "most points triangulate behind a device" if np.isinf(given.typical_px) else f"{given.typical_px:.0f} px"
+    return Problem(
+        f"does not fit the coordinates in {bad} of {count} frames (epipolar residual: {symptom})",
+        "the poses are those of another scan, in another order or in other axes, or the intrinsics are wrong; "
+        "no single known mistake explains it",
+        "check that frames, poses and intrinsics are of the same scan, and compare the axes with docs/scan-format.md",
+    )
+
+
+def wrong_unit(metres: float) -> Problem:
+    """A working distance that is impossible for a scanner."""
+    return Problem(
+        f"would put the object {metres:.3g} m from the camera",
+        "lengths are in another unit than stated (m and mm mixed up?)",
+        'state the unit that the poses are in, or "arbitrary" if it is unknown',
+    )
+
+
+def far_away(times: float) -> Problem:
+    """A device that is `times` as far from the others as they usually are."""
+    return Problem(
+        f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
+        "registration failed for this frame, or its position is in another unit",
+        "register it again, or leave the frame out",
+    )
+
+
+# Epipolar residuals as fractions of the projector's focal length: angles in radians.
+_SUSPECT = 0.01  # 0.6 degrees: worse than auto-calibration usually is
+_SUSPECT_FRAME = 0.05  # of one frame among good ones
+_FITS = 0.05  # the largest residual of an interpretation that "fits"
+_HOPELESS = 0.35  # 19 degrees: no calibration is that wrong
+_MUCH_BETTER = 0.2  # factor by which the right interpretation must lower the residual
+_MUCH_CLOSER = 0.4  # factor by which the right interpretation must lower the distance between surfaces
+_ONE_SURFACE = 0.1  # the largest distance it may leave, in working distances, with frames wrong by 10 degrees
+_MOST = 0.9  # share of hopeless frames that makes a scan hopeless
+_FAR = 100.0  # times the median distance of all devices from their middle; rings and walls have 1 to 2
+_NEAREST, _FARTHEST = 1e-3, 100.0  # metres; working distances outside this range mean a wrong unit
+
+
+def convention_problems(
+    frames: Sequence[Correspondences], projector: Device, metres: float | None
+) -> Iterable[tuple[str | None, str, Problem]]:
+    """(frame or None, key, problem) of poses, coordinates and units that cannot be right as they are.
+
+    `metres` is the length of the scan's unit, None if unknown.
+    """
+    given = fit_geometry(frames, projector)
+    focal = (projector.fl_x + projector.fl_y) / 2
+    interpretation = _better_interpretation(frames, projector, given, focal)
+    if interpretation is not None:
+        yield None, key_of(interpretation), describe(interpretation, given)
+        return
+    lost = given.residual_px > _HOPELESS * focal
+    if lost.mean() >= _MOST:
+        yield None, "transform_matrix", hopeless(given, int(lost.sum()), len(frames))
+        return
+    explained: set[int] = set()
+    if len(frames) > 2:
+        others = OtherClouds(given.clouds)
+        for index, frame in enumerate(frames):
+            own = _better_interpretation_of_frame(frames, index, projector, given, others, focal)
+            if own is not None:
+                explained.add(index)
+                yield frame.name, key_of(own), describe(own, given, index)
+    for index, key, times in _far_devices(frames):
+        if index not in explained:
+            yield frames[index].name, key, far_away(times)
+    if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
+        yield None, "units", wrong_unit(given.depth * metres)
+
+
+def _better_interpretation(
+    frames: Sequence[Correspondences], projector: Device, given: GeometricFit, focal: float
+) -> Interpretation | None:
+    """The interpretation under which the whole scan fits; None if it fits as it is, or nothing helps."""
+    if given.typical_px <= _SUSPECT * focal and given.typical_spread <= APART:
+        return None
+    found: list[tuple[float, Interpretation]] = []
+    for interpretation in other_interpretations():
+        fit = fit_geometry([apply_interpretation(interpretation, frame, projector) for frame in frames], projector)
+        if _explains(given.typical_px, given.typical_spread, fit.typical_px, fit.typical_spread, focal):
+            found.append((_badness(fit.typical_px, fit.typical_spread, focal), interpretation))
+    return min(found, key=lambda item: item[0])[1] if found else None
+
+
+def _better_interpretation_of_frame(
+    frames: Sequence[Correspondences],
+    index: int,
+    projector: Device,
+    given: GeometricFit,
+    others: OtherClouds,
+    focal: float,
+) -> Interpretation | None:
+    """The interpretation of one frame alone under which it fits the others."""
+    residual, spread = float(given.residual_px[index]), float(given.spread[index])
+    if given.depth == 0 or (residual <= _SUSPECT_FRAME * focal and spread <= APART):
+        return None
+    found: list[tuple[float, Interpretation]] = []
+    for interpretation in other_interpretations():
+        alone = fit_geometry([apply_interpretation(interpretation, frames[index], projector)], projector)
+        px, cloud = alone.typical_px, alone.clouds[0]
+        if px > _FITS * focal:
+            continue
+        apart = others.distance(cloud, index) / given.depth
+        if apart < APART and _explains(residual, spread, px, apart, focal):
+            found.append((_badness(px, apart, focal), interpretation))
+    return min(found, key=lambda item: item[0])[1] if found else None
+
+
+def _far_devices(frames: Sequence[Correspondences]) -> Iterator[tuple[int, str, float]]:
+    """(frame, key, distance from the middle of all devices in median distances) of devices that are far away."""
+    cameras = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
+    projectors = np.stack([frame.T_world_projector[:3, 3] for frame in frames])
+    everything = np.concatenate([cameras, projectors])
+    middle = np.median(everything, 0)
+    usual = max(float(np.median(np.linalg.norm(everything - middle, axis=1))), 1e-300)
+    for key, positions in (("transform_matrix", cameras), ("projector_transform_matrix", projectors)):
+        times = np.linalg.norm(positions - middle, axis=1) / usual
+        for index in np.flatnonzero(times > _FAR).tolist():
+            yield index, key, float(times[index])
+
+
+def _explains(px_before: float, spread_before: float, px: float, spread: float, focal: float) -> bool:
+    """Whether an interpretation fits, and so much better than the one before that it cannot be chance."""
+    if px > _FITS * focal:
+        return False
+    if px_before > _SUSPECT * focal and px < _MUCH_BETTER * px_before:
+        return px < _SUSPECT * focal or spread <= max(APART, spread_before)
+    # The rays meet equally well in both: only the agreement of the frames decides. Views that never overlap
+    # (a room seen from its middle) may come closer to each other when misinterpreted, but not to one surface.
+    return spread_before > APART and spread < min(_MUCH_CLOSER * spread_before, _ONE_SURFACE) and px < 2 * px_before + 1
+
+
+def _badness(px: float, spread: float, focal: float) -> float:
+    """Orders interpretations that fit: both parts are about 0.01 for a good scan interpreted correctly."""
+    return px / focal + min(spread, 1.0)

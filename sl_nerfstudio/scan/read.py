@@ -1,0 +1,498 @@
+"""Reading a scan folder."""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from sl_nerfstudio.errors import ScanError
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan.document import (
+    TRANSFORMS,
+    Faults,
+    Fields,
+    FileError,
+    Problem,
+    document_faults,
+    frame_label,
+    read_document,
+    read_path,
+)
+from sl_nerfstudio.scan.images import read_coords_size, read_header
+from sl_nerfstudio.scan.types import (
+    CAMERA_KEYS,
+    FORMAT,
+    PROJECTOR_KEYS,
+    UNITS,
+    Frame,
+    PoseSigma,
+    Scale,
+    Scan,
+    check_scale_frames,
+    read_device,
+    read_scale,
+)
+
+# Whether a matrix is a pose: a rigid motion from device to world.
+
+TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, a scale error of 0.01 % does not
+FARTHEST = 1e12  # units from the origin: beyond, numbers of 16 digits do not hold a position exactly enough
+
+
+def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
+    """The first reason why `T` is not a rigid motion, None if it is one."""
+    if T.shape == (3, 4):
+        return Problem("is 3 x 4", "the last row was left out", "add the row 0, 0, 0, 1")
+    if T.shape != (4, 4):
+        size = " x ".join(map(str, T.shape)) or "one number"
+        return Problem(
+            f"is {size} instead of 4 x 4", "it is another kind of matrix", "give the 4 x 4 matrix from device to world"
+        )
+    if not np.isfinite(T).all():
+        return Problem(
+            "holds NaN or infinity",
+            "registration or calibration failed for this frame",
+            "calibrate it again or leave the frame out",
+        )
+    if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
+        return _last_row_problem(T)
+    return _rotation_problem(T[:3, :3]) or _position_problem(T[:3, 3])
+
+
+def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
+    row = ", ".join(f"{x:g}" for x in T[3])
+    if np.abs(T[:, 3] - (0, 0, 0, 1)).max() < 1e-9:
+        return Problem(
+            f"has the last row {row} and the last column 0, 0, 0, 1",
+            "the matrix is transposed (stored column by column)",
+            "transpose it: the translation is the last column",
+        )
+    return Problem(
+        f"has the last row {row} instead of 0, 0, 0, 1",
+        "the matrix is projective or scaled, or its rows are in another order",
+        "give a rigid motion from device to world",
+    )
+
+
+def _position_problem(position: Float64[ndarray, "3"]) -> Problem | None:
+    reach = float(np.abs(position).max())
+    if reach <= FARTHEST:
+        return None
+    return Problem(
+        f"puts the device {reach:.2g} units from the origin",
+        "registration or calibration diverged for this frame, or the number was damaged",
+        "calibrate it again or leave the frame out",
+    )
+
+
+def _rotation_problem(R: Float64[ndarray, "3 3"]) -> Problem | None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = R.T @ R
+        determinant = float(np.linalg.det(R))
+    if np.abs(gram - np.eye(3)).max() <= TOLERANCE:
+        if determinant > 0:
+            return None
+        return Problem(
+            "is a reflection (the determinant of its rotation is -1)",
+            "one axis was negated, or the axes are left-handed (as in Unity or DirectX)",
+            "convert to right-handed axes: device looks along -z, +x right, +y up",
+        )
+    scale = float(np.cbrt(abs(determinant)))
+    if scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= TOLERANCE:
+        return Problem(
+            f"is scaled: its rotation is {scale:.6g} times {'a reflection' if determinant < 0 else 'a rotation'}",
+            "a similarity (which includes a scale or a change of unit) was stored as a pose",
+            "divide the upper left 3 x 3 block by its scale, and give positions in the scan's unit",
+        )
+    return Problem(
+        "has no rotation in its upper left 3 x 3 block: its columns are not unit vectors at right angles",
+        "it was rounded to few digits, is sheared, or is not a pose matrix",
+        "give the rotation with at least six digits",
+    )
+
+
+# The frames of transforms.json: what could be read of each, and everything that could not.
+
+POSES = ("transform_matrix", "projector_transform_matrix")
+SIGMA_KEYS = tuple(PoseSigma.__dataclass_fields__)
+FRAME_FILES = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path", "sl_color_path")
+_FRAME_KEYS = (*FRAME_FILES, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
+
+
+@dataclass
+class PartialFrame:
+    """What could be read of a frame; None where a value is absent, or faulty and listed as a fault."""
+
+    name: str
+    camera: Device | None = None
+    paths: dict[str, Path] = field(default_factory=dict)
+    T_world_camera: Float64[ndarray, "4 4"] | None = None
+    T_world_projector: Float64[ndarray, "4 4"] | None = None
+    pose_sigma: PoseSigma | None = None
+
+    def complete(self) -> Frame:
+        """The frame, if no fault was found. Raises ValueError if a value is missing."""
+        if self.camera is None or self.T_world_camera is None or self.T_world_projector is None:
+            raise ValueError(f"frame {self.name} has faults")
+        return Frame(
+            name=self.name,
+            camera=self.camera,
+            image_path=self.paths["file_path"],
+            pattern_path=self.paths.get("sl_pattern_path"),
+            coords_path=self.paths.get("sl_coords_path"),
+            mask_path=self.paths.get("mask_path"),
+            T_world_camera=self.T_world_camera,
+            T_world_projector=self.T_world_projector,
+            pose_sigma=self.pose_sigma,
+            color_path=self.paths.get("sl_color_path"),
+        )
+
+
+def read_frame(frame: Fields, top: Fields, root: Path, common: Device | None, need_coords: bool) -> PartialFrame:
+    """One frame of transforms.json; `common` is the camera of the frames that have no camera keys."""
+    result = PartialFrame(frame.frame or "")
+    frame.check_spelling(_FRAME_KEYS)
+    result.camera = read_frame_camera(frame, top) if any(key in frame.record for key in CAMERA_KEYS) else common
+    for key in FRAME_FILES:
+        if key == "file_path" or (key == "sl_coords_path" and need_coords) or frame.record.get(key) is not None:
+            path = read_path(frame, key, root)
+            if path is not None:
+                result.paths[key] = path
+    result.T_world_camera, result.T_world_projector = (read_pose(frame, key) for key in POSES)
+    if result.T_world_camera is not None and result.T_world_projector is not None:
+        _check_baseline(frame, result.T_world_camera, result.T_world_projector)
+    return result
+
+
+def read_frame_camera(frame: Fields, top: Fields) -> Device | None:
+    """Intrinsics of a frame; keys that it lacks are taken from the scan."""
+    both = [key for key in CAMERA_KEYS if key in frame.record and key in top.record]
+    differ = [key for key in both if frame.record[key] != top.record[key]]
+    for key in differ:
+        frame.fault(
+            key,
+            f"is {frame.record[key]} here but {top.record[key]} for all frames",
+            "intrinsics were given twice, and programs differ in which value they use",
+            "give each key either once for all frames or in every frame",
+        )
+    if differ:
+        return None
+    merged = {**{k: top.record[k] for k in CAMERA_KEYS if k in top.record}, **frame.record}
+    return read_device(Fields(merged, frame.faults, frame.file, frame.frame), "camera")
+
+
+def read_pose(frame: Fields, key: str) -> Float64[ndarray, "4 4"] | None:
+    """The pose under `key`; None after adding a fault."""
+    matrix = frame.read_matrix(key)
+    if matrix is None:
+        return None
+    problem = pose_problem(matrix)
+    if problem is None:
+        return matrix
+    frame.faults.add(problem, frame.file, frame.frame, key)
+    return None
+
+
+def _check_baseline(
+    frame: Fields, T_world_camera: Float64[ndarray, "4 4"], T_world_projector: Float64[ndarray, "4 4"]
+) -> None:
+    if np.array_equal(T_world_camera[:3, 3], T_world_projector[:3, 3]):
+        frame.fault(
+            "projector_transform_matrix",
+            "has exactly the position of the camera",
+            "the camera's pose was copied, or the calibration is missing",
+            "calibrate the projector relative to the camera; without a distance between them there is no depth",
+        )
+
+
+def read_sigma(fields: Fields) -> PoseSigma | None:
+    """The value of `sl_pose_sigma`; None where it is absent, or after adding a fault."""
+    if fields.record.get("sl_pose_sigma") is None:
+        return None
+    section = fields.read_section("sl_pose_sigma")
+    if section is None:
+        return None
+    section.check_spelling(SIGMA_KEYS)
+    values = {key: section.read_number(key) for key in SIGMA_KEYS}
+    for key, value in values.items():
+        if value is not None and value > FARTHEST:
+            section.fault(
+                key, f"is {value:g}", "the adjustment diverged, or the number was damaged",
+                "give the uncertainty of the starting poses, or leave sl_pose_sigma out",
+            )  # fmt: skip
+            return None
+        if value is not None and value <= 0:
+            section.fault(
+                key, f"is {value:g}", "a standard deviation must be greater than 0",
+                "give the uncertainty of the starting poses, however small, or leave sl_pose_sigma out",
+            )  # fmt: skip
+            return None
+    numbers = {key: value for key, value in values.items() if value is not None}
+    return PoseSigma(**numbers) if len(numbers) == len(SIGMA_KEYS) else None
+
+
+def check_together(frames: list[PartialFrame], faults: Faults) -> None:
+    """Add the faults that show only when several frames are compared: equal names, or equal poses in all frames."""
+    seen: set[str] = set()
+    for frame in frames:
+        if frame.name in seen:
+            problem = Problem(
+                "occurs more than once",
+                "a frame was duplicated, or images in two folders have the same name",
+                "remove the duplicate, or rename one of the images",
+            )
+            faults.add(problem, TRANSFORMS, frame.name, "file_path")
+        seen.add(frame.name)
+    posed = [f for f in frames if f.T_world_camera is not None and f.T_world_projector is not None]
+    if len(posed) < 2 or len(posed) != len(frames):
+        return
+    if all(_same_poses(frame, posed[0]) for frame in posed[1:]):
+        problem = Problem(
+            "is the same in all frames, for camera and projector",
+            "the poses were never filled in, or nothing was moved",
+            "register the frames first; a scan needs views from different places",
+        )
+        faults.add(problem, TRANSFORMS, None, "transform_matrix")
+
+
+def _same_poses(a: PartialFrame, b: PartialFrame) -> bool:
+    pairs = ((a.T_world_camera, b.T_world_camera), (a.T_world_projector, b.T_world_projector))
+    return all(x is not None and y is not None and np.array_equal(x, y) for x, y in pairs)
+
+
+# transforms.json as a whole: what could be read of a scan, and everything that could not.
+
+_TOP_KEYS = ("sl_format", "units", *CAMERA_KEYS, "projector", "scale", "frames", "sl_pose_sigma")
+
+_NO_PROJECTOR = Problem(
+    "is missing: there is no projector in this data set",
+    "it is an ordinary data set of nerfstudio, captured without a pattern projector",
+    "make a scan from captures of a projected pattern with sl-process",
+)
+
+
+@dataclass
+class PartialScan:
+    """What could be read of a scan; None where a value is faulty and listed as a fault."""
+
+    root: Path
+    units: str | None = None
+    scale: Scale | None = None
+    projector: Device | None = None
+    pattern_path: Path | None = None
+    frames: list[PartialFrame] = field(default_factory=list)
+
+    def complete(self) -> Scan:
+        """The scan, if no fault was found. Raises ValueError if a value is missing."""
+        if self.units is None or self.scale is None or self.projector is None or self.pattern_path is None:
+            raise ValueError("a scan with faults cannot be completed")
+        frames = tuple(frame.complete() for frame in self.frames)
+        return Scan(self.root, self.units, self.scale, self.projector, self.pattern_path, frames)
+
+
+def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> PartialScan:
+    """Everything in transforms.json; what is wrong goes to `faults`. Opens no other file."""
+    partial = PartialScan(root)
+    try:
+        document = read_document(_transforms_path(root))
+    except FileError as error:
+        faults.add(error, TRANSFORMS)
+        return partial
+    if _without_projector(document):
+        faults.add(_NO_PROJECTOR, TRANSFORMS, None, "projector")
+        return partial
+    document_faults(document, TRANSFORMS, faults)
+    top = Fields(document, faults, TRANSFORMS)
+    top.check_spelling(_TOP_KEYS)
+    _check_format(top)
+    partial.units = top.read_choice("units", list(UNITS), "an unknown unit of length")
+    _read_projector(top, partial)
+    common_sigma = read_sigma(top)
+    records = _frame_records(top)
+    common = _read_common_camera(top, records)
+    for index, record in enumerate(records):
+        if isinstance(record, dict):
+            frame = Fields(record, faults, TRANSFORMS, frame_label(record, index))
+            partial.frames.append(read_frame(frame, top, root, common, need_coords))
+            partial.frames[-1].pose_sigma = read_sigma(frame) or common_sigma
+        else:
+            problem = Problem("is not an object { .. }", "wrong type", "see docs/scan-format.md")
+            faults.add(problem, TRANSFORMS, f"#{index}", "frames")
+    partial.scale = read_scale(top, [frame.name for frame in partial.frames])
+    if partial.scale is not None:
+        check_scale_frames(partial.scale, {frame.name: frame.camera for frame in partial.frames}, faults)
+    check_together(partial.frames, faults)
+    return partial
+
+
+def _without_projector(document: dict[str, Any]) -> bool:
+    """Whether the file is one of nerfstudio's that was never meant to be a scan: not even a key of this format."""
+    frames = document.get("frames")
+    ours = {"sl_format", "projector"} & set(document)
+    return isinstance(frames, list) and bool(frames) and not ours and not any(map(_has_projector_keys, frames))
+
+
+def _has_projector_keys(record: Any) -> bool:
+    return not isinstance(record, dict) or any(key.startswith(("sl_", "projector")) for key in record)
+
+
+def _transforms_path(root: Path) -> Path:
+    if not os.path.isdir(root):
+        what = "is a file, not a folder" if os.path.lexists(root) else "does not exist"
+        raise FileError(
+            root, f"is missing: {root} {what}", "the path is mistyped", "give the folder that holds transforms.json"
+        )
+    return root / TRANSFORMS
+
+
+def _check_format(top: Fields) -> None:
+    number = top.read_number("sl_format")
+    if number is not None and number != FORMAT:
+        top.fault(
+            "sl_format", f"is {number:g}", "it was written by a newer version of this package", "update the package"
+        )
+
+
+def _read_projector(top: Fields, partial: PartialScan) -> None:
+    section = top.read_section("projector")
+    if section is None:
+        return
+    section.check_spelling(PROJECTOR_KEYS)
+    partial.projector = read_device(section, "projector")
+    partial.pattern_path = read_path(section, "pattern_path", partial.root)
+
+
+def _frame_records(top: Fields) -> list[Any]:
+    frames = top.record.get("frames")
+    if not isinstance(frames, list):
+        top.fault(
+            "frames",
+            "is missing or is not a list",
+            "this is not the transforms.json of a scan",
+            "give the list of frames, see docs/scan-format.md",
+        )
+        return []
+    if len(frames) < 2:
+        top.fault(
+            "frames",
+            "is empty" if not frames else "holds only one frame",
+            "the scan was interrupted, or frames were removed",
+            "a scan needs at least two frames from different places",
+        )
+    return frames
+
+
+def _read_common_camera(top: Fields, records: list[Any]) -> Device | None:
+    """The camera of all frames; None (without a fault) if every frame has its own."""
+    own = [isinstance(r, dict) and any(key in r for key in CAMERA_KEYS) for r in records]
+    if own and all(own):
+        return None
+    return read_device(top, "camera")
+
+
+# The headers of a scan's files: do the files exist, are they of the right kind and size? Decodes nothing.
+
+_MAY_BE_COLOUR = ("file_path", "sl_color_path")
+
+
+def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
+    """Check the headers of all files; return the files that can be decoded."""
+    good: set[Path] = set()
+    if partial.pattern_path is not None:
+        size = None if partial.projector is None else (partial.projector.w, partial.projector.h)
+        _check_image(partial.pattern_path, partial.root, None, size, True, "the projector", good, faults)
+    for frame in partial.frames:
+        _check_frame(frame, partial.root, good, faults)
+    return good
+
+
+def relative(path: Path, root: Path) -> str:
+    """How messages name a file: its path below the folder, with slashes."""
+    return path.relative_to(root).as_posix()
+
+
+def _check_frame(frame: PartialFrame, root: Path, good: set[Path], faults: Faults) -> None:
+    size = _size(frame.camera)
+    for key in ("file_path", "sl_pattern_path", "mask_path", "sl_color_path"):
+        if key in frame.paths:
+            _check_image(
+                frame.paths[key], root, frame.name, size, key not in _MAY_BE_COLOUR, "the camera", good, faults
+            )
+    path = frame.paths.get("sl_coords_path")
+    if path is None:
+        return
+    try:
+        found = read_coords_size(path)
+    except FileError as error:
+        faults.add(error, relative(path, root), frame.name)
+        return
+    if size is not None and found != size:
+        faults.add(_wrong_size(found, size, "the camera"), relative(path, root), frame.name)
+    else:
+        good.add(path)
+
+
+def _check_image(
+    path: Path,
+    root: Path,
+    frame: str | None,
+    size: tuple[int, int] | None,
+    grey_only: bool,
+    device: str,
+    good: set[Path],
+    faults: Faults,
+) -> None:
+    try:
+        header = read_header(path)
+    except FileError as error:
+        faults.add(error, relative(path, root), frame)
+        return
+    found = (header.w, header.h)
+    before = len(faults.found)
+    if size is not None and found != size:
+        faults.add(_wrong_size(found, size, device), relative(path, root), frame)
+    if grey_only and header.mode != "grey":
+        faults.add(
+            Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit"),
+            relative(path, root),
+            frame,
+        )
+    if len(faults.found) == before:
+        good.add(path)
+
+
+def _size(device: Device | None) -> tuple[int, int] | None:
+    return None if device is None else (device.w, device.h)
+
+
+def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:
+    if found == wanted[::-1]:
+        cause = "width and height are swapped: the image was rotated, or w and h were swapped"
+    elif found[0] * wanted[1] == found[1] * wanted[0]:
+        cause = "it was resized, or the intrinsics are those of another resolution"
+    else:
+        cause = "it was cropped, or comes from another camera or scan"
+    return Problem(
+        f"is {found[0]} x {found[1]} pixels, but {device} has {wanted[0]} x {wanted[1]}",
+        cause,
+        "give the original file, or the intrinsics (w, h, fl_x, fl_y, cx, cy) of this one",
+    )
+
+
+def read_scan(root: Path, need_coords: bool = True) -> Scan:
+    """The scan in a folder, after quick checks: transforms.json, paths, poses and the headers of all files.
+
+    No pixel is decoded. `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all
+    faults found.
+    """
+    root = Path(os.path.realpath(root))
+    faults = Faults()
+    partial = read_partial_scan(root, faults, need_coords)
+    check_headers(partial, faults)
+    if faults.found:
+        raise ScanError(faults.found, str(root))
+    return partial.complete()
