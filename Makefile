@@ -24,14 +24,15 @@ IMAGES_TRAINED = $(IMAGES_RUN)/nerfstudio_models/step-000000999.ckpt
 PYTHONS := python3.11 python3.12 python3.10 python3 python
 SUITABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))
 
-.PHONY: help install demo demo-images test bench lint format docs clean
+.PHONY: help install demo demo-images test test-slow bench lint format docs clean
 
 help:
 	@echo "make install   create .venv with pinned dependencies and this package"
 	@echo "make demo      synthesise, train, export and evaluate a scan: outputs/demo/report.html (minutes);"
 	@echo "                 if it was interrupted, it goes on where it was"
 	@echo "make demo-images   the same from images alone, with decoding, calibration and registration first (minutes)"
-	@echo "make test      run the test suite"
+	@echo "make test      run the tests that every change needs (minutes)"
+	@echo "make test-slow run the others: trainings, whole commands, sweeps over many cases"
 	@echo "make bench     run the benchmarks that take minutes; results in benchmarks/results/"
 	@echo "make lint      check with ruff and pyright"
 	@echo "make format    format the code and sort the imports with ruff"
@@ -122,8 +123,13 @@ $(IMAGES)/report.html: $(IMAGES)/refined/training.json
 	  --json $(IMAGES)/evaluation.json --report $@
 
 # On up to four cores. The tests of one file run together, because they share what was trained for them.
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
 test: install
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -m "not slow"
+
+test-slow: install
+	$(PYTEST) -m slow
 
 bench: install
 	$(BIN)/python -m benchmarks

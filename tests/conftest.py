@@ -1,19 +1,25 @@
-"""Set-up of all tests: shapes and types are checked at run time, one thread, no deadlines, signals as in a terminal."""
+"""Set-up of all tests: one thread, no deadlines, signals as in a terminal; types checked if SL_TYPE_CHECKS is set."""
 
 import importlib
 import os
 import signal
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from tests import type_checks
+if os.environ.get("SL_TYPE_CHECKS"):  # every call's shapes, dtypes and types: about a third slower
+    import jaxtyping
 
-type_checks.install()
+    _ROOT = Path(__file__).parents[1]
+    _MODULES = [".".join(f.relative_to(_ROOT).with_suffix("").parts) for f in _ROOT.glob("sl_nerfstudio/**/*.py")]
+    # Warp compiles what is in its modules; its types are not those of Python.
+    _CHECKED = [m for m in _MODULES if "warp" not in m and not m.endswith("__init__")]
+    jaxtyping.install_import_hook(_CHECKED, "beartype.beartype")
 
-import hypothesis  # noqa: E402
-import pytest  # noqa: E402
+import hypothesis
+import pytest
 
 hypothesis.settings.register_profile("project", deadline=None, derandomize=True, max_examples=50, print_blob=True)
 hypothesis.settings.load_profile("project")
@@ -51,8 +57,3 @@ def threads_of_this_test_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     from sl_nerfstudio import parallel
 
     monkeypatch.setattr(parallel, "_ours", None)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files marked as long come first."""
-    items.sort(key=lambda item: item.get_closest_marker("long") is None)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 BIN = Path(sys.executable).parent
 # One scan of 10 frames of 160 x 160 gives 0.18 mm, 0.9 mm and 0.06 degrees; starts are off by 24 mm and 1.2 degrees.

@@ -36,7 +36,7 @@ from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
 
-pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio emits many warnings
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstudio emits many warnings
 
 SMALL = [
     "--pipeline.model.sdf.log2-table-size",

@@ -14,7 +14,7 @@ from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import make_gray_scan
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 def _run(monkeypatch, *flags):

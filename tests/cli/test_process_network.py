@@ -11,7 +11,7 @@ from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 FRAMES, KEPT = 14, 5  # a walk around the object, and the neighbouring frames of it that are used
 RESOLUTION = 540  # a period of the grid is about 14 pixels

@@ -46,7 +46,7 @@ from sl_nerfstudio.scan import (
 
 from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 FRAMES, SIZE, MM = 6, 80, 50.0
 S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))

@@ -8,7 +8,7 @@ import pytest
 from sl_nerfstudio.object_separation.planes import points_of
 from sl_nerfstudio.object_separation.separate import Part, separate
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 def _shares(case, found):

@@ -35,7 +35,7 @@ from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of
 from tests.relative_pose.known_pose import known_pose
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 SIZE, FRAMES, MOVED = 100, 7, 3
 RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))

@@ -26,7 +26,7 @@ from tests.decoding.ramps_decoder import RampsDecoder
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 class KilledDecoder(RampsDecoder):

@@ -21,7 +21,7 @@ from sl_nerfstudio.storage import LOCK, NewFolder, locked
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
 
-pytestmark = [pytest.mark.usefixtures("ramps_registered"), pytest.mark.long]
+pytestmark = [pytest.mark.usefixtures("ramps_registered"), pytest.mark.slow]
 
 KEPT = ["registration: kept from an earlier run", "adjustment: kept from an earlier run"]
 

@@ -16,7 +16,7 @@ from tests.registration.analytic_clouds import clouds_of
 from tests.registration.shaped_clouds import rendered
 from tests.registration.symmetry.turned_scan import write_bar
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 FRAMES, TURNED = 10, 4
 

@@ -20,7 +20,7 @@ from sl_nerfstudio.scan import check_scan, read_scan
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
 
-pytestmark = [pytest.mark.usefixtures("ramps_registered", "calibrated_before"), pytest.mark.long]
+pytestmark = [pytest.mark.usefixtures("ramps_registered", "calibrated_before"), pytest.mark.slow]
 
 
 ALONE = "no other frame shows any of its surface; capture views in between"

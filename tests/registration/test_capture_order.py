@@ -52,7 +52,7 @@ def test_the_chain_of_small_steps_shows_every_side_of_a_nut(nut: RenderedClouds)
     assert max(turned_from_truth(known, nut.S_world_camera)) < 3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_nut_is_registered_at_the_sides_that_it_shows_or_said_to_be_symmetric(nut: RenderedClouds, seed: int) -> None:
     found = register(nut.clouds, seed=seed)

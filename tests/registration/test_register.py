@@ -17,7 +17,7 @@ from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, pose_errors, rolled
 from tests.registration.shaped_clouds import rendered
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 SIZE, FRAMES = 100, 18  # 20 degrees from frame to frame
 RIG = rig_of(FRAMES, SIZE)

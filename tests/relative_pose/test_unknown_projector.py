@@ -21,7 +21,7 @@ from sl_nerfstudio.relative_pose.unknown_projector import (
 from tests.relative_pose.two_views import CAMERA, PROJECTORS
 from tests.relative_pose.unknown_views import SHIFTED, frames_of
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 BLANK = Device(SHIFTED.w, SHIFTED.h, 1.5 * SHIFTED.w, 1.5 * SHIFTED.w, SHIFTED.w / 2, SHIFTED.h / 2)
 

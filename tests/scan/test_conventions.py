@@ -21,7 +21,7 @@ from sl_nerfstudio.scan.check_conventions import (
     sample_pixels,
 )
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 OPENCV = np.diag([1.0, -1, -1, 1])
 KEYS = ("transform_matrix", "projector_transform_matrix")

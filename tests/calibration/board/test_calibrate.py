@@ -14,7 +14,7 @@ from sl_nerfstudio.review.verdict import (
 )
 from tests.calibration.board.scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 SEEDS = range(3)
 

@@ -38,7 +38,7 @@ from tests.model.training.small_runs import (
     train,
 )
 
-pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
 
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 SAID = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}

@@ -25,7 +25,7 @@ from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.runs.run import load_run
 from tests.model.training.small_runs import folder_of, go_on, last_state, require_equal, settings, status, train
 
-pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
 
 ROWS = 3000  # each process averages some of them
 forked = functools.partial(mp.start_processes, start_method="fork")

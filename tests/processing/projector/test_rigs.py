@@ -15,7 +15,7 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import make_setup
 from tests.processing.ramp_scan import NAMES, RampScan, make_captures
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 def _captures(root, path) -> RampScan:
