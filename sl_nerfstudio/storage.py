@@ -1,7 +1,7 @@
-"""Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.
+"""What is written to disk: outputs of one process alone, complete or not there at all; and arrays too large for memory.
 
-The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends it.
-The operating system keeps in memory what is used of it.
+filelock is not used: it empties the file that it locks, and so the note of what a killed process had written; it leaves
+its file in the user's folder; and it refuses file systems without locks.
 """
 
 import errno
@@ -26,7 +26,6 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.parallel import OWN, ROOT, groups_around, return_freed_memory
 
 # Names of the files beside an output, and the error for a place where nothing can be written.
 
@@ -86,8 +85,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 # A file that one process holds, with a note of which process that is.
 #
-# The kernel releases the file when its process ends, however it ends (flock), so one that a killed process left
-# blocks
+# The kernel releases the file when its process ends, however it ends (flock), so one that a killed process left blocks
 # nobody. Where a file system knows no locks, the note decides.
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
@@ -211,8 +209,9 @@ def open_alone(path: Path) -> tuple[int, bool]:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             locked = _lock(file)
-            if _is_at(file, path):
-                return file, locked
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file), os.lstat(path)):
+                    return file, locked
         except BaseException:
             os.close(file)
             raise
@@ -229,20 +228,11 @@ def write_all(file: int, content: bytes) -> None:
 def _lock(file: int) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
+        if error.errno not in _NO_LOCKS:  # held by another process, among others
             raise
         return False
     return True
-
-
-def _is_at(file: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file), os.lstat(path))
-    except FileNotFoundError:
-        return False
 
 
 def _holder(path: Path) -> Holder | None:
@@ -552,29 +542,20 @@ def _require_earlier_result(path: Path, mark: bytes) -> None:
     raise UserError(f"{path}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")
 
 
+# Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.
+#
+# The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends
+# it. The operating system keeps in memory what is used of it.
+
 _ALIGNMENT = 64  # bytes, of arrays in a file
 _SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
-_LIMITS = ("memory.max", "memory.limit_in_bytes")  # of control groups, versions 2 and 1
 
 
 def largest_in_memory() -> int:
     """Bytes beyond which an array is kept in a file."""
+    from sl_nerfstudio.parallel import memory_of_process
+
     return memory_of_process() // _SHARE
-
-
-def memory_of_process() -> int:
-    """Bytes of memory that this process may use."""
-    return usable_memory(ROOT, OWN)
-
-
-def usable_memory(root: Path, own: Path) -> int:
-    """Bytes of memory of the machine, or fewer if the control groups of this process allow fewer.
-
-    For the arguments see `control_groups.groups_around`.
-    """
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    files = (folder / name for folder in groups_around("memory", root, own) for name in _LIMITS)
-    return min([machine, *(limit for file in files if (limit := _limit(file)) is not None)])
 
 
 class GrowingArray:
@@ -617,6 +598,8 @@ class GrowingArray:
             raise _no_space(error, self._bytes) from error
         self._pieces = []
         if first:  # many pieces; from now on there is one at a time
+            from sl_nerfstudio.parallel import return_freed_memory
+
             return_freed_memory()
 
 
@@ -647,10 +630,3 @@ def _no_space(error: OSError, size: int) -> UserError:
         f"    cause:  the scan is too large for the memory, and {size / 2**30:.1f} GB do not fit there\n"
         "    remedy: set TMPDIR to a folder on a disk with more space"
     )
-
-
-def _limit(file: Path) -> int | None:
-    try:
-        return int(file.read_text())
-    except (OSError, ValueError):  # no such group, or "max"
-        return None

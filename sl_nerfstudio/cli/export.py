@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, short_path, unit_word
 from sl_nerfstudio.errors import UserError
 
@@ -483,8 +483,6 @@ def export(config: ExportConfig) -> None:
         if config.pose_folder is not None:
             held.enter_context(locked(config.pose_folder))
         check_outputs(config)  # again: a process that held them until now may have written them
-        from sl_nerfstudio.runs.run import load_run
-
         print(export_trained(load_run(config.load_config, config.data), config))
 
 
