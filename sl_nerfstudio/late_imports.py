@@ -1,7 +1,7 @@
 """Imports of other libraries without parts that this package never uses: seconds of every command's start.
 
 CPU seconds on one core, with torch 2.11, nerfstudio 1.1.5 and open3d 0.19:
-- `ns-train sl-neus`, `sl-export`: nerfstudio's import takes 5.9 instead of 9.7 without torch's compiler (torch._dynamo).
+- `ns-train sl-neus`, `sl-export`: nerfstudio's import takes 5.9 instead of 9.7 without the compiler, torch._dynamo.
   torchvision and one of nerfstudio's models ask for it as soon as they are imported, to use it in functions that this
   package never calls, and torch's optimisers ask it to leave them alone. Within `compiler_on_demand()` they get
   functions that fetch it when they are called.
