@@ -51,14 +51,21 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     )
 
 
-def require_possible(path: Path) -> None:
-    """Raise UserError for a path in an existing folder that can neither be found nor made: its name is too long."""
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Errors of the system in the block are those of an output that cannot be written."""
     try:
-        os.lstat(path)
-    except FileNotFoundError:
-        pass
+        yield
+    except BlockingIOError:
+        raise
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def require_possible(path: Path) -> None:
+    """Raise UserError for a path in an existing folder that can neither be found nor made: its name is too long."""
+    with _writing(path), suppress(FileNotFoundError):
+        os.lstat(path)
 
 
 def made_with(folder: Path) -> list[Path]:
@@ -149,11 +156,10 @@ class LockFile:
         """
         self.path, self.output = path, output
         try:
-            self._file, locked = open_alone(path)
+            with _writing(output):
+                self._file, locked = open_alone(path)
         except BlockingIOError:
             raise in_use(output, _holder(path)) from None
-        except OSError as error:
-            raise cannot_write(output, error) from error
         try:
             self.left_by, self.lines = self._read()
             if not locked and self.left_by is not None and self.left_by.may_run():
@@ -177,20 +183,16 @@ class LockFile:
 
     def hold(self) -> None:
         """Replace what a killed process left by a note of this one."""
-        try:
+        with _writing(self.output):
             os.ftruncate(self._file, 0)
             os.lseek(self._file, 0, os.SEEK_SET)
-        except OSError as error:
-            raise cannot_write(self.output, error) from error
         self.left_by, self.lines = None, []
         self.add(Holder.here().note())
 
     def add(self, line: bytes) -> None:
         """Add a line, which ends with a newline."""
-        try:
+        with _writing(self.output):
             write_all(self._file, line)
-        except OSError as error:
-            raise cannot_write(self.output, error) from error
 
     def release(self, remove: bool = True) -> None:
         """Let others take the output."""
@@ -313,22 +315,20 @@ def write_atomic(path: Path, content: bytes) -> None:
     """
     temporary = beside(path, PARTIAL)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file, _ = open_alone(temporary)
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file, _ = open_alone(temporary)
     except BlockingIOError:
         raise in_use(path, None) from None
-    except OSError as error:
-        raise cannot_write(path, error) from error
     # The file stays open, and thereby locked, until it has its name: nobody else can then write into it.
     try:
-        os.ftruncate(file, 0)
-        write_all(file, content)
-        temporary.replace(path)
-    except BaseException as error:
+        with _writing(path):
+            os.ftruncate(file, 0)
+            write_all(file, content)
+            temporary.replace(path)
+    except BaseException:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise cannot_write(path, error) from error
         raise
     finally:
         os.close(file)

@@ -113,7 +113,7 @@ def test_one_bar_at_a_time_for_long_work_and_errors_pass_through(monkeypatch: py
     terminal = use_terminal(monkeypatch)
     pairs = [(i, j) for i in track(range(3), "Outer") for j in track(range(3), "Inner")]
     assert pairs == [(i, j) for i in range(3) for j in range(3)]
-    assert "Outer" in terminal.getvalue() and "/3" in terminal.getvalue()
+    assert "Outer" in terminal.getvalue() and "of 3" in terminal.getvalue()
 
     def failing() -> Iterator[int]:
         yield 1

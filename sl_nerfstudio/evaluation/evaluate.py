@@ -12,10 +12,8 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.evaluation.agreement import (
-    AgreementAccumulator,
     CaptureAgreement,
     FrameAgreement,
     FramePixels,
@@ -398,13 +396,7 @@ def _agreement(
     poses: DevicePoses,
     on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None,
 ) -> CaptureAgreement:
-    total = AgreementAccumulator()
-    frames = compare_captures(surface, scan, poses)
-    for frame, figures, pixels in track(frames, "ray casting the frames", total=len(scan.frames)):
-        total.add(figures, pixels)
-        if on_frame is not None:
-            on_frame(frame, figures, pixels)
-    result = total.result()
+    result = compare_captures(surface, scan, poses, on_frame)
     if not any(frame.hit_share > 0 for frame in result.frames):
         raise UserError(_missed(surface, scan, poses))
     return result

@@ -26,7 +26,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import MeshReference, PointReference, mesh_reference
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
-from sl_nerfstudio.meshing.uncertainty import collect_views, point_changes
+from sl_nerfstudio.meshing.uncertainty import point_changes, views_by_frame
 from sl_nerfstudio.scan import Scan, read_scan
 
 from .faceted_scan import FacetedScan
@@ -241,10 +241,9 @@ def scan(clean_scan: Path) -> Scan:
 def rows(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices that frames confirm, the derivatives of those points, and the frames that confirm each."""
     mesh = FacetedScan().truth()
-    every = collect_views(mesh, scan, scan.poses)
-    chosen = np.unique(every.vertex)
-    seen = np.zeros((len(chosen), FRAMES), dtype=bool)
-    seen[np.searchsorted(chosen, every.vertex), every.frame] = True
+    every = list(views_by_frame(mesh, scan, scan.poses, None, "test"))
+    chosen = np.unique(np.concatenate([view.vertex for view in every]))
+    seen = np.stack([np.isin(chosen, view.vertex) for view in every], 1)
     return chosen, point_changes(mesh, scan, scan.poses, every, chosen, np.eye(12 * FRAMES + 6)), seen
 
 

@@ -30,8 +30,7 @@ from sl_nerfstudio.meshing.uncertainty import (
     FrameViews,
     Smoothing,
     VertexSums,
-    VertexViews,
-    collect_views,
+    all_devices,
     devices_of,
     independent_variance,
     packed_devices,
@@ -170,48 +169,48 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 
 
 @pytest.fixture(scope="module")
-def views(scan: Scan) -> VertexViews:
-    return collect_views(hill(), scan, scan.poses)
+def views(scan: Scan) -> list[FrameViews]:
+    return list(views_by_frame(hill(), scan, scan.poses, None, "test"))
 
 
 @pytest.fixture(scope="module")
-def sums(scan: Scan) -> VertexSums:
-    return sum_views(views_by_frame(hill(), scan, scan.poses, None, "test"), len(hill().vertices))
+def sums(views: list[FrameViews]) -> VertexSums:
+    return sum_views(views, len(hill().vertices))
 
 
-def confirmed_by(views: VertexViews, vertices: np.ndarray) -> np.ndarray:
+def confirmed_by(views: list[FrameViews], vertices: np.ndarray) -> np.ndarray:
     """Which frames confirm some vertices."""
-    return np.stack([np.isin(vertices, views.vertex[views.frame == k]) for k in range(FRAMES)], 1)
+    return np.stack([np.isin(vertices, view.vertex) for view in views], 1)
 
 
-def rows_of(scan: Scan, views: VertexViews) -> tuple[np.ndarray, np.ndarray]:
+def joined(views: list[FrameViews], name: str) -> np.ndarray:
+    return np.concatenate([getattr(view, name) for view in views])
+
+
+def rows_of(scan: Scan, views: list[FrameViews]) -> tuple[np.ndarray, np.ndarray]:
     mesh = hill()
-    vertices = np.unique(views.vertex)[::7]
-    confirmed = confirmed_by(views, vertices)
-    return vertices, surface_rows(mesh.vertices[vertices], mesh.vertex_normals()[vertices], scan, scan.poses, confirmed)
+    vertices = np.unique(joined(views, "vertex"))[::7]
+    confirmed, devices = confirmed_by(views, vertices), all_devices(scan, scan.poses)
+    return vertices, surface_rows(mesh.vertices[vertices], mesh.vertex_normals()[vertices], devices, confirmed)
 
 
-def test_sums_are_those_of_all_pairs_of_a_vertex_and_a_frame(views: VertexViews, sums: VertexSums):
-    count = len(hill().vertices)
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(views.vertex, values, count)
-
-    weight = views.pixels_per_area * (views.slope**2).sum(1)
+def test_sums_are_those_of_all_pairs_of_a_vertex_and_a_frame(views: list[FrameViews], sums: VertexSums):
+    vertex, slope, residual, pixels = (joined(views, n) for n in ("vertex", "slope", "residual", "pixels_per_area"))
+    noise, count = np.repeat([v.noise_px for v in views], [len(v.vertex) for v in views]), len(hill().vertices)
+    weight = pixels * (slope**2).sum(1)
     wanted = {
-        "number": total(np.ones(len(weight))),
-        "distance": total(np.linalg.norm(views.residual, axis=1)),
-        "weight": total(weight),
-        "variance": total(weight * views.noise_px[views.frame] ** 2),
-        "pull": total(views.pixels_per_area * (views.slope * views.residual).sum(1)),
+        "number": np.ones(len(weight)),
+        "distance": np.linalg.norm(residual, axis=1),
+        "weight": weight,
+        "variance": weight * noise**2,
+        "pull": pixels * (slope * residual).sum(1),
     }
     for name, values in wanted.items():
-        assert np.array_equal(getattr(sums, name), values), name
-    assert sums.correlation == views.correlation
+        assert np.array_equal(getattr(sums, name), np.bincount(vertex, values, count)), name
     for vertices in (np.arange(count), np.array([3, 900, 77])):
         assert np.array_equal(sums.confirmed(vertices), confirmed_by(views, vertices))
     angle = np.full(count, np.nan)
-    np.fmax.at(angle, views.vertex, views.ray_angle)
+    np.fmax.at(angle, vertex, joined(views, "ray_angle"))
     assert np.array_equal(sums.ray_angle, angle, equal_nan=True)
 
 
@@ -236,7 +235,7 @@ def test_sigma_is_what_the_covariance_says_of_the_surface_less_its_motion(scan: 
     """The whole matrix of derivatives at once, and the motion that fits it best."""
     mesh, joint, seen = hill(), random_joint(), np.flatnonzero(sums.number)
     p, n = mesh.vertices[seen], mesh.vertex_normals()[seen]
-    rows = surface_rows(p, n, scan, scan.poses, sums.confirmed(seen))
+    rows = surface_rows(p, n, all_devices(scan, scan.poses), sums.confirmed(seen))
     p = p - p.mean(0)
     rigid = np.concatenate([n, np.cross(p, n)], 1)
     rows = rows - rigid @ np.linalg.lstsq(rigid, rows, rcond=None)[0]
@@ -252,12 +251,12 @@ def random_joint() -> JointCovariance:
     return JointCovariance(scale[:, None] * factor)
 
 
-def test_noise_and_its_independence_are_measured_from_the_scan(views: VertexViews):
-    np.testing.assert_allclose(views.noise_px, NOISE, rtol=0.1)
-    assert 1 <= views.correlation < 1.4
+def test_noise_and_its_independence_are_measured_from_the_scan(views: list[FrameViews], sums: VertexSums):
+    np.testing.assert_allclose([view.noise_px for view in views], NOISE, rtol=0.1)
+    assert 1 <= sums.correlation < 1.4
 
 
-def test_the_surface_moves_with_all_poses_and_grows_with_them(scan: Scan, views: VertexViews):
+def test_the_surface_moves_with_all_poses_and_grows_with_them(scan: Scan, views: list[FrameViews]):
     vertices, rows = rows_of(scan, views)
     mesh = hill()
     p, n = mesh.vertices[vertices], mesh.vertex_normals()[vertices]
@@ -278,12 +277,12 @@ def moved(scan: Scan, step: np.ndarray) -> DevicePoses:
     return DevicePoses(camera.numpy(), (camera @ relative).numpy())
 
 
-def test_vertices_move_as_surfaces_that_are_fitted_again(scan: Scan, views: VertexViews):
+def test_vertices_move_as_surfaces_that_are_fitted_again(scan: Scan, views: list[FrameViews]):
     """With disturbed poses, each vertex is moved along its normal to where its pixels fit best, by iteration."""
     vertices, rows = rows_of(scan, views)
     mesh = hill()
     p, n = (torch.from_numpy(x[vertices]) for x in (mesh.vertices, mesh.vertex_normals()))
-    seen = [np.isin(vertices, views.vertex[views.frame == k]) for k in range(FRAMES)]
+    seen = confirmed_by(views, vertices).T
     decoded = [view_surface(devices_of(scan, scan.poses, k), p, n) for k in range(FRAMES)]
 
     def fitted(poses: DevicePoses) -> np.ndarray:
@@ -314,16 +313,17 @@ def test_a_common_rigid_motion_is_no_uncertainty_of_the_shape(scan: Scan):
     assert np.array_equal(exact.sigma, exact.sigma_independent, equal_nan=True)
 
 
-def test_independent_part_is_the_noise_of_the_averaged_pixels(scan: Scan, views: VertexViews, sums: VertexSums):
-    mesh, seen = hill(), np.unique(views.vertex)
+def test_independent_part_is_the_noise_of_the_averaged_pixels(views: list[FrameViews], sums: VertexSums):
+    mesh, seen = hill(), np.flatnonzero(sums.number)
     on_truth = replace(sums, pull=np.zeros_like(sums.pull), correlation=1.0)
     area = AVERAGED_CELLS * CELL**2
     v = seen[len(seen) // 2]
-    mine = views.vertex == v
-    pixels = area * views.pixels_per_area[mine]
-    slope2 = (views.slope[mine] ** 2).sum(1)
-    noise = views.noise_px[views.frame[mine]]
-    expected = (pixels * slope2 * noise**2).sum() / (pixels * slope2).sum() ** 2
+    weight = [
+        (area * view.pixels_per_area[at] * (view.slope[at] ** 2).sum(1), view.noise_px)
+        for view in views
+        if (at := view.vertex == v).any()
+    ]
+    expected = sum(float(w[0]) * noise**2 for w, noise in weight) / sum(float(w[0]) for w, _ in weight) ** 2
     assert independent_variance(mesh, on_truth, area)[v] == pytest.approx(expected)
     # a surface that lies 0.6 mm beside what the pixels say is that uncertain
     beside = replace(on_truth, pull=0.6 * sums.weight)

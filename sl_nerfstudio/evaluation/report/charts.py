@@ -205,8 +205,6 @@ class Bars:
 
 def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False) -> str:
     """Bars per frame, several series side by side; `wide` fills the width of the page."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(10.4 if wide else 5.4, 2.1)
         count = len(series[0].values)
@@ -226,8 +224,6 @@ def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False
 
 def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, upper: float) -> str:
     """Share of the values in each bin between two limits; values outside count in the outermost bins."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(5.4, 2.1)
         share = np.full(len(values), 100 / max(len(values), 1))
@@ -240,8 +236,6 @@ def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, 
 
 def curve(title: str, step: Sequence[float | int | None], values: Sequence[float | int | None]) -> str:
     """A convergence curve; logarithmic where positive values span more than a factor of 20."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(2.9, 1.7)
         x, y = np.asarray(step, np.float64), np.asarray(values, np.float64)
@@ -275,9 +269,6 @@ def _legend(axes: Axes, series: int) -> None:
 
 def _svg(figure: Figure, title: str) -> str:
     """The figure as an <svg> element with a title for screen readers."""
-    import matplotlib
-    from markupsafe import escape
-
     buffer = io.StringIO()
     # One salt per chart: the ids of several charts on one page must differ, and every run must give the same.
     with matplotlib.rc_context({"svg.hashsalt": title}):

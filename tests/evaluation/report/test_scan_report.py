@@ -127,7 +127,8 @@ def test_report_tells_everything(full_report: str) -> None:
         "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
         "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
         "known (by construction)", "σ frame", "The intrinsics contradict the captures (chi square 412, by chance 6)",
-        "Frames that cannot be placed: frame_00001.", "width <of> it 12.346 0.0123 0.0111 0.00550 3 and 2", "height 7 unknown unknown unknown 3 and 0",
+        "Frames that cannot be placed: frame_00001.",
+        "width <of> it 12.346 0.0123 0.0111 0.00550 3 and 2", "height 7 unknown unknown unknown 3 and 0",
         "focal length of the camera +1.00 %, of the projector -0.50 %", "camera: focal length +0.20 ± 0.01 %",
     ):  # fmt: skip
         assert what in text, what
