@@ -50,6 +50,7 @@ def test_open3d_comes_without_its_web_viewer_until_somebody_asks(tmp_path):
     assert printed(OPEN3D.format(left_out=list(_LEFT_OUT)), tmp_path)[-3:] == ["[]", "True", "True"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("library", "names"), [("torchvision", ["torch._dynamo"]), ("open3d", ["dash", "sklearn", "pandas", *_LEFT_OUT])]
 )
@@ -91,6 +92,7 @@ print(torch._dynamo.config.suppress_errors, "torch._dynamo.eval_frame" in sys.mo
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "compiler"), [("/bin/ns-train sl-neus", False), ("ns-train splatfacto", True)])
 def test_commands_of_this_package_go_without_the_compiler_until_somebody_asks(tmp_path, command, compiler):
     found = printed(COMMAND.format(command=command.split()), tmp_path)

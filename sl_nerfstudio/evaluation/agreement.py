@@ -101,7 +101,7 @@ def frame_pixels(
     meeting = triangulate(camera, T_c, uv, projector, T_p, torch.as_tensor(np.nan_to_num(predicted)))
     to_projector = T_world_projector[:3, 3] - p_world
     cosine = -(to_projector * direction).sum(1) / np.linalg.norm(to_projector, axis=1)
-    footprint = _footprint(coords)
+    footprint = _median(np.linalg.norm(np.diff(coords, axis=1), axis=2).ravel())
     return FramePixels(
         row=row,
         column=column,
@@ -117,7 +117,7 @@ def frame_pixels(
         depth_per_px=np.where(reached, meeting.sigma_depth.numpy(), np.nan),
         ray_angle_deg=np.degrees(np.arccos(np.clip(cosine, -1, 1))),
         behind=np.where(np.isfinite(decoded_uv).all(1), hits.distance - measured, np.nan),
-        noise_px=float(np.nan_to_num(max(MAD_TO_SIGMA * _known_median(np.abs(epipolar)), _FOOTPRINT * footprint))),
+        noise_px=float(np.nan_to_num(max(MAD_TO_SIGMA * _median(np.abs(epipolar)), _FOOTPRINT * footprint))),
         footprint_px=footprint,
     )
 
@@ -141,12 +141,6 @@ def _predict(
     return np.where(in_front.numpy()[:, None], uv, np.nan), reached
 
 
-def _footprint(coords: Float[ndarray, "h w 2"]) -> float:
-    """Pattern pixels between the coordinates of neighbouring camera pixels; NaN where there are none."""
-    step = np.linalg.norm(np.diff(coords, axis=1), axis=2)
-    return _known_median(step.ravel())
-
-
 def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[ndarray, "n"]:
     """Bilinear value of an image at pixels `uv` (centre of the first pixel: 0.5); NaN for NaN."""
     out = np.full(len(uv), np.nan)
@@ -156,16 +150,9 @@ def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[nd
     return out
 
 
-def _known_median(values: Float[ndarray, "n"]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
-
-
 # Holes of a mesh: places that a frame decoded and whose rays meet no surface there.
 
-_LEAST_DEPTH = (
-    0.01  # of the mesh's size, by which a ray must pass the measured point for the surface to be missing there
-)
+_LEAST_DEPTH = 0.01  # of the mesh's size: how far behind the measured point a ray must pass where surface is missing
 _LEAST_WIDTH = 0.02  # of the side of a square as large as the decoded area: narrower gaps are rims of the surface
 
 _JUMP = 2.5  # usual steps between neighbouring pixels, beyond which coordinates jump

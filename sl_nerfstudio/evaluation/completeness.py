@@ -4,16 +4,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, faces_and_falls_inside
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels
+from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.meshing.mesh import Mesh
 
 # Openings of a mesh: where its surface ends. Every real object is closed, so behind each of them something lacks.
@@ -224,13 +224,8 @@ def _pattern_px_per_length(points: Float[ndarray, "n 3"], view: SurfaceView) -> 
     """How far the pattern moves under a point that moves along its camera ray."""
     eye = view.T_world_camera[:3, 3]
     step = 1e-4 * (points - eye)
-    uv = [_project(points + side * step, view) for side in (-0.5, 0.5)]
+    uv = [world_pixels(view.projector, view.T_world_projector, points + side * step)[0] for side in (-0.5, 0.5)]
     return np.linalg.norm(uv[1] - uv[0], axis=1) / np.linalg.norm(step, axis=1)
-
-
-def _project(points: Float[ndarray, "n 3"], view: SurfaceView) -> Float[ndarray, "n 2"]:
-    T = inverse(torch.as_tensor(view.T_world_projector, dtype=torch.float64))
-    return project(Intrinsics.of(view.projector, torch.float64), transform(T, torch.from_numpy(points)))[0].numpy()
 
 
 def _cosine(

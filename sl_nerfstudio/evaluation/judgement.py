@@ -131,7 +131,11 @@ def disagreeing_frames(evaluation: Evaluation) -> tuple[str, ...]:
     if evaluation.starting_poses:
         return ()
     frames = evaluation.agreement.frames
-    names = [f.name for k, f in enumerate(frames) if _stands_out(f, frames) or _contradicts(evaluation, k)]
+    bad = {f.name for f in frames if _stands_out(f, frames)}
+    if evaluation.cross is not None and evaluation.cross.pairs:
+        judged = zip(frames, evaluation.cross.frames, strict=True)
+        bad |= {f.name for f, one in judged if frame_band(one, VerdictSettings()) != "good"}
+    names = [f.name for f in frames if f.name in bad]
     if not names or len(names) > _MOST * len(frames):
         return ()
     several = len(names) > 1
@@ -145,11 +149,6 @@ def _stands_out(frame: FrameAgreement, frames: tuple[FrameAgreement, ...]) -> bo
         if known and getattr(frame, key) > factor * known[len(known) // 2]:
             return True
     return frame.agreeing_share < _LEAST_AGREEING
-
-
-def _contradicts(evaluation: Evaluation, number: int) -> bool:
-    cross = evaluation.cross
-    return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number], VerdictSettings()) != "good"
 
 
 def capture_next(evaluation: Evaluation, view: NextView | None) -> str:

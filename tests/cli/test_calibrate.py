@@ -16,6 +16,8 @@ from sl_nerfstudio.pattern.gray_code import GrayCode
 
 from .snapshots import expect, expect_refusals, masked, succeed
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 5
 BOARD = ["--corners", "9x6", "--square", "30 mm"]
 

@@ -23,6 +23,7 @@ def pattern(*flags: object) -> Ended:
     return succeed(main, "sl-pattern", *flags)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_presets_tell_places_apart_whatever_the_roll_of_the_camera(preset):
     grid = make_grid(preset)

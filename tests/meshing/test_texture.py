@@ -192,7 +192,7 @@ def test_formats_without_textures(suffix, mesh, textured, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-KNOT = trimesh.creation.torus(30.0, 11.0, major_sections=64, minor_sections=32)
+KNOT = trimesh.creation.torus(30.0, 11.0, major_sections=48, minor_sections=24)
 BOX = trimesh.creation.box((30, 20, 10)).subdivide_to_size(4.0)
 SOLIDS = {"torus": KNOT, "box": BOX}
 

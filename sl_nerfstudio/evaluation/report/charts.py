@@ -218,7 +218,9 @@ def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False
         axes.set_xlabel("frame")
         axes.set_ylabel(unit)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _legend(axes, len(series))
+        if len(series) > 1:
+            place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 0.98), "borderaxespad": 0}
+            axes.legend(frameon=False, fontsize=8, ncols=len(series), **place)
         return _svg(figure, title)
 
 
@@ -258,13 +260,6 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     axes.grid(axis="y", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     return figure, axes
-
-
-def _legend(axes: Axes, series: int) -> None:
-    if series > 1:
-        axes.legend(
-            frameon=False, fontsize=8, ncols=series, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0
-        )
 
 
 def _svg(figure: Figure, title: str) -> str:
@@ -401,11 +396,12 @@ def colour_layers(
         layers.append(ColourLayer("error", error, error_scale, error_units))
     if quality is not None and (quality.views > 0).any():
         most_views = ColourScale("viridis", 0.0, float(quality.views.max()))
+        angles = ColourScale("viridis", 0.0, nice_limit(float(np.nanpercentile(quality.ray_angle, 95))))
         layers += [
             _from_zero("uncertainty (1 sigma)", quality.sigma, units),
             ColourLayer("views", quality.views.astype(np.float64), most_views, "frames"),
             _from_zero("residual", quality.residual, "px"),
-            ColourLayer("ray angle", np.nan_to_num(quality.ray_angle), _angles(quality.ray_angle), "degrees"),
+            ColourLayer("ray angle", np.nan_to_num(quality.ray_angle), angles, "degrees"),
         ]
     return layers
 
@@ -414,7 +410,3 @@ def _from_zero(name: str, values: Float[ndarray, "v"], units: str) -> ColourLaye
     """Dark is small and good; values that are not known lie beyond the scale."""
     limit = nice_limit(float(np.nanpercentile(values, 95)))
     return ColourLayer(name, np.nan_to_num(values, nan=2 * limit), ColourScale("inferno", 0.0, limit), units)
-
-
-def _angles(values: Float[ndarray, "v"]) -> ColourScale:
-    return ColourScale("viridis", 0.0, nice_limit(float(np.nanpercentile(values, 95))))

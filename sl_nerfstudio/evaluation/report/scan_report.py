@@ -91,6 +91,7 @@ def _map(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
 # Captured and rendered pattern of a few frames, side by side.
 
 _COMPARISON_SIDE = 420
+DIFFERENCE = ColourScale("RdBu_r", -0.6, 0.6)
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def _compare(name: str, why: str, cosine: float, pixels: FramePixels) -> Compari
         why=why,
         captured=_picture(pixels, _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit))),
         rendered=_picture(pixels, _grey(rendered / white, pixels, pixels.lit)),
-        difference=_picture(pixels, _signed((pixels.captured - rendered) / white, pixels)),
+        difference=_picture(pixels, residual_colours((pixels.captured - rendered) / white, DIFFERENCE, ~pixels.hit)),
         cosine=cosine,
     )
 
@@ -154,10 +155,6 @@ def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> F
     rgb[~known] = NO_VALUE
     rgb[~known & ~pixels.hit] = NO_SURFACE
     return rgb
-
-
-def _signed(values: Float[ndarray, "n"], pixels: FramePixels) -> Float[ndarray, "n 3"]:
-    return residual_colours(values, ColourScale("RdBu_r", -0.6, 0.6), ~pixels.hit)
 
 
 def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
@@ -232,7 +229,13 @@ class SurfacePictures:
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
-    surface, comparisons, script, drawn = _parts(report)
+    surface, comparisons, script, changes = _parts(report)
+    frames, limit = evaluation.agreement.frames, 2 * evaluation.agreement.coordinate_px_median
+    residuals = [
+        charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
+        charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
+    ]
+    truth = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
     values = {
         "report": report,
         "evaluation": evaluation,
@@ -247,44 +250,31 @@ def render_report(report: ReportInput) -> str:
         "coordinate_scale": COORDINATE,
         "epipolar_scale": EPIPOLAR,
         "pattern_scale": PATTERN,
-        "residual_chart": drawn.residuals,
-        "outliers": _outliers(evaluation),
-        "changes": drawn.changes,
+        "residual_chart": charts.frame_bars("Median residuals by frame", "pattern px", residuals, wide=True),
+        "outliers": {f.name for f in frames if not f.coordinate_px_median <= limit},
+        "changes": changes,
         "lengths": report.lengths,
-        "truth": _truth_rows(evaluation),
-        "training": drawn.training,
+        "truth": [(name, errors) for name, errors in truth if errors is not None],
+        "training": _training(report.inputs.training),
         "summary": _summary(report),
         "plotly": script,
     }
     return page(_TEMPLATE, values)
 
 
-def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "DrawnCharts"]:
+def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "PoseChanges | None"]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
     surface = IndexedMesh(report.inputs.mesh)
     compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
     tasks: list[Callable[[], Any]] = [
-        partial(_surface_pictures, report, surface), partial(_charts, report), compare, compressed_script,
+        partial(_surface_pictures, report, surface), partial(_pose_changes, report), compare, compressed_script,
     ]  # fmt: skip
-    (pictures, errors), drawn, comparisons, script = results(tasks)
+    (pictures, errors), changes, comparisons, script = results(tasks)
     if errors is not None and pictures.scale is not None:
         title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
         histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
         pictures = replace(pictures, histogram=histogram)
-    return pictures, comparisons, script, drawn
-
-
-@dataclass(frozen=True)
-class DrawnCharts:
-    """All charts but the histogram, as SVG."""
-
-    residuals: str
-    changes: "PoseChanges | None"
-    training: "TrainingSection | None"
-
-
-def _charts(report: ReportInput) -> DrawnCharts:
-    return DrawnCharts(_residual_chart(report.evaluation), _pose_changes(report), _training(report.inputs.training))
+    return pictures, comparisons, script, changes
 
 
 def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
@@ -314,25 +304,6 @@ def _errors(
     exact = isinstance(reference, MeshReference)
     limit = charts.nice_limit((score.accuracy if exact else score.completeness).p95)
     return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
-
-
-def _residual_chart(evaluation: Evaluation) -> str:
-    frames = evaluation.agreement.frames
-    return charts.frame_bars(
-        "Median residuals by frame",
-        "pattern px",
-        [
-            charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
-            charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
-        ],
-        wide=True,
-    )
-
-
-def _outliers(evaluation: Evaluation) -> set[str]:
-    """Frames whose coordinate residual is more than twice the scan's."""
-    limit = 2 * evaluation.agreement.coordinate_px_median
-    return {f.name for f in evaluation.agreement.frames if not f.coordinate_px_median <= limit}
 
 
 @dataclass(frozen=True)
@@ -372,11 +343,6 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
             ]
             figures.append(charts.frame_bars(title, unit, series))
     return PoseChanges(change, sigma, report.inputs.unplaced, figures)
-
-
-def _truth_rows(evaluation: Evaluation) -> list[tuple[str, PoseErrors]]:
-    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
-    return [(name, errors) for name, errors in rows if errors is not None]
 
 
 @dataclass(frozen=True)
