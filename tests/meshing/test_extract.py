@@ -159,28 +159,27 @@ def test_field_gets_float32_points_inside_the_box_in_bounded_chunks():
     extract_mesh(checked, 97)
 
 
-@pytest.mark.parametrize("sign", ["positive", "negative"])
-def test_no_surface_says_so(sign):
-    value = 0.7 if sign == "positive" else -0.7
-    with pytest.raises(UserError, match=rf"no zero level.*{sign} everywhere.*ns-viewer.*sl-check"):
-        extract_mesh(lambda p: torch.full_like(p[:, 0], value), 32)
-
-
-def test_not_a_number_says_so():
-    with pytest.raises(UserError, match=r"not a number at \d+ of \d+ points.*diverged"):
-        extract_mesh(lambda p: torch.where(p[:, 0] > 0.5, torch.nan, sphere(p)), 32)
-
-
-def test_a_field_that_is_zero_everywhere_is_refused_before_memory_runs_out(monkeypatch):
+@pytest.mark.parametrize(
+    ("field", "resolution", "message"),
+    [
+        (lambda p: torch.full_like(p[:, 0], 0.7), 32, r"no zero level.*positive everywhere.*ns-viewer.*sl-check"),
+        (lambda p: torch.full_like(p[:, 0], -0.7), 32, r"no zero level.*negative everywhere"),
+        (
+            lambda p: torch.where(p[:, 0] > 0.5, torch.nan, sphere(p)),
+            32,
+            r"not a number at \d+ of \d+ points.*diverged",
+        ),
+        (lambda p: 1e-3 * torch.sin(500 * p).prod(-1), 256, r"is not a surface yet.*--resolution"),  # zero everywhere
+        *((sphere, n, f"--resolution {n}: a mesh needs at least 2 cells") for n in (-3, 0, 1)),
+    ],
+)
+def test_what_is_no_surface_is_refused_before_memory_runs_out(monkeypatch, field, resolution, message):
     monkeypatch.setattr(extract, "MAX_LEAVES", 100_000)
-    with pytest.raises(UserError, match=r"is not a surface yet.*--resolution"):
-        extract_mesh(lambda p: 1e-3 * torch.sin(500 * p).prod(-1), 256)
+    with pytest.raises(UserError, match=message):
+        extract_mesh(field, resolution)
 
 
-@pytest.mark.parametrize("resolution", [-3, 0, 1])
-def test_resolution_must_be_at_least_two(resolution):
-    with pytest.raises(UserError, match=f"--resolution {resolution}: a mesh needs at least 2 cells"):
-        extract_mesh(sphere, resolution)
+# The derived table of cases: complete, closed over faces.
 
 
 def directed_edges(case: int) -> list[tuple[int, int]]:

@@ -23,8 +23,6 @@ from sl_nerfstudio.meshing.files import (
 )
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
 
-from .test_visibility import plate
-
 SOLID = trimesh.creation.icosphere(subdivisions=2)
 MESH = Mesh(
     np.asarray(SOLID.vertices, dtype=np.float64) * 40 + [100.0, -20.0, 3.0], np.asarray(SOLID.faces, dtype=np.int64)
@@ -140,62 +138,54 @@ def test_normals_and_cutting():
     assert upper.face_areas().sum() == pytest.approx(MESH.face_areas()[expected].sum())
 
 
-PLATE = plate(5.0, 1.0)
-COUNT = len(PLATE.vertices)
-PLATE_SIGMA = np.where(np.arange(COUNT) < 7, np.nan, np.linspace(0.01, 0.1, COUNT))
-QUALITY = VertexQuality(PLATE_SIGMA, PLATE_SIGMA / 2, np.arange(COUNT), PLATE_SIGMA * 10, PLATE_SIGMA * 100)
-PLATE_COLOUR = np.stack([np.arange(COUNT), 255 - np.arange(COUNT), np.full(COUNT, 7)], 1).astype(np.uint8)
-PLATE_PROPERTIES = VertexProperties(QUALITY, np.arange(COUNT) % 3 == 0, PLATE_COLOUR)
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    write_mesh(tmp_path / "mesh.ply", PLATE, PLATE_PROPERTIES, "mm")
-    return tmp_path / "mesh.ply"
-
-
-def test_all_properties_come_back(file: Path):
-    found = read_quality(file)
-    assert found is not None and np.array_equal(found.views, QUALITY.views)
-    for name in ("sigma", "sigma_independent", "residual", "ray_angle"):
-        np.testing.assert_allclose(getattr(found, name), getattr(QUALITY, name), rtol=1e-6)
-    mesh = read_mesh(file)
-    assert np.array_equal(mesh.vertices, PLATE.vertices) and np.array_equal(mesh.faces, PLATE.faces)
-
-
-def test_other_programs_read_positions_normals_and_properties(file: Path):
-    loaded = trimesh.load(file, process=False)
-    rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
-    np.testing.assert_allclose(rows["sigma"], PLATE_SIGMA, rtol=1e-6)
-    assert np.array_equal(rows["views"], QUALITY.views)
-    assert np.array_equal(rows["invented"], PLATE_PROPERTIES.invented)
-    assert np.array_equal(loaded.visual.vertex_colors[:, :3], PLATE_COLOUR)
-    mesh = o3d.io.read_triangle_mesh(str(file))
-    np.testing.assert_allclose(np.asarray(mesh.vertices), PLATE.vertices)
-    np.testing.assert_allclose(np.asarray(mesh.vertex_normals), np.tile([0.0, 0.0, 1.0], (COUNT, 1)), atol=1e-7)
-    np.testing.assert_allclose(np.asarray(mesh.vertex_colors) * 255, PLATE_COLOUR, atol=1e-6)
-    assert b"comment lengths in mm" in file.read_bytes()[:400]
-
-
-def test_files_without_properties_have_none(file: Path, tmp_path: Path):
-    plain = tmp_path / "plain.ply"
-    plain.write_bytes(encode_ply(PLATE))
-    text = tmp_path / "text.ply"
-    trimesh.Trimesh(PLATE.vertices, PLATE.faces, process=False).export(text, encoding="ascii")
-    cut = tmp_path / "cut.ply"
-    cut.write_bytes(file.read_bytes()[:700])
-    write_mesh(tmp_path / "mesh.obj", PLATE, PLATE_PROPERTIES)
-    assert [read_quality(path) for path in (plain, text, cut, tmp_path / "mesh.obj")] == [None] * 4
-
-
 # A corner with three unequal legs along the axes: no turn or mirror image of it is the same. It is 82 mm long.
 VERTICES = np.array([[0.0, 0, 0], [82, 0, 0], [0, 30, 0], [0, 0, 11]]) + [5.0, -3.0, 2.0]
 CORNER = Mesh(VERTICES, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
 COLOUR = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [188, 188, 188]], dtype=np.uint8)
 VIEWS = np.array([3, 0, 2, 7])
 SIGMA = np.array([0.05, np.nan, 0.02, 0.03])
-PROPERTIES = VertexProperties(VertexQuality(SIGMA, SIGMA, VIEWS, SIGMA, SIGMA), VIEWS == 0, COLOUR)
+PROPERTIES = VertexProperties(VertexQuality(SIGMA, SIGMA / 2, VIEWS, SIGMA * 10, SIGMA * 100), VIEWS == 0, COLOUR)
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "arbitrary": 1.0}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    write_mesh(tmp_path / "mesh.ply", CORNER, PROPERTIES, "mm")
+    return tmp_path / "mesh.ply"
+
+
+def test_all_properties_come_back(file: Path):
+    found = read_quality(file)
+    assert found is not None and np.array_equal(found.views, PROPERTIES.quality.views)
+    for name in ("sigma", "sigma_independent", "residual", "ray_angle"):
+        np.testing.assert_allclose(getattr(found, name), getattr(PROPERTIES.quality, name), rtol=1e-6)
+    mesh = read_mesh(file)
+    assert np.array_equal(mesh.vertices, CORNER.vertices) and np.array_equal(mesh.faces, CORNER.faces)
+
+
+def test_other_programs_read_positions_normals_and_properties(file: Path):
+    loaded = trimesh.load(file, process=False)
+    rows = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_allclose(rows["sigma"], SIGMA, rtol=1e-6)
+    assert np.array_equal(rows["views"], PROPERTIES.quality.views)
+    assert np.array_equal(rows["invented"], PROPERTIES.invented)
+    assert np.array_equal(loaded.visual.vertex_colors[:, :3], COLOUR)
+    mesh = o3d.io.read_triangle_mesh(str(file))
+    np.testing.assert_allclose(np.asarray(mesh.vertices), CORNER.vertices)
+    np.testing.assert_allclose(np.asarray(mesh.vertex_normals), CORNER.vertex_normals(), atol=1e-7)
+    np.testing.assert_allclose(np.asarray(mesh.vertex_colors) * 255, COLOUR, atol=1e-6)
+    assert b"comment lengths in mm" in file.read_bytes()[:400]
+
+
+def test_files_without_properties_have_none(file: Path, tmp_path: Path):
+    plain = tmp_path / "plain.ply"
+    plain.write_bytes(encode_ply(CORNER))
+    text = tmp_path / "text.ply"
+    trimesh.Trimesh(CORNER.vertices, CORNER.faces, process=False).export(text, encoding="ascii")
+    cut = tmp_path / "cut.ply"
+    cut.write_bytes(file.read_bytes()[:600])
+    write_mesh(tmp_path / "mesh.obj", CORNER, PROPERTIES)
+    assert [read_quality(path) for path in (plain, text, cut, tmp_path / "mesh.obj")] == [None] * 4
 
 
 def in_gltf(p: np.ndarray, metres: float) -> np.ndarray:

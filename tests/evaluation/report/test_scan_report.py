@@ -18,11 +18,7 @@ from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, Length, evaluate
 from sl_nerfstudio.evaluation.judgement import judge
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
-from sl_nerfstudio.evaluation.report.charts import (
-    OrthographicView,
-    draw_overlaps,
-    render,
-)
+from sl_nerfstudio.evaluation.report.charts import OrthographicView, draw_overlaps, render
 from sl_nerfstudio.evaluation.report.scan_report import (
     ReportInput,
     ResidualThumbnails,
@@ -33,7 +29,7 @@ from sl_nerfstudio.evaluation.report.scan_report import (
 )
 from sl_nerfstudio.evaluation.report.view3d import decimated
 from sl_nerfstudio.geometry.devices import UNCHANGED, DeviceChange, IntrinsicsChange
-from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.meshing.mesh import VertexQuality
 from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
 from sl_nerfstudio.scan import PoseSigma, Scan, read_scan
@@ -48,18 +44,19 @@ TRAINING = {
     "versions": {"torch": "2.11"},
     "curves": {"step": [0, 100, 200], "loss": [5.0, 0.5, 0.1], "coordinate_px": [20.0, None, 0.4]},
     "intrinsics": {
-        "change": {"camera": {"focal": 0.01, "x": 0.0, "y": 0.0}, "projector": {"focal": -0.005, "x": 0.0, "y": 0.0}},
+        "change": asdict(IntrinsicsChange(DeviceChange(0.01), DeviceChange(-0.005))),
         "self_calibration": {
-            "change": {"camera": {"focal": 0.002, "x": 0.0, "y": 0.0}, "projector": {"focal": 0.0, "x": 0.0, "y": 0.0}},
-            "sigma": {
-                "camera": {"focal": 1e-4, "x": 1e-4, "y": 1e-4},
-                "projector": {"focal": 1e-4, "x": 0.0, "y": 0.0},
-            },
+            "change": asdict(IntrinsicsChange(DeviceChange(0.002), DeviceChange())),
+            "sigma": asdict(IntrinsicsChange(DeviceChange(1e-4, 1e-4, 1e-4), DeviceChange(1e-4))),
             "chi_square": 412.3,
             "contradicts": True,
         },
     },
 }
+
+
+def text_of(page: str) -> str:
+    return " ".join(" ".join(Page(page).text).split())
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +118,7 @@ def test_report_is_accessible_and_its_links_lead_somewhere(full_report: str) -> 
 
 
 def test_report_tells_everything(full_report: str) -> None:
-    text = " ".join(" ".join(Page(full_report).text).split())
+    text = text_of(full_report)
     for what in (
         "Scan report: scan", "<mesh & co>.ply", "refined/transforms.json", "2026-01-02 03:04", "What it means",
         "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
@@ -194,47 +191,22 @@ def test_the_view_of_all_devices_shows_all_of_them(full_report: str) -> None:
     assert max(shown["all devices", k] for k in range(3)) > 0.85 and shown["object", 0] > 0.85  # and not far away
 
 
-def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path) -> None:
-    scan, made = read_scan(clean_scan), FacetedScan()
-    poses = scan.poses
-    thumbnails = ResidualThumbnails()
-    evaluation = evaluate(made.truth(), scan, poses, on_frame=thumbnails)
-    inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
-    page = render_report(
-        ReportInput(
-            evaluation, judge(evaluation, intrinsics_hint(inputs.training, scan)), inputs, thumbnails.frames, "mesh.ply"
-        )
-    )
-    text = " ".join(" ".join(Page(page).text).split())
-    assert "No truth or reference is known for this scan" in text
+@pytest.mark.parametrize("with_points", [False, True])
+def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path, with_points: bool) -> None:
+    scan, truth, thumbnails = read_scan(clean_scan), FacetedScan().truth(), ResidualThumbnails()
+    points = PointReference(IndexedMesh(truth).sample(5000, 0)[0], "some points") if with_points else None
+    evaluation = evaluate(truth, scan, scan.poses, points, samples=5000, on_frame=thumbnails)
+    inputs = EvaluationInputs(truth, scan, scan.poses, None, points, None)
+    text = text_of(render_report(ReportInput(evaluation, judge(evaluation), inputs, thumbnails.frames, "mesh.ply")))
     assert "The scan's own poses were evaluated" in text
-    assert "There is no training.json next to the poses file" in text
-    assert "Accuracy" not in text
-
-
-def test_report_with_reference_points_shows_signed_offsets(clean_scan: Path) -> None:
-    scan, made = read_scan(clean_scan), FacetedScan()
-    points = IndexedMesh(made.truth()).sample(5000, 0)[0]
-    poses = scan.poses
-    thumbnails = ResidualThumbnails()
-    evaluation = evaluate(
-        made.truth(), scan, poses, PointReference(points, "some points"), samples=5000, on_frame=thumbnails
-    )
-    inputs = EvaluationInputs(made.truth(), scan, poses, None, evaluation.reference, None)
-    page = render_report(
-        ReportInput(
-            evaluation, judge(evaluation, intrinsics_hint(inputs.training, scan)), inputs, thumbnails.frames, "mesh.ply"
-        )
-    )
-    text = " ".join(" ".join(Page(page).text).split())
-    assert "Distance from reference" in text and "some points" in text
+    assert "There is no training.json next to the poses file" in text and "Accuracy" not in text
+    assert ("No truth or reference is known for this scan" in text) == (not with_points)
+    assert ("Distance from reference" in text and "some points" in text) == with_points
 
 
 def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
     truth, result = IndexedMesh(sphere(10.0, 100)), IndexedMesh(sphere(10.25, 100))
     reference = PointReference(truth.sample(3000, 0)[0], "")
-    from sl_nerfstudio.geometry.lie import Similarity
-
     errors = reference.surface_errors(result, Similarity.identity(), result.sample(500, 1)[0])
     np.testing.assert_allclose(errors, 0.25, atol=0.02)
 
@@ -290,12 +262,7 @@ def test_the_best_the_median_and_the_worst_frame_are_compared(clean_scan: Path) 
         grey = (np.ptp(captured, axis=2) < 0.05) & (np.ptp(rendered, axis=2) < 0.05)  # blue: no surface
         assert grey.mean() > 0.95 and np.abs(captured - rendered)[grey].mean() < 0.05
         assert np.ptp(difference[grey], axis=-1).mean() < 0.15  # nearly white: no difference
-
-
-def test_frames_without_agreement_are_not_compared(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
-    surface, nan = IndexedMesh(FacetedScan().truth()), float("nan")
-    assert compare_frames(surface, scan, agreement_of(scan, [nan] * 3), scan.poses) == []
+    surface, nan = IndexedMesh(made.truth()), float("nan")
     only = compare_frames(surface, scan, agreement_of(scan, [nan, 0.4, nan]), scan.poses)
     assert [c.name for c in only] == ["frame_00001"]
 
