@@ -124,7 +124,7 @@ class Phase:
     _recent: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, done: int, total: int | None, note: str = "") -> None:
-        """How much of the work is done; the time left follows from the speed of the last half minute."""
+        """Note how much of the work is done; the time left follows from the speed of the last half minute."""
         now = time.monotonic()
         if total != self.total or done < self.done:
             self._recent.clear()
@@ -146,7 +146,7 @@ class Phase:
         return (self.total - done) * (now - start) / (done - before) if done > before else None
 
     def state(self) -> str:
-        """How far the phase is, in words."""
+        """Say how far the phase is."""
         count = f"{self.done} of {self.total}" if self.total else ""
         left = self.seconds_left
         return ", ".join(filter(None, [count, self.note, "" if left is None else f"{duration(left)} left"]))

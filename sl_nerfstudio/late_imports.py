@@ -30,7 +30,7 @@ _importing = ExitStack()
 
 @contextmanager
 def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
-    """For the duration of imports; what they decorate with `torch.compile` is compiled when it is first called.
+    """Leave the compiler out of imports in the block; what `torch.compile` decorates is compiled when it is called.
 
     With `stays_out` torch itself does not fetch the compiler afterwards, either, until something compiles.
     """
@@ -47,7 +47,7 @@ def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
 
 
 def begin_imports(command: list[str]) -> None:
-    """To be called by what nerfstudio imports first of this package, with the command line.
+    """Begin to leave the compiler out; called by what nerfstudio imports first of this package, with the command line.
 
     If that trains one of this package's methods, or loads a run of one, nothing in the process needs the compiler.
     """
@@ -76,7 +76,7 @@ def _begins_with(path: Path, name: str) -> bool:
 
 
 def end_imports() -> None:
-    """To be called by what nerfstudio imports last of this package."""
+    """End what `begin_imports` began; called by what nerfstudio imports last of this package."""
     _importing.close()
 
 

@@ -151,7 +151,7 @@ def one_library_thread() -> Iterator[None]:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """The same without BLAS, for what is called often: looking for the process's BLAS libraries takes milliseconds."""
+    """Operations of torch on one thread, our loops on all, for what is called often: finding BLAS takes milliseconds."""
     global _ours
     before, count = _ours, torch.get_num_threads()
     _ours = threads()
@@ -171,7 +171,7 @@ def torch_on_one_thread() -> None:
 
 
 def only_one_library_thread() -> None:
-    """All libraries and our loops on one thread for the rest of this process: one of several that share the cores."""
+    """Put all libraries and our loops on one thread for good, in one of several processes that share the cores."""
     torch.set_num_threads(1)
     threadpool_limits(limits=1, user_api="blas")
 
@@ -226,7 +226,7 @@ def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: boo
 
 
 def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:
-    """One to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
+    """Make one to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
     step = max(-(-n // parts), 1)
     step = -(-step // multiple) * multiple
     return [(start, min(start + step, n)) for start in range(0, max(n, 1), step)]

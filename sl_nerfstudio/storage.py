@@ -115,7 +115,7 @@ class Holder:
 
     @staticmethod
     def read(note: bytes) -> "Holder | None":
-        """From a note; None if the text is none."""
+        """Read a note; None if the text is none."""
         try:
             found = json.loads(note)["sl-nerfstudio"]
             return Holder(str(found["command"]), int(found["process"]), str(found["host"]), str(found["since"]))
@@ -123,7 +123,7 @@ class Holder:
             return None
 
     def note(self) -> bytes:
-        """One line of text."""
+        """Write the note: one line of text."""
         return json.dumps({"sl-nerfstudio": vars(self)}).encode() + b"\n"
 
     def may_run(self) -> bool:
@@ -139,7 +139,7 @@ class Holder:
         return self.process != os.getpid()
 
     def __str__(self) -> str:
-        """In words."""
+        """Describe the process in words."""
         return f"{self.command} (process {self.process} on {self.host}, since {self.since})"
 
 
@@ -274,7 +274,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked_file(path: Path) -> Iterator[None]:
-    """The same for one file; others in its folder may be outputs of other processes."""
+    """Hold one file; others in its folder may be outputs of other processes."""
     with _locked(beside(path, "sl-lock"), path, path.parent):
         yield
 
@@ -604,7 +604,7 @@ class GrowingArray:
 
 
 def in_file(arrays: Sequence[ndarray]) -> list[ndarray]:
-    """The same arrays, mapped into memory from one temporary file. Raises UserError if the disk is full."""
+    """Map arrays into memory from one temporary file. Raises UserError if the disk is full."""
     firsts, end = [], 0
     for array in arrays:
         firsts.append(end)

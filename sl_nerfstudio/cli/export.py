@@ -264,7 +264,7 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
 
 
 def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]:
-    """How to judge the mesh. It fits the captures only from the poses with which it was trained."""
+    """Say how to judge the mesh. It fits the captures only from the poses with which it was trained."""
     if config.watertight or config.keep_unobserved:
         flag = "--watertight" if config.watertight else "--keep-unobserved"
         return [fitted(f"to judge the surface with sl-eval, export it without {flag}: it judges what is invented, too")]
@@ -419,7 +419,7 @@ def _texture_words(textured: "Textured", unit: str) -> list[str]:
 
 
 def _uncertainty(quality: "VertexQuality", unit: str) -> list[str]:
-    """How well the surface is known, and how much of it is not."""
+    """Say how well the surface is known, and how much of it is not."""
     import numpy as np
 
     sigma = quality.sigma[quality.views > 0]

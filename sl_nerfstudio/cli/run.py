@@ -69,7 +69,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _ignore_more_signals() -> None:
-    """Everything is cleaned up: a second control-C must not print a traceback while Python ends."""
+    """Keep a second control-C from printing a traceback while Python ends: everything is cleaned up."""
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)

@@ -79,7 +79,7 @@ def frame_pixels(
     T_world_projector: Float[ndarray, "4 4"],
     max_pixels: int = MAX_PIXELS,
 ) -> FramePixels:
-    """Everything that the figures and pictures of one frame need; reads the files of the frame."""
+    """Evaluate the pixels of a frame, whose files this reads, for figures and pictures."""
     mask, coords, captured = frame.read_mask(), frame.read_coords(), frame.read_pattern()
     stride = max(1, int(np.ceil(np.sqrt(mask.sum() / max_pixels))))
     row, column = np.nonzero(mask[::stride, ::stride])

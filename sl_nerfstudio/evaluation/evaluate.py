@@ -376,7 +376,7 @@ def _starts(
     points: Float[ndarray, "n 3"],
     tolerance: float,
 ) -> list[Similarity]:
-    """Where ICP starts from; a single start if the poses say that the result is already in place."""
+    """Choose where ICP starts from; a single start if the poses say that the result is already in place."""
     identity = Similarity.identity()
     if poses is None or true_poses is None:
         return [identity]

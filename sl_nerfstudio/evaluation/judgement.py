@@ -97,7 +97,7 @@ class TrainedSteps:
 
 
 def trained_steps(training: dict[str, Any] | None) -> TrainedSteps | None:
-    """From a training.json; None if it does not say."""
+    """Read the steps from a training.json; None if it does not say."""
     settings = (training or {}).get("settings")
     if not isinstance(settings, dict):
         return None
@@ -127,7 +127,7 @@ _STEEP_DEG = 60.0  # above or below the horizon
 
 
 def disagreeing_frames(evaluation: Evaluation) -> tuple[str, ...]:
-    """At most one sentence, with all frames that contradict the others or the surface; none with starting poses."""
+    """Name all frames that contradict the others or the surface, in one sentence; none with starting poses."""
     if evaluation.starting_poses:
         return ()
     frames = evaluation.agreement.frames
@@ -152,7 +152,7 @@ def _stands_out(frame: FrameAgreement, frames: tuple[FrameAgreement, ...]) -> bo
 
 
 def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
-    """Where to capture next and what that would show; "" if nothing that no frame has seen would show."""
+    """Say where to capture next and what that would show; "" if nothing that no frame has seen would show."""
     found = evaluation.completeness
     if found is None or view is None:
         return ""

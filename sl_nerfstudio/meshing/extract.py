@@ -156,7 +156,7 @@ class SparseGrid:
         return out
 
     def corner_keys(self, corner: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-        """One number for each corner of the grid."""
+        """Number the corners of the grid."""
         nx, ny = self.cells[0] + 1, self.cells[1] + 1
         return corner[..., 0] + nx * (corner[..., 1] + ny * corner[..., 2])
 
@@ -383,5 +383,5 @@ def _vertices(grid: SparseGrid, leaves: Leaves, edges: Int[Tensor, "v 2"], polis
 
 
 def _zero(a: Tensor, b: Tensor, value_a: Tensor, value_b: Tensor) -> Tensor:
-    """Where the line through (a, value_a) and (b, value_b), of opposite signs, is zero."""
+    """Find where the line through (a, value_a) and (b, value_b), of opposite signs, is zero."""
     return a + (b - a) * value_a / (value_a - value_b)

@@ -1,4 +1,8 @@
-"""Meshes as files: PLY, OBJ, STL and GLB, chosen by the suffix."""
+"""Meshes as files, PLY, OBJ, STL and GLB, chosen by the suffix; and point clouds, PLY and LAS.
+
+trimesh reads them. What writes them is our own: trimesh's PLY rounds positions to float32 and has no comment for the
+unit, its GLB takes sRGB colours of vertices for linear ones, and its STL does not name the unit.
+"""
 
 import io
 import json
@@ -25,7 +29,7 @@ Y_UP_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def file_from_world(suffix: str, units: str) -> Similarity:
-    """From a scan's world and unit to what a mesh file holds.
+    """Map a scan's world and unit to what a mesh file holds.
 
     glTF (.glb) is in metres with y up by its specification; STL (.stl) in millimetres by custom, in the scan's axes.
     One arbitrary unit becomes one of the file's.
@@ -221,7 +225,7 @@ def encode_glb(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textur
 
 
 def _attributes(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Texture | None) -> dict[str, ndarray]:
-    """Of the vertices; those of charts where there is a texture, because each has one texture coordinate."""
+    """Attributes of the vertices, or of the corners of charts, each of which has one texture coordinate."""
     found = {"POSITION": mesh.vertices.astype("<f4"), "NORMAL": mesh.vertex_normals().astype("<f4")}
     if texture is not None:
         found = {name: values[texture.charts.vertex] for name, values in found.items()}
@@ -259,7 +263,7 @@ def _accessor(view: int, array: ndarray) -> dict[str, Any]:
 
 
 def _views(parts: list[bytes], targets: list[int | None]) -> list[dict[str, int]]:
-    """Where in the buffer each part is, and what for."""
+    """Say where in the buffer each part is, and what for."""
     views, at = [], 0
     for part, target in zip(parts, targets, strict=True):
         view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}

@@ -147,7 +147,7 @@ def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
 def views_by_frame(
     mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None, task: str
 ) -> Iterator[FrameViews]:
-    """Of each frame in order, what it confirms of a mesh, or of the `chosen` vertices; `task` names the progress.
+    """Yield what each frame, in order, confirms of a mesh or of the `chosen` vertices; `task` names the progress.
 
     A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
     predicts. As many frames are in memory at a time as there are threads.
@@ -172,7 +172,7 @@ class VertexViews:
 
 
 def collect_views(mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"], task: str) -> VertexViews:
-    """All frames that confirm each of the chosen vertices."""
+    """Find all frames that confirm each of the chosen vertices."""
     found = list(views_by_frame(mesh, scan, poses, chosen, task))
     vertex, residual = (np.concatenate([getattr(one, name) for one in found]) for name in ("vertex", "residual"))
     order = np.argsort(vertex, kind="stable")
@@ -228,7 +228,7 @@ def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int6
 
 
 def _correlation(window_ratios: Sequence[float]) -> float:
-    """How many neighbouring pixels share an error, from what windows gain in each frame (NaN: unknown).
+    """Estimate how many neighbouring pixels share an error from what windows gain in each frame (NaN: unknown).
 
     If errors were independent, as many pixels as a decoded window has would gain what the fit in it gains.
     """
@@ -262,7 +262,7 @@ class VertexSums:
 
 
 def sum_views(views: Iterable[FrameViews], vertices: int) -> VertexSums:
-    """Of a mesh with a number of vertices, from the views of all frames in order."""
+    """Add up the views of all frames, in order, of a mesh with a number of vertices."""
     number, (distance, weight, variance, unknown, pull) = np.zeros(vertices, dtype=np.int64), np.zeros((5, vertices))
     ray_angle, noises, ratios, bits = np.full(vertices, np.nan), [], [], []
     for one in views:
@@ -432,7 +432,7 @@ def all_devices(scan: Scan, poses: DevicePoses) -> Float[ndarray, "frames device
 
 
 def _columns(some: Int64[ndarray, "some"], frames: int) -> Int64[ndarray, "c"]:
-    """Where delta of some frames, their rho, and the intrinsics are among the unknowns."""
+    """Places of delta of some frames, their rho, and the intrinsics among the unknowns."""
     delta = (6 * some[:, None] + np.arange(6)).reshape(-1)
     return np.concatenate([delta, 6 * frames + delta, np.arange(12 * frames, 12 * frames + UNKNOWNS)])
 

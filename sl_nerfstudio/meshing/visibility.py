@@ -1,4 +1,4 @@
-"""For every vertex of a mesh, how many frames see it, and how many of them confirm or contradict it."""
+"""Which frames see, confirm or contradict each vertex of a mesh, and the part of it that they observed."""
 
 import math
 from dataclasses import dataclass, replace

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.evaluation.completeness import (
+    CaptureView,
     NextView,
     Occluders,
-    SurfaceView,
     find_openings,
     information,
     known,
@@ -78,7 +78,7 @@ def poses(angles_deg: np.ndarray, elevation: float) -> DevicePoses:
 
 def proposed(mesh: Mesh, devices: DevicePoses) -> NextView:
     pairs = zip(devices.T_world_camera, devices.T_world_projector, strict=True)
-    frames = [SurfaceView(DEVICE, T_camera, DEVICE, T_projector) for T_camera, T_projector in pairs]
+    frames = [CaptureView(DEVICE, T_camera, DEVICE, T_projector) for T_camera, T_projector in pairs]
     found = next_view(IndexedMesh(mesh), find_openings(mesh), frames, 0.3)
     assert found is not None
     return found
@@ -112,7 +112,7 @@ def test_information_follows_from_noise_angle_and_visibility():
     at, occluders = places(surface, openings, 400), Occluders(surface, openings)
     wide, narrow = (poses(np.array([0.0]), 0.6) for _ in range(2))
     narrow.T_world_projector[0] = poses(np.array([-9.0]), 0.6).T_world_projector[0]  # 3 degrees beside the camera
-    views = [SurfaceView(DEVICE, p.T_world_camera[0], DEVICE, p.T_world_projector[0]) for p in (wide, narrow)]
+    views = [CaptureView(DEVICE, p.T_world_camera[0], DEVICE, p.T_world_projector[0]) for p in (wide, narrow)]
     one, coarse = information(at, occluders, views[0], 0.3), information(at, occluders, views[0], 0.6)
     np.testing.assert_allclose(one, 4 * coarse)  # variance is the square of the noise
     flat = information(at, occluders, views[1], 0.3)

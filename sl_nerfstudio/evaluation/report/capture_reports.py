@@ -1,4 +1,4 @@
-"""The report of `sl-process`: what happened to every capture, as one HTML file that needs no network."""
+"""The reports of `sl-process` and `sl-calibrate`: what happened to every capture, as HTML that needs no network."""
 
 import math
 import re
@@ -29,7 +29,7 @@ from sl_nerfstudio.review.verdict import DEVICES, Verdict, shortcomings
 # The report of `sl-calibrate`: what was found in every photograph, and how far the result can be trusted.
 
 TITLE = b"<title>Calibration report"
-"""By which an earlier report is known."""
+"""Marks an earlier report."""
 _THUMBNAIL = 360  # pixels
 _ARROW = 0.06  # of the image's width: length of the arrow of the largest usual residual
 

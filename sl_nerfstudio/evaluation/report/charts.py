@@ -1,4 +1,4 @@
-"""Small charts as inline SVG: sharp in print, without scripts."""
+"""What reports are made of: charts as inline SVG, pictures as embedded data, colours, and filled-in templates."""
 
 import base64
 import io

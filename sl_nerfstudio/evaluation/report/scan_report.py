@@ -1,4 +1,4 @@
-"""The report: one HTML file with which a person can judge a scan, without a network."""
+"""The report of `sl-eval`: one HTML file with which a person can judge a scan, without a network."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -165,7 +165,7 @@ def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
 
 
 def intrinsics_hint(training: dict[str, Any] | None, scan: Scan) -> str:
-    """How the run changed the intrinsics, and which ones would agree better; "" if there is nothing to say."""
+    """Say how the run changed the intrinsics, and which ones would agree better; "" if there is nothing to say."""
     record = (training or {}).get("intrinsics")
     if not isinstance(record, dict):
         return ""
