@@ -151,7 +151,7 @@ def one_library_thread() -> Iterator[None]:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Operations of torch on one thread, our loops on all, for what is called often: finding BLAS takes milliseconds."""
+    """Operations of torch on one thread, our loops on all, for frequent calls: finding BLAS takes milliseconds."""
     global _ours
     before, count = _ours, torch.get_num_threads()
     _ours = threads()

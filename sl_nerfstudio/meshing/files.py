@@ -1,7 +1,7 @@
 """Meshes as files, PLY, OBJ, STL and GLB, chosen by the suffix; and point clouds, PLY and LAS.
 
 trimesh reads them. What writes them is our own: trimesh's PLY rounds positions to float32 and has no comment for the
-unit, its GLB takes sRGB colours of vertices for linear ones, and its STL does not name the unit.
+unit, and its GLB takes sRGB colours of vertices for linear ones.
 """
 
 import io
@@ -172,14 +172,10 @@ def encode_mtl(coloured: bool, image: str | None) -> bytes:
 
 def encode_stl(mesh: Mesh, unit: str) -> bytes:
     """Binary STL; its header names the unit."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    rows = np.zeros(len(mesh.faces), dtype=[("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
-    rows["normal"] = normal / np.where(length > 0, length, 1.0)
-    rows["corner"] = np.stack([a, b, c], 1)
-    header = f"binary STL, lengths in {unit}".encode().ljust(80)
-    return header + np.uint32(len(rows)).tobytes() + rows.tobytes()
+    import trimesh
+
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return f"binary STL, lengths in {unit}".encode().ljust(80) + surface.export(file_type="stl")[80:]
 
 
 # Meshes as bytes of GLB files: binary glTF 2.0.

@@ -87,18 +87,6 @@ def test_a_surface_at_another_height_is_predicted_wrong_by_the_parallax(scan):
     assert expected.min() > LEAST_PX and (view.least > LEAST_PX).all()
 
 
-def test_vertices_that_face_away_or_are_hidden_are_not_seen(scan):
-    flipped = plate(20.0, 2.0)
-    flipped = Mesh(flipped.vertices, flipped.faces[:, ::-1].copy())
-    assert len(seen(flipped, scan).vertex) == 0
-    floor, roof = plate(20.0, 2.0), plate(25.0, 2.0, z=20.0)
-    both = Mesh(
-        np.concatenate([floor.vertices, roof.vertices]), np.concatenate([floor.faces, roof.faces + len(floor.vertices)])
-    )
-    below = np.abs(floor.vertices).max(1) < 10
-    assert not np.isin(np.flatnonzero(below), seen(both, scan).vertex).any()
-
-
 def test_outside_the_mask_the_distance_in_pixels_decides(scan):
     """The mesh goes on beyond the true plate."""
     mesh = plate(45.0, 1.0)
