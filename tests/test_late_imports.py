@@ -42,6 +42,7 @@ def printed(code: str, folder: Path) -> list[str]:
     return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_loading_a_run_does_not_import_the_compiler_until_somebody_asks(tmp_path):
     assert printed(LOAD, tmp_path) == ["UserError True False", "False True"]
 

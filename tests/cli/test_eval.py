@@ -101,6 +101,7 @@ def test_the_poses_file_brings_its_intrinsics(scan: Path, untrue: Path, tmp_path
     assert residuals[0] > 1 and residuals[1] < 1e-2
 
 
+@pytest.mark.slow
 def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: Path) -> None:
     known = read_scan(scan)
     refined = DevicePoses(known.poses.T_world_camera, known.poses.T_world_projector)
@@ -130,6 +131,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
     assert "refined/transforms.json" in text and "9.9" in text and "σ frame" in text
 
 
+@pytest.mark.slow
 def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(
     scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

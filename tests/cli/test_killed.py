@@ -19,7 +19,9 @@ COMMANDS = {
     "sl-synth": (synth.main, ["--frames", "2", "--resolution", "16"]),
     "sl-synth images": (synth.main, ["--frames", "2", "--resolution", "16", "--images-only"]),
 }
-each_command = pytest.mark.parametrize("command", COMMANDS)
+each_command = pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=[pytest.mark.slow] * ("synth" in name)) for name in COMMANDS]
+)
 
 
 def run(command, output):

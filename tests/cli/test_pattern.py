@@ -49,6 +49,7 @@ def test_a_folder_with_a_grid(monkeypatch, tmp_path):
     expect("sl-pattern", "run", said)
 
 
+@pytest.mark.slow
 def test_too_many_nodes_are_warned_of_and_the_remedy_helps(tmp_path):
     """Where (3, 2) cannot be had, the roll of the camera counts before the second misread symbol."""
     flags = ["--width", 355, "--height", 200]
