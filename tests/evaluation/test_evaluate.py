@@ -64,11 +64,11 @@ def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_
     """No true poses: the scan's own ones lead to the reference, though the result is 60 times smaller and far away."""
     made, scan = FacetedScan(), read_scan(clean_scan)
     S = Similarity(1 / 60, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
-    points = IndexedMesh(made.truth()).sample(4 * SAMPLES, 3)[0]
+    points = IndexedMesh(made.truth()).sample(SAMPLES, 3)[0]
     poses = scan.poses.mapped(S)
     result = evaluate(made.truth().mapped(S), scan, poses, PointReference(points, "points"), samples=SAMPLES)
     assert result.surface["similarity"].scale == pytest.approx(60, rel=1e-3)
-    assert result.surface["similarity"].accuracy.p95 < 1.2  # distances between 20,000 points on 100 mm
+    assert result.surface["similarity"].accuracy.p95 < 2.5  # distances between 5,000 points on 100 mm
     assert result.pose_errors is None
 
 

@@ -166,9 +166,7 @@ def pixel_map(row: ndarray, column: ndarray, stride: int, rgb: Float[ndarray, "n
 
 
 def residual_colours(
-    values: Float[ndarray, "n"],
-    scale: ColourScale,
-    no_surface: Bool[ndarray, "n"],
+    values: Float[ndarray, "n"], scale: ColourScale, no_surface: Bool[ndarray, "n"]
 ) -> Float[ndarray, "n 3"]:
     """Colours of residuals; grey where there is no value, blue where there is no surface."""
     rgb = scale(np.nan_to_num(values))

@@ -66,15 +66,13 @@ class ResidualThumbnails:
         """Add one frame."""
         missed = ~pixels.hit
         difference = np.abs(pixels.captured - pixels.rendered * brightness_ratio(pixels))
-        self.frames.append(
-            FrameThumbnails(
-                frame.name,
-                figures,
-                coordinate=_map(pixels, residual_colours(pixels.coordinate, COORDINATE, missed & pixels.decoded)),
-                epipolar=_map(pixels, residual_colours(pixels.epipolar, EPIPOLAR, np.zeros_like(missed))),
-                pattern=_map(pixels, residual_colours(difference, PATTERN, missed)),
-            )
+        drawn = (
+            residual_colours(pixels.coordinate, COORDINATE, missed & pixels.decoded),
+            residual_colours(pixels.epipolar, EPIPOLAR, np.zeros_like(missed)),
+            residual_colours(difference, PATTERN, missed),
         )
+        maps = (_picture(pixels, rgb, _THUMBNAIL_SIDE, 82) for rgb in drawn)
+        self.frames.append(FrameThumbnails(frame.name, figures, *maps))
 
 
 def brightness_ratio(pixels: FramePixels) -> float:
@@ -84,8 +82,8 @@ def brightness_ratio(pixels: FramePixels) -> float:
     return float(a @ b / (b @ b)) if (b @ b) > 0 else 1.0
 
 
-def _map(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
-    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _THUMBNAIL_SIDE))
+def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"], side: int, quality: int) -> str:
+    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), side), quality)
 
 
 # Captured and rendered pattern of a few frames, side by side.
@@ -107,47 +105,29 @@ class Comparison:
 
 
 def compare_frames(
-    surface: IndexedMesh,
-    scan: Scan,
-    agreement: CaptureAgreement,
-    poses: DevicePoses,
+    surface: IndexedMesh, scan: Scan, agreement: CaptureAgreement, poses: DevicePoses
 ) -> list[Comparison]:
-    """The frames with the best, the median and the worst pattern agreement."""
-    pattern = scan.read_pattern()
-    shown = []
-    for index, why in _chosen(agreement):
-        frame = scan.frames[index]
-        pixels = frame_pixels(
-            surface, frame, scan, pattern, poses.T_world_camera[index], poses.T_world_projector[index]
-        )
-        shown.append(_compare(frame.name, why, agreement.frames[index].pattern_cosine, pixels))
-    return shown
-
-
-def _chosen(agreement: CaptureAgreement) -> list[tuple[int, str]]:
-    """Indices of frames, and why."""
-    order = sorted(
-        (i for i, f in enumerate(agreement.frames) if math.isfinite(f.pattern_cosine)),
-        key=lambda i: -agreement.frames[i].pattern_cosine,
-    )
+    """Draw the frames with the best, the median and the worst pattern agreement."""
+    cosine = [frame.pattern_cosine for frame in agreement.frames]
+    order = sorted((k for k, value in enumerate(cosine) if math.isfinite(value)), key=lambda k: -cosine[k])
     picks: dict[int, str] = {}
     for place, why in ((0, "best agreement"), (len(order) // 2, "median"), (-1, "worst agreement")):
         if order:
             picks.setdefault(order[place], why)
-    return list(picks.items())
-
-
-def _compare(name: str, why: str, cosine: float, pixels: FramePixels) -> Comparison:
-    rendered = pixels.rendered * brightness_ratio(pixels)
-    white = max(float(np.nanpercentile(pixels.captured, 99.5)), 1e-6) if len(pixels.captured) else 1.0
-    return Comparison(
-        name=name,
-        why=why,
-        captured=_picture(pixels, _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit))),
-        rendered=_picture(pixels, _grey(rendered / white, pixels, pixels.lit)),
-        difference=_picture(pixels, residual_colours((pixels.captured - rendered) / white, DIFFERENCE, ~pixels.hit)),
-        cosine=cosine,
-    )
+    pattern, shown = scan.read_pattern(), []
+    for k, why in picks.items():
+        T = poses.T_world_camera[k], poses.T_world_projector[k]
+        pixels = frame_pixels(surface, scan.frames[k], scan, pattern, *T)
+        rendered = pixels.rendered * brightness_ratio(pixels)
+        white = max(float(np.nanpercentile(pixels.captured, 99.5)), 1e-6) if len(pixels.captured) else 1.0
+        drawn = (
+            _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit)),
+            _grey(rendered / white, pixels, pixels.lit),
+            residual_colours((pixels.captured - rendered) / white, DIFFERENCE, ~pixels.hit),
+        )
+        pictures = (_picture(pixels, rgb, _COMPARISON_SIDE, 85) for rgb in drawn)
+        shown.append(Comparison(scan.frames[k].name, why, *pictures, cosine=cosine[k]))
+    return shown
 
 
 def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> Float[ndarray, "n 3"]:
@@ -155,10 +135,6 @@ def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> F
     rgb[~known] = NO_VALUE
     rgb[~known & ~pixels.hit] = NO_SURFACE
     return rgb
-
-
-def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
-    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _COMPARISON_SIDE), quality=85)
 
 
 # What the report says about the intrinsics of a run, from its training.json.
