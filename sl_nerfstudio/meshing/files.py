@@ -173,9 +173,10 @@ def encode_mtl(coloured: bool, image: str | None) -> bytes:
 def encode_stl(mesh: Mesh, unit: str) -> bytes:
     """Binary STL; its header names the unit."""
     import trimesh
+    from trimesh.exchange.stl import export_stl
 
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    return f"binary STL, lengths in {unit}".encode().ljust(80) + surface.export(file_type="stl")[80:]
+    return f"binary STL, lengths in {unit}".encode().ljust(80) + export_stl(surface)[80:]
 
 
 # Meshes as bytes of GLB files: binary glTF 2.0.

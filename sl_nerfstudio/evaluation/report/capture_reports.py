@@ -175,7 +175,8 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
     rows = []
     for record, preview in zip(result.frames, previews, strict=True):
         shown = (preview.image, preview.coords, preview.left_out)
-        rows.append(FrameRow(record, *("" if p is None else data_uri(p) for p in shown), shares.get(record.name)))
+        image, coords, left_out = ("" if p is None else data_uri(p) for p in shown)
+        rows.append(FrameRow(record, image, coords, left_out, shares.get(record.name)))
     # The flags on which the scan depends; with others, and at another time, the report is the same byte for byte.
     flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
     figure = ""
