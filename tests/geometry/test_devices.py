@@ -1,4 +1,4 @@
-"""Device models against OpenCV and the formulas of the format, and the projection of compiled loops against that of tensors."""
+"""Device models against OpenCV and the format's formulas; the projection of compiled loops against that of tensors."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Connected components, against a flood fill."""
+"""Connected components against a flood fill, robust kernels, evenly spaced indices."""
 
 from fractions import Fraction
 
