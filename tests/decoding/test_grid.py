@@ -71,7 +71,7 @@ def test_light_is_what_the_surface_returns_of_the_projectors(decoder, decoded, t
 
 
 def test_the_shipped_weights_are_small():
-    weights = Path(sl_nerfstudio.decoding.__file__).parent / "grid" / "weights"
+    weights = Path(sl_nerfstudio.decoding.__file__).parent / "weights"
     assert 0 < sum(path.stat().st_size for path in weights.iterdir()) < 15e6
 
 
