@@ -16,9 +16,23 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
-from sl_nerfstudio.registration.agreement import Tolerance, agreement_at
-from sl_nerfstudio.registration.assembly import Assembly, Component, Nodes, PoseGraphSolution, node_at
+from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, PENALTY, Tolerance, agreement_at
+from sl_nerfstudio.registration.assembly import (
+    INNER_MISFIT_FACTOR,
+    Assembly,
+    Component,
+    Nodes,
+    PoseGraphSolution,
+    node_at,
+    see_same_side,
+)
 from sl_nerfstudio.registration.pairs import (
+    ANYWHERE,
+    KERNEL_SIGMAS,
+    LEAST_FITNESS,
+    LEAST_OVERLAP,
+    NEIGHBOURS,
+    SAME_ROTATION_DEG,
     PairMatch,
     is_accepted,
     is_ambiguous,
@@ -40,16 +54,26 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, EdgeSettings, RegistrationSettings
 from sl_nerfstudio.registration.surfaces import FrameCloud, SurfaceMap, build_surface_map
 from sl_nerfstudio.registration.symmetry import (
+    DIFFERENT_SIDES_DEG,
+    SEQUENCE_GAPS,
     chain_of_small_steps,
     sides_are_open,
     symmetric_turns_deg,
     turn_blocks_back,
     typical_step_deg,
 )
-from sl_nerfstudio.registration.view_graph import ViewGraph, split_by_slip, starting_similarities, with_common_centre
+from sl_nerfstudio.registration.view_graph import ViewGraph, starting_similarities, with_common_centre
+
+ROUNDS = 2  # of closing cycles
+LEAST_JOINED = 0.5  # share of successive frames that must be joined for their order to be that of capture
+LEAST_FRAME_FITNESS = 0.55  # share of a frame's points, of those that other frames can judge, which must agree
+MOST_DOUBTFUL = 0.25  # share of the frames most of whose pairs contradict the pose found; more: the pairs are to blame
+LARGEST_SIGMA_ROTATION_DEG = 3.0  # standard deviation of the least known rotation beyond which it is uncertain
+UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservable: of all angles from -180 to 180
+REACH = 2  # frames before and after one with which each pose of its projector is compared
+RIVAL = 0.8  # support of another pose, relative to the best, from which the choice is not certain
 
 # Which frames are registered in the end, why the others are not, and what is uncertain.
 
@@ -61,7 +85,7 @@ def accept_frames(
 
     `others`: pairs that are not in the graph, and may say that the surface looks the same after a turn.
     """
-    components, settings = graph.assemble(), graph.settings
+    components = graph.assemble()
     edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
     component = _numbers(components, len(names))
@@ -71,9 +95,9 @@ def accept_frames(
     fitness = np.array(
         results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
     )
-    agrees = connected & (fitness >= settings.acceptance.least_fitness)
-    doubts = _doubtful(names, agrees, edges, solution.consistent, settings.edge)
-    few = len(doubts) <= settings.acceptance.most_doubtful * agrees.sum()
+    agrees = connected & (fitness >= LEAST_FRAME_FITNESS)
+    doubts = _doubtful(names, agrees, edges, solution.consistent)
+    few = len(doubts) <= MOST_DOUBTFUL * agrees.sum()
     registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
@@ -87,7 +111,7 @@ def accept_frames(
         tuple(
             Edge(
                 (names[e.source], names[e.target]), e.S_target_source.R, e.overlap, e.fitness, bool(used),
-                is_ambiguous(e, settings.edge), e.rotation_sigma_deg, e.by_tone,
+                is_ambiguous(e), e.rotation_sigma_deg, e.by_tone,
             )
             for e, used in zip(edges, solution.consistent, strict=True)
         ),
@@ -101,7 +125,7 @@ def accept_frames(
         ),
         tuple(_uncertainties(names, consistent, registered, graph)),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(graph.sides, edges, solution, settings, [*others, *graph.put_aside]),
+        symmetric_turns_deg(graph.sides, edges, solution, [*others, *graph.put_aside]),
         ordered,
     )  # fmt: skip
 
@@ -111,14 +135,13 @@ def _doubtful(
     inside: Bool[ndarray, "n"],
     edges: Sequence[PairMatch],
     consistent: Bool[ndarray, "edges"],
-    settings: EdgeSettings,
 ) -> dict[int, PairsContradict]:
     """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
     found = {}
     frames: list[int] = np.flatnonzero(inside).tolist()
     for k in frames:
         mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
-        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e, settings)]
+        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e)]
         against = [e for e, used in mine if not used]
         if math.fsum(map(support, against)) > math.fsum(support(e) for e, used in mine if used):
             found[k] = PairsContradict(names[k], len(mine), len(against))
@@ -144,16 +167,16 @@ def _fitness_of(
     k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
 ) -> float:
     """Of a frame's points that other frames can judge, the share that agrees."""
-    S, settings = solution.S_world_camera[k], graph.settings.pair
+    S = solution.S_world_camera[k]
     if S is None or not connected[k]:
         return 0.0
     agreeing = expected = 0.0
     for j in np.flatnonzero(connected).tolist():
         other = solution.S_world_camera[j]
-        if j == k or other is None or not graph.see_same_side(S, other):
+        if j == k or other is None or not see_same_side(S, other):
             continue
         maps = graph.maps[k], graph.maps[j]
-        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
+        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, AGREEING_SIGMAS))
         agreeing += found.agreeing[0]
         expected += found.expected[0]
     return agreeing / expected if expected else 0.0
@@ -182,23 +205,22 @@ def _exclusion(
     k: int, names: Sequence[str], components: Sequence[Component], main: Component, graph: ViewGraph
 ) -> Exclusion:
     """Why a frame is not in the largest component."""
-    settings = graph.settings.edge
     mine = [e for e in graph.matches if k in (e.source, e.target)]
     if not mine:
         return NoCommonSurface(names[k])
-    best = max(mine, key=lambda e: quality(e, settings))
-    if not is_accepted(best, settings):
+    best = max(mine, key=lambda e: quality(e))
+    if not is_accepted(best):
         partner = names[best.other(k)]
-        return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+        return PoorPair(names[k], partner, best.overlap, best.fitness, LEAST_OVERLAP, LEAST_FITNESS)
     component = next(c for c in components if k in c)
     across = [
         (e, e.source if e.source in main else e.target)
         for e in graph.matches
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
-    partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
+    partner = names[max(across, key=lambda pair: quality(pair[0]))[1]] if across else None
     # where no two frames could be joined, every pair of the frame might have joined it
-    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e, settings)]
+    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e)]
     slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
     return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 
@@ -213,8 +235,8 @@ def _uncertainties(
         mine = [e for e in consistent if k in (e.source, e.target)]
         sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
         if mine and all(e.slip_deg > 0 for e in mine):
-            out.append(UncertainRotation(names[k], graph.settings.acceptance.unknown_sigma_rotation_deg))
-        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
+            out.append(UncertainRotation(names[k], UNKNOWN_SIGMA_ROTATION_DEG))
+        elif sigma_deg > LARGEST_SIGMA_ROTATION_DEG:
             out.append(UncertainRotation(names[k], sigma_deg))
     return out
 
@@ -254,29 +276,24 @@ def include_left_out(
     adjusted: DevicePoses,
     left_out: Sequence[int],
     seed: int = 0,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
     """The registration, at the adjusted poses, with those of `left_out` that can now be placed by more than one pair.
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
     n = len(clouds)
-    graph = ViewGraph(
-        [build_surface_map(c, settings.surface_map) for c in clouds], [None] * n, np.random.default_rng(seed), settings
-    )
+    graph = ViewGraph([build_surface_map(c) for c in clouds], [None] * n, np.random.default_rng(seed))
     main: Component = {
         k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
         for k, T in enumerate(adjusted.T_world_camera)
         if registration.registered[k]
     }
-    search = settings.pair.anywhere
     for k in left_out:
-        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
+        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
     used = [e.fitness for e in registration.edges if e.used]
-    firm, slipping = split_by_slip(graph.edges, settings.pair.bounded_slip_deg)
+    firm, slipping = [e for e in graph.edges if e.holds], [e for e in graph.edges if not e.holds]
     # after the adjustment right frames fit as well as the others do
-    strict = replace(settings.assembly, misfit_factor=settings.assembly.inner_misfit_factor)
-    assembly = Assembly(graph.sides, graph.pivots, firm, replace(settings, assembly=strict), used or None, slipping)
+    assembly = Assembly(graph.sides, graph.pivots, firm, slipping, used or None, INNER_MISFIT_FACTOR)
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):
@@ -316,9 +333,7 @@ def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Comp
     return with_edges_at_poses(found, names)
 
 
-def with_edges_at_poses(
-    registration: Registration, frames: Collection[str], settings: RegistrationSettings = REGISTRATION_DEFAULTS
-) -> Registration:
+def with_edges_at_poses(registration: Registration, frames: Collection[str]) -> Registration:
     """The registration; pairs of `frames`, which stand elsewhere now, are used if they say the same rotation."""
     T = dict(zip(registration.names, registration.T_world_camera, strict=True))
 
@@ -326,7 +341,7 @@ def with_edges_at_poses(
         first, second = (T[name][:3, :3] for name in edge.frames)
         if not np.isfinite([first, second]).all():
             return False
-        limit_deg = settings.pair.same_rotation_deg + settings.pair.kernel_sigmas * edge.rotation_sigma_deg
+        limit_deg = SAME_ROTATION_DEG + KERNEL_SIGMAS * edge.rotation_sigma_deg
         return angle_deg(edge.R_second_first @ first.T @ second) <= limit_deg
 
     edges = (replace(e, used=says_the_same(e)) if set(e.frames) & set(frames) else e for e in registration.edges)
@@ -356,19 +371,18 @@ def choose_projectors(
     clouds: Sequence[FrameCloud],
     sequence: bool = True,
     seed: int = 0,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> ProjectorChoice:
     """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
     open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
     if not open_frames:
         return ProjectorChoice((0,) * len(clouds), ())
-    search = _Choice(clouds, sequence, np.random.default_rng(seed), settings)
+    search = _Choice(clouds, sequence, np.random.default_rng(seed))
     chosen, undecided = [0] * len(clouds), []
     for k in track(open_frames, "comparing poses of projectors"):
         support = search.support(k)
         best = int(np.argmax(support))
         chosen[k] = best
-        rivals = [h for h in range(len(support)) if h != best and support[h] >= settings.choice.rival * support[best]]
+        rivals = [h for h in range(len(support)) if h != best and support[h] >= RIVAL * support[best]]
         if rivals:
             angle = max(_angle_deg(search.choices[k][best], search.choices[k][h]) for h in rivals)
             undecided.append(UndecidedProjector(clouds[k].name, angle))
@@ -378,15 +392,11 @@ def choose_projectors(
 class _Choice:
     """All clouds of all frames, and how well pairs of them agree."""
 
-    def __init__(
-        self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator, settings: RegistrationSettings
-    ) -> None:
+    def __init__(self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator) -> None:
         self.choices = [(c, *c.alternatives) for c in clouds]
-        maps = iter(
-            results([partial(build_surface_map, c, settings.surface_map) for all_ in self.choices for c in all_])
-        )
+        maps = iter(results([partial(build_surface_map, c) for all_ in self.choices for c in all_]))
         self._maps = [[next(maps) for _ in choice] for choice in self.choices]
-        self._sequence, self._rng, self._settings = sequence, rng, settings
+        self._sequence, self._rng = sequence, rng
 
     def support(self, k: int) -> list[float]:
         """For every cloud of a frame the sum of what agrees with its neighbours, less what contradicts."""
@@ -399,26 +409,24 @@ class _Choice:
 
     def _partners(self, k: int) -> list[int]:
         """Frames taken shortly before and after; of an unordered set those that look most alike."""
-        s, n = self._settings.choice, len(self.choices)
+        n = len(self.choices)
         if self._sequence:
-            return [j for j in range(max(0, k - s.reach), min(n, k + s.reach + 1)) if j != k]
-        search = self._settings.pair.anywhere
+            return [j for j in range(max(0, k - REACH), min(n, k + REACH + 1)) if j != k]
         others = [j for j in range(n) if j != k]
         tasks = [
-            partial(search_score, (self._maps[k][0], self._maps[j][0]), search, rng, self._settings.pair)
+            partial(search_score, (self._maps[k][0], self._maps[j][0]), ANYWHERE, rng)
             for j, rng in zip(others, self._rng.spawn(len(others)), strict=True)
         ]
-        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * s.reach]]
+        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * REACH]]
 
     def _agreement(self, own: SurfaceMap, partner: int, rng: np.random.Generator) -> float:
-        pair = self._settings.pair
-        search = pair.neighbours if self._sequence else pair.anywhere
+        search = NEIGHBOURS if self._sequence else ANYWHERE
         best = 0.0
         for other in self._maps[partner]:
-            match = register_pair((own, other), (0, 1), search, rng, None, pair)
-            if match is not None and is_accepted(match, self._settings.edge):
+            match = register_pair((own, other), (0, 1), search, rng)
+            if match is not None and is_accepted(match):
                 contradicting = match.overlap * (1 / match.fitness - 1)
-                best = max(best, match.overlap - pair.agreement.penalty * contradicting)
+                best = max(best, match.overlap - PENALTY * contradicting)
         return best
 
 
@@ -434,7 +442,6 @@ def register(
     seed: int = 0,
     start: Float64[ndarray, "n 4 4"] | None = None,
     progress: Callable[[str], None] | None = None,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
     """Camera poses of all frames in one world; alternatives of the clouds are not considered.
 
@@ -444,30 +451,29 @@ def register(
         seed: of the choice of points.
         start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
         progress: called with a few words at the beginning of each stage.
-        settings: everything else.
     """
     report = progress or (lambda _: None)
-    n, selection = len(clouds), settings.selection
-    maps = tracked([partial(build_surface_map, c, settings.surface_map) for c in clouds], "averaging surfaces")
+    n = len(clouds)
+    maps = tracked([partial(build_surface_map, c) for c in clouds], "averaging surfaces")
     rough: list[Similarity | None] = [None] * n
     if start is not None:
-        rough = starting_similarities(start, maps, settings.start)
+        rough = starting_similarities(start, maps)
     centred = with_common_centre(rough, maps)
-    graph = ViewGraph(maps, centred, np.random.default_rng(seed), settings)
+    graph = ViewGraph(maps, centred, np.random.default_rng(seed))
     report("registering pairs")
     if start is not None:
         graph.try_overlapping(rough)
         graph.try_overlapping(centred)
     ordered = sequence
     if start is None and sequence:
-        for gap in selection.sequence_gaps:
-            graph.try_pairs([(k, k + gap) for k in range(n - gap)], settings.pair.neighbours)
-        ordered = _in_order(graph.assemble(), n, selection.least_joined)
+        for gap in SEQUENCE_GAPS:
+            graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
+        ordered = _in_order(graph.assemble(), n)
     if start is None and not ordered:
         report("comparing all frames")
-        graph = ViewGraph(maps, centred, np.random.default_rng(seed), settings)  # what chance neighbours say is no help
+        graph = ViewGraph(maps, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
         graph.try_all()
-    for _ in range(selection.rounds):
+    for _ in range(ROUNDS):
         report("closing loops")
         components = graph.assemble()
         for component in (c for c in components if len(c) > 1):
@@ -478,30 +484,29 @@ def register(
     found = accept_frames(names, graph, ordered)
     most_are_lost = found.registered.sum() <= n / 2
     if start is None and sequence and (found.turns_deg or most_are_lost):
-        return _by_order(names, graph, settings) or found
+        return _by_order(names, graph) or found
     return found
 
 
-def _by_order(names: tuple[str, ...], graph: ViewGraph, settings: RegistrationSettings) -> Registration | None:
+def _by_order(names: tuple[str, ...], graph: ViewGraph) -> Registration | None:
     """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
 
     `graph` is without it: frames are at other sides than they show, or most could not be placed.
     """
-    step_deg = typical_step_deg(graph.matches, settings)
-    if step_deg is None or not sides_are_open(graph.said, settings):
+    step_deg = typical_step_deg(graph.matches)
+    if step_deg is None or not sides_are_open(graph.said):
         return None
-    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng, settings)
-    near = ViewGraph(graph.maps, [None] * len(names), graph.rng, settings)
-    within = settings.order.different_sides_deg
-    near.try_overlapping(chain, within)
-    for _ in range(settings.selection.rounds):
-        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, within)
+    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng)
+    near = ViewGraph(graph.maps, [None] * len(names), graph.rng)
+    near.try_overlapping(chain, DIFFERENT_SIDES_DEG)
+    for _ in range(ROUNDS):
+        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, DIFFERENT_SIDES_DEG)
     placed = accept_frames(names, near, True, graph.said)
     return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
 
 
-def _in_order(components: Sequence[Component], n: int, least: float) -> bool:
+def _in_order(components: Sequence[Component], n: int) -> bool:
     """Whether successive frames mostly are in the same component."""
     number = {k: c for c, frames in enumerate(components) for k in frames}
     joined = sum(number[k] == number[k + 1] for k in range(n - 1))
-    return joined >= least * (n - 1)
+    return joined >= LEAST_JOINED * (n - 1)

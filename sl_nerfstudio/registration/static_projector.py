@@ -1,7 +1,7 @@
 """All frames under a projector that stands still: cameras, then the projector, then everything together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -30,98 +30,42 @@ from sl_nerfstudio.relative_pose.unknown_projector import (
     values_of,
 )
 
-# Settings of the placement of cameras under a projector that stands still.
+# Squares of the pattern at whose centres all cameras are compared.
+CELL_PIXELS = 20.0  # camera pixels in a square, in the mean
+MOST_ALONG = 300  # squares along the longer side of the pattern
+FEWEST_IN_CELL = 6  # camera pixels from which a square is used
+ROUGHNESS_MEDIANS = 3.0  # distance of its pixels from a linear map, in medians of all, beyond which it lies at an edge
+LARGEST_LEVER = 4.0  # inverse share of pixels that determine the place of the centre: allowed extrapolation
 
+# Cameras one after the other.
+FEWEST_COMMON = 60  # squares that two cameras, or a camera and the known points, must have in common
+MOST_FIRST_PAIRS = 60  # pairs of cameras that are tried as the first
+OUTLIER_PX = 2.0  # distance within which a match is an inlier, camera pixels
+USABLE_ANGLE_DEG = 15.0  # between two cameras' rays, beyond which more is no gain for a first pair
+LEAST_ANGLE_DEG = 1.0  # between rays from which a point counts as known
 
-@dataclass(frozen=True)
-class CellSettings:
-    """Squares of the pattern at whose centres all cameras are compared."""
+# The projector from points and their codes.
+FEWEST_POINTS = 20
+RESECTION_ROUNDS = 8  # of leaving out what does not fit
+OUTLIER_SIGMAS = 4.0  # standard deviations beyond which a point is left out
+LEAST_RELIEF = 1e-3  # extent of the points across their plane, as a share of that along it
 
-    pixels: float = 20.0
-    """camera pixels in a square, in the mean"""
-    most_along: int = 300
-    """squares along the longer side of the pattern, at most"""
-    fewest: int = 6
-    """camera pixels from which a square is used"""
-    roughness_medians: float = 3.0
-    """distance of a square's pixels from a linear map, in medians of all squares, beyond which it lies at an edge"""
-    largest_lever: float = 4.0
-    """inverse share of pixels that determine the place of the centre: how far it may lie beside the pixels"""
-
-
-@dataclass(frozen=True)
-class ChainSettings:
-    """Cameras placed one after the other."""
-
-    fewest: int = 60
-    """squares that two cameras, or a camera and the known points, must have in common"""
-    pairs: int = 60
-    """pairs of cameras that are tried as the first, at most"""
-    outlier_px: float = 2.0
-    """distance within which a match is an inlier, camera pixels"""
-    usable_angle_deg: float = 15.0
-    """angle between two cameras' rays beyond which more is no gain for a first pair"""
-    least_angle_deg: float = 1.0
-    """angle between rays from which a point counts as known"""
-
-
-@dataclass(frozen=True)
-class ResectionSettings:
-    """The projector from points and their codes."""
-
-    fewest: int = 20
-    """points, at least"""
-    rounds: int = 8
-    """of leaving out what does not fit"""
-    outlier_sigmas: float = 4.0
-    """standard deviations beyond which a point is left out"""
-    least_relief: float = 1e-3
-    """extent of the points across their plane, as a share of that along it"""
-
-
-@dataclass(frozen=True)
-class StaticSettings:
-    """All settings."""
-
-    most_points: int = 2500
-    """squares in the bundle adjustment, at most"""
-    iterations: int = 40
-    """Levenberg-Marquardt steps, at most"""
-    kernel_sigmas: float = 3.0
-    """width of the robust kernel, in standard deviations of the residuals"""
-    noise_quantile: float = 0.8
-    """share of the residuals whose size tells the noise: with lenses modelled less than perfectly, half is too few"""
-    parts_along: int = 8
-    """parts along the longer side of the pattern within which errors may depend on each other"""
-    noise_floor_px: float = 1e-4
-    """noise that is assumed at least, pixels"""
-    converged: float = 1e-6
-    """share of the cost that a step must gain for the search to go on"""
-    standard_errors: float = 2.0
-    """standard errors by which left-out squares must agree better for another free parameter"""
-    folds: int = 4
-    """parts that are left out in turn"""
-    dependence: float = 2.0
-    """factor on the stated sigma: neighbouring squares share errors of decoding and of the lens"""
-    largest_sigma: float = 0.08
-    """standard deviation of the focal length, as a share, beyond which there is no result"""
-    largest_noise_share: float = 0.005
-    """noise, as a share of the pattern's width, beyond which no single projector explains what the cameras see"""
-    doubtful_sigma: float = 0.02
-    """the same beyond which the result is doubtful"""
-    prior: IntrinsicsPrior = field(default_factory=IntrinsicsPrior)
-    """what is known of any projector"""
-    cells: CellSettings = field(default_factory=CellSettings)
-    """squares"""
-    chain: ChainSettings = field(default_factory=ChainSettings)
-    """placement of the cameras"""
-    resection: ResectionSettings = field(default_factory=ResectionSettings)
-    """the projector's first place"""
-    difference_step: float = 1e-6
-    """change of the intrinsics for derivatives"""
-
-
-STATIC_DEFAULTS = StaticSettings()
+# Everything together.
+MOST_POINTS = 2500  # squares in the adjustment
+ITERATIONS = 40  # Levenberg-Marquardt steps
+FOLD_ITERATIONS = 5  # of them, with a part of the squares left out
+KERNEL_SIGMAS = 3.0  # width of the robust kernel, in standard deviations of the residuals
+NOISE_QUANTILE = 0.8  # of the residuals whose size tells the noise: imperfect lenses make half too few
+NOISE_FLOOR_PX = 1e-4  # noise that is assumed at least
+PARTS_ALONG = 8  # parts along the longer side of the pattern within which errors may depend on each other
+CONVERGED = 1e-6  # share of the cost that a step must gain for the search to go on
+STANDARD_ERRORS = 2.0  # by which left-out squares must agree better for another free parameter
+FOLDS = 4  # parts that are left out in turn
+DEPENDENCE = 2.0  # factor on the stated sigma: neighbouring squares share errors of decoding and of the lens
+LARGEST_SIGMA = 0.08  # of the focal length, as a share, beyond which there is no result
+DOUBTFUL_SIGMA = 0.02  # the same beyond which the result is doubtful
+LARGEST_NOISE_SHARE = 0.005  # of the pattern's width, beyond which no single projector explains what the cameras see
+DIFFERENCE_STEP = 1e-6  # change of the intrinsics for derivatives
 
 # Where every camera sees the centres of small squares of the pattern: matches between all cameras at once.
 
@@ -143,28 +87,28 @@ class PatternCells:
         return PatternCells(self.uv_projector[index], self.uv_camera[:, index])
 
 
-def find_cells(coords: Sequence[Float32[ndarray, "_ _ 2"]], projector: Device, settings: CellSettings) -> PatternCells:
+def find_cells(coords: Sequence[Float32[ndarray, "_ _ 2"]], projector: Device) -> PatternCells:
     """Squares of equal size; in each, a linear map from coordinates to pixels gives the place of the centre."""
     matches = [correspondences_of(uv) for uv in coords]
-    side = _side(matches, projector, settings)
+    side = _side(matches, projector)
     columns, rows = int(np.ceil(projector.w / side)), int(np.ceil(projector.h / side))
     number = np.arange(columns * rows)
     centres = (np.stack([number % columns, number // columns], -1) + 0.5) * side
-    seen = np.stack([_centres_seen(*match, centres, side, columns, rows, settings) for match in matches])
+    seen = np.stack([_centres_seen(*match, centres, side, columns, rows) for match in matches])
     used = np.isfinite(seen[..., 0]).sum(0) > 1
     return PatternCells(centres[used], seen[:, used])
 
 
-def _side(matches: Sequence[tuple[ndarray, ndarray]], projector: Device, settings: CellSettings) -> float:
+def _side(matches: Sequence[tuple[ndarray, ndarray]], projector: Device) -> float:
     """Side of the squares, so that they hold enough camera pixels in most frames."""
-    least = max(projector.w, projector.h) / settings.most_along
+    least = max(projector.w, projector.h) / MOST_ALONG
     density = []
     for _, uv in matches:
         if len(uv):
-            column, row = np.floor(uv / (4 * least)).astype(np.int64).clip(0, 4 * settings.most_along).T
-            squares = np.count_nonzero(np.bincount(row * (4 * settings.most_along + 1) + column))
+            column, row = np.floor(uv / (4 * least)).astype(np.int64).clip(0, 4 * MOST_ALONG).T
+            squares = np.count_nonzero(np.bincount(row * (4 * MOST_ALONG + 1) + column))
             density.append(len(uv) / (squares * 16 * least**2))
-    return max(least, float(np.sqrt(settings.pixels / np.median(density)))) if density else least
+    return max(least, float(np.sqrt(CELL_PIXELS / np.median(density)))) if density else least
 
 
 def _centres_seen(
@@ -174,7 +118,6 @@ def _centres_seen(
     side: float,
     columns: int,
     rows: int,
-    settings: CellSettings,
 ) -> Float64[ndarray, "cells 2"]:
     """Least squares in every square at once, from sums over its pixels."""
     column, row = np.floor(uv_projector / side).astype(np.int64).T
@@ -190,7 +133,7 @@ def _centres_seen(
     b = _sums(cell, basis[:, :, None] * from_middle[:, None, :], len(centres))
     squares = _sums(cell, from_middle**2, len(centres))
     out = np.full((len(centres), 2), np.nan)
-    good = (count >= settings.fewest) & (np.linalg.det(A) > 1e-6 * count.astype(float) ** 3)
+    good = (count >= FEWEST_IN_CELL) & (np.linalg.det(A) > 1e-6 * count.astype(float) ** 3)
     if not good.any():
         return out
     inverse = np.linalg.inv(A[good])
@@ -198,7 +141,7 @@ def _centres_seen(
     left = (squares[good] - (linear * b[good]).sum(1)).clip(0).sum(1) / (2 * count[good])
     rough = np.sqrt(left)
     lever = inverse[:, 0, 0] * count[good]  # 1 if the pixels lie around the centre, larger if they lie beside it
-    firm = (rough <= settings.roughness_medians * max(float(np.median(rough)), 1e-9)) & (lever < settings.largest_lever)
+    firm = (rough <= ROUGHNESS_MEDIANS * max(float(np.median(rough)), 1e-9)) & (lever < LARGEST_LEVER)
     index = np.flatnonzero(good)[firm]
     out[index] = middle[index] + linear[firm, 0]
     return out
@@ -240,28 +183,25 @@ def _flip() -> Float64[ndarray, "3 3"]:
 
 
 def first_pair(
-    rays: Float64[ndarray, "frames cells 3"], cameras: Sequence[Device], settings: ChainSettings
+    rays: Float64[ndarray, "frames cells 3"], cameras: Sequence[Device]
 ) -> tuple[int, int, Float64[ndarray, "4 4"]] | None:
     """Two cameras with many matches and a large angle between them, and the pose of the second against the first."""
     seen = np.isfinite(rays[..., 0])
     common = seen.astype(np.float64) @ seen.T
-    pairs = [(a, b) for a, b in combinations(range(len(rays)), 2) if common[a, b] >= settings.fewest]
+    pairs = [(a, b) for a, b in combinations(range(len(rays)), 2) if common[a, b] >= FEWEST_COMMON]
     # spread over the whole set, not only neighbours, which share most and turn least
-    pairs = (
-        pairs
-        if len(pairs) <= settings.pairs
-        else [pairs[k] for k in np.linspace(0, len(pairs) - 1, settings.pairs).astype(int)]
-    )
+    if len(pairs) > MOST_FIRST_PAIRS:
+        pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, MOST_FIRST_PAIRS).astype(int)]
     best, best_score = None, 0.0
     for a, b in pairs:
         both = seen[a] & seen[b]
-        found = _two_views(rays[a, both], rays[b, both], settings.outlier_px / cameras[a].fl_x)
+        found = _two_views(rays[a, both], rays[b, both], OUTLIER_PX / cameras[a].fl_x)
         if found is None:
             continue
         T, good = found
         d_b = rays[b, both][good] @ T[:3, :3].T
         angle = np.degrees(np.arccos((rays[a, both][good] * d_b).sum(-1).clip(-1, 1)))
-        score = good.sum() * min(float(np.median(angle)), settings.usable_angle_deg)
+        score = good.sum() * min(float(np.median(angle)), USABLE_ANGLE_DEG)
         if score > best_score:
             best, best_score = (a, b, T), score
     return best
@@ -311,13 +251,12 @@ def place_next(
     rays: Float64[ndarray, "cells 3"],
     points: Float64[ndarray, "cells 3"],
     camera: Device,
-    settings: ChainSettings,
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a camera against known points (PnP with RANSAC); None where it has too few or no pose fits."""
     both = np.isfinite(rays[:, 0]) & np.isfinite(points[:, 0])
-    if both.sum() < settings.fewest:
+    if both.sum() < FEWEST_COMMON:
         return None
-    return posed(points[both], rays[both], 3 * settings.outlier_px / camera.fl_x, 0.5)
+    return posed(points[both], rays[both], 3 * OUTLIER_PX / camera.fl_x, 0.5)
 
 
 def posed(
@@ -343,23 +282,22 @@ def resect(
     points: Float64[ndarray, "n 3"],
     uv: Float64[ndarray, "n 2"],
     projector: Device,
-    settings: ResectionSettings = STATIC_DEFAULTS.resection,
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Focal length, principal point (anywhere) and pose of a pinhole projector; its pixels count as square.
 
     None where the points lie in a plane, or no projector fits.
     """
     extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    if len(points) < settings.fewest or extent[2] < settings.least_relief * extent[1]:
+    if len(points) < FEWEST_POINTS or extent[2] < LEAST_RELIEF * extent[1]:
         return None
     keep = np.ones(len(points), dtype=bool)
     P = None
-    for _ in range(settings.rounds):
-        if keep.sum() < settings.fewest:
+    for _ in range(RESECTION_ROUNDS):
+        if keep.sum() < FEWEST_POINTS:
             return None
         P = _linear(points[keep], uv[keep])
         error = np.linalg.norm(_seen(P, points) - uv, axis=1)
-        limit = settings.outlier_sigmas * MAD_TO_SIGMA * float(np.median(error))
+        limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * float(np.median(error))
         again: Bool[ndarray, n] = error <= max(limit, 1e-9)
         if (again == keep).all():
             break
@@ -418,7 +356,6 @@ def place_known(
     points: Float64[ndarray, "n 3"],
     uv: Float64[ndarray, "n 2"],
     projector: Device,
-    settings: ResectionSettings = STATIC_DEFAULTS.resection,
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a projector with known intrinsics; None where no pose fits most of the points."""
     d = directions(projector, uv)
@@ -464,14 +401,14 @@ class AdjustedScene:
 
 
 def adjust_scene(
-    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], settings: StaticSettings
+    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], iterations: int = ITERATIONS
 ) -> AdjustedScene:
     """Levenberg-Marquardt from a start that is right to within a few pixels."""
     damping, cost, width = 1e-4, np.inf, np.inf
-    prior = _Prior.of(scene.devices[-1], free, settings)
-    for _ in range(settings.iterations):
+    prior = _Prior.of(scene.devices[-1], free)
+    for _ in range(iterations):
         r = residuals(scene, sightings)
-        width = min(width, settings.kernel_sigmas * _noise(r, scene, settings))
+        width = min(width, KERNEL_SIGMAS * _noise(r, scene))
         cost = _cost(r, sightings, width, prior, scene)
         equations = _equations(scene, sightings, r, width, free, prior)
         for _ in range(8):
@@ -484,12 +421,12 @@ def adjust_scene(
         else:
             break
         scene, gain = new, cost - new_cost
-        if gain <= settings.converged * cost:
+        if gain <= CONVERGED * cost:
             break
     r = residuals(scene, sightings)
-    noise = _noise(r, scene, settings)
-    equations = _equations(scene, sightings, r, settings.kernel_sigmas * noise, free, prior)
-    return AdjustedScene(scene, noise, _covariance(equations, sightings, scene, len(free), settings))
+    noise = _noise(r, scene)
+    equations = _equations(scene, sightings, r, KERNEL_SIGMAS * noise, free, prior)
+    return AdjustedScene(scene, noise, _covariance(equations, sightings, scene, len(free)))
 
 
 @dataclass(frozen=True)
@@ -497,11 +434,10 @@ class _Prior:
     mean: Float64[ndarray, "5"]
     sigma: Float64[ndarray, "5"]
     free: tuple[int, ...]
-    difference_step: float
 
     @staticmethod
-    def of(projector: Device, free: tuple[int, ...], settings: StaticSettings) -> "_Prior":
-        return _Prior(values_of(projector), prior_sigma(settings.prior), free, settings.difference_step)
+    def of(projector: Device, free: tuple[int, ...]) -> "_Prior":
+        return _Prior(values_of(projector), prior_sigma(IntrinsicsPrior()), free)
 
     def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
         index = list(self.free)
@@ -545,7 +481,7 @@ def residuals(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 2"]:
     return out
 
 
-def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene, settings: StaticSettings) -> float:
+def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene) -> float:
     """Robust standard deviation of one coordinate, of all devices together.
 
     Apart, that of the cameras or that of the projector could fall to nothing, because three numbers of every point are
@@ -553,8 +489,8 @@ def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene, settings: StaticSetti
     """
     free = 3 * len(scene.points)
     lost = np.sqrt(r.size / max(r.size - free, 1))
-    size = float(np.quantile(np.abs(r), settings.noise_quantile))
-    return max(lost * size / float(norm.ppf((1 + settings.noise_quantile) / 2)), settings.noise_floor_px)
+    size = float(np.quantile(np.abs(r), NOISE_QUANTILE))
+    return max(lost * size / float(norm.ppf((1 + NOISE_QUANTILE) / 2)), NOISE_FLOOR_PX)
 
 
 def _cost(r: Float64[ndarray, "n 2"], s: CellSightings, width: float, prior: _Prior, scene: StaticScene) -> float:
@@ -585,7 +521,7 @@ def _equations(
     if free:
         by_free = np.zeros((n, 2, len(free)))
         rows = np.flatnonzero(s.device == D - 1)
-        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free, prior.difference_step)
+        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free)
         J = np.concatenate([J, by_free], -1)
         columns = np.concatenate([columns, np.broadcast_to(6 * D + np.arange(len(free)), (n, len(free)))], 1)
     H, gradients, coupling = np.zeros((m, m)), np.zeros((m, C)), np.zeros((m, 3 * C))
@@ -606,18 +542,20 @@ def _equations(
 
 
 def _by_intrinsics(
-    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...], step: float
+    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...]
 ) -> Float64[ndarray, "n 2 free"]:
     values, out = values_of(projector), []
     for k in free:
         ahead, behind = (
             project(
-                Intrinsics.of(device_with(projector, values + sign * step * np.eye(len(values))[k]), torch.float64),
+                Intrinsics.of(
+                    device_with(projector, values + sign * DIFFERENCE_STEP * np.eye(len(values))[k]), torch.float64
+                ),
                 torch.from_numpy(p),
             )[0].numpy()
             for sign in (1, -1)
         )
-        out.append((ahead - behind) / (2 * step))
+        out.append((ahead - behind) / (2 * DIFFERENCE_STEP))
     return np.stack(out, -1)
 
 
@@ -636,9 +574,7 @@ def _reduced(e: _Equations, damping: float) -> tuple[ndarray, ndarray, ndarray]:
     return (S + S.T) / 2, e.g - carried @ e.points_g.reshape(-1), inverse
 
 
-def _covariance(
-    e: _Equations, s: CellSightings, scene: StaticScene, free: int, settings: StaticSettings
-) -> Float64[ndarray, "free free"]:
+def _covariance(e: _Equations, s: CellSightings, scene: StaticScene, free: int) -> Float64[ndarray, "free free"]:
     """Of the projector's intrinsics, cluster-robust: errors of points in one part of the pattern may be shared.
 
     Lenses that are modelled slightly wrong, and edges that are decoded wrong, push neighbouring points the same way.
@@ -649,7 +585,7 @@ def _covariance(
     m, C = len(S), len(scene.points)
     H_inverse = np.linalg.pinv(S, rcond=1e-13, hermitian=True)
     pull = np.einsum("mci,cij,cj->mc", e.coupling.reshape(m, C, 3), inverse, e.points_g)
-    part = _parts(s, scene, settings.parts_along)
+    part = _parts(s, scene)
     scores = np.stack([np.bincount(part, row) for row in e.gradients - pull], 1)
     n = len(scores)
     meat = scores.T @ scores * (n / max(n - m, n / 4))
@@ -658,15 +594,15 @@ def _covariance(
     return growth[:, None] * formal * growth
 
 
-def _parts(s: CellSightings, scene: StaticScene, along: int) -> Int64[ndarray, "points"]:
+def _parts(s: CellSightings, scene: StaticScene) -> Int64[ndarray, "points"]:
     """Number of the square part of the projector's image in which each point lies; one part without a projector."""
     part = np.zeros(len(scene.points), dtype=np.int64)
     beam = s.device >= s.cameras
     uv = s.uv[beam]
     if len(uv):
         low, high = uv.min(0), uv.max(0)
-        cell = ((uv - low) / (high - low).max() * along).astype(np.int64).clip(0, along - 1)
-        part[s.point[beam]] = cell[:, 1] * along + cell[:, 0]
+        cell = ((uv - low) / (high - low).max() * PARTS_ALONG).astype(np.int64).clip(0, PARTS_ALONG - 1)
+        part[s.point[beam]] = cell[:, 1] * PARTS_ALONG + cell[:, 0]
     return part
 
 
@@ -725,26 +661,25 @@ def place_under_static_projector(
     projector: Device,
     known: bool,
     stated: bool,
-    settings: StaticSettings = STATIC_DEFAULTS,
 ) -> StaticPlacement | NoPlacement:
     """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
 
     `stated`: the projector is at least a start for them.
     """
-    cells = find_cells(coords, projector, settings.cells)
+    cells = find_cells(coords, projector)
     rays = rays_of(cells, cameras)
     common = np.isfinite(rays[..., 0]).astype(np.float64)
     most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
-    start = first_pair(rays, cameras, settings.chain)
+    start = first_pair(rays, cameras)
     if start is None:
         return NoPlacement("no pair", most)
     a, b, T_a_b = start
     T = np.full((len(cameras), 4, 4), np.nan)
     T[a], T[b] = np.eye(4), T_a_b
-    T = _grown(T, rays, cells, cameras, settings)
-    points = triangulated(rays, T, settings.chain.least_angle_deg)
-    firm = _spread(np.isfinite(points[:, 0]), settings.most_points)
-    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated, settings)
+    T = _grown(T, rays, cells, cameras)
+    points = triangulated(rays, T, LEAST_ANGLE_DEG)
+    firm = _spread(np.isfinite(points[:, 0]), MOST_POINTS)
+    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
     if found is None:
         return NoPlacement("no projector", most)
     device, T_projector = found
@@ -753,14 +688,14 @@ def place_under_static_projector(
         (*(cameras[k] for k in placed), device), np.concatenate([T[placed], T_projector[None]]), points[firm]
     )
     sightings = _sightings(cells.chosen(firm), placed, with_projector=True)
-    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE", settings)
-    if adjusted.noise_px > settings.largest_noise_share * projector.w:
+    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE")
+    if adjusted.noise_px > LARGEST_NOISE_SHARE * projector.w:
         return NoPlacement("no projector", most)
     T[placed] = adjusted.scene.T_world_device[:-1]
     covariance = np.zeros((5, 5))
-    covariance[np.ix_(free, free)] = settings.dependence**2 * adjusted.covariance
+    covariance[np.ix_(free, free)] = DEPENDENCE**2 * adjusted.covariance
     sigma = float(np.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]))
-    if sigma > settings.largest_sigma:
+    if sigma > LARGEST_SIGMA:
         return NoPlacement("uncertain", most, sigma)
     return StaticPlacement(
         T, adjusted.scene.devices[-1], adjusted.scene.T_world_device[-1], covariance, adjusted.noise_px
@@ -772,21 +707,20 @@ def _grown(
     rays: Float64[ndarray, "frames cells 3"],
     cells: PatternCells,
     cameras: Sequence[Device],
-    settings: StaticSettings,
 ) -> Float64[ndarray, "frames 4 4"]:
     """Cameras added one by one, those that see most known points first; everything is adjusted as the set doubles."""
     T, failed, adjusted_with = T.copy(), set(), 0
     while True:
         placed = np.isfinite(T[:, 0, 0])
         if placed.sum() >= 2 * adjusted_with or placed.all():
-            T = _adjusted_cameras(T, rays, cells, cameras, settings)
+            T = _adjusted_cameras(T, rays, cells, cameras)
             adjusted_with = int(placed.sum())
-        points = triangulated(rays, T, settings.chain.least_angle_deg)
+        points = triangulated(rays, T, LEAST_ANGLE_DEG)
         seen = (np.isfinite(rays[..., 0]) & np.isfinite(points[:, 0])).sum(1)
         left = sorted((int(k) for k in np.flatnonzero(~placed) if k not in failed), key=lambda k: -seen[k])
         if not left:
-            return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras, settings)
-        pose = place_next(left[0], rays[left[0]], points, cameras[left[0]], settings.chain)
+            return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras)
+        pose = place_next(left[0], rays[left[0]], points, cameras[left[0]])
         if pose is None:
             failed.add(left[0])
         else:
@@ -799,14 +733,13 @@ def _adjusted_cameras(
     rays: Float64[ndarray, "frames cells 3"],
     cells: PatternCells,
     cameras: Sequence[Device],
-    settings: StaticSettings,
 ) -> Float64[ndarray, "frames 4 4"]:
     """The placed cameras adjusted with the points that they see, without a projector."""
     placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    points = triangulated(rays, T, settings.chain.least_angle_deg)
-    firm = _spread(np.isfinite(points[:, 0]), settings.most_points)
+    points = triangulated(rays, T, LEAST_ANGLE_DEG)
+    firm = _spread(np.isfinite(points[:, 0]), MOST_POINTS)
     scene = StaticScene(tuple(cameras[k] for k in placed), T[placed], points[firm])
-    found = adjust_scene(scene, _sightings(cells.chosen(firm), placed, with_projector=False), (), settings).scene
+    found = adjust_scene(scene, _sightings(cells.chosen(firm), placed, with_projector=False), ()).scene
     T = T.copy()
     T[placed] = found.T_world_device
     return T
@@ -834,13 +767,12 @@ def _projector(
     projector: Device,
     known: bool,
     stated: bool,
-    settings: StaticSettings,
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Intrinsics and pose to start from."""
     if known or projector.model == "DOE":
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
-    found = resect(points, uv, projector, settings.resection)
+    found = resect(points, uv, projector)
     if found is None and stated:
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
@@ -848,25 +780,25 @@ def _projector(
 
 
 def _best_model(
-    scene: StaticScene, sightings: CellSightings, known: bool, doe: bool, settings: StaticSettings
+    scene: StaticScene, sightings: CellSightings, known: bool, doe: bool
 ) -> tuple[AdjustedScene, tuple[int, ...]]:
     """The smallest model that no larger one beats on left-out points by more than chance."""
     if known:
-        return adjust_scene(scene, sightings, (), settings), ()
+        return adjust_scene(scene, sightings, ()), ()
     models = _MODELS[:1] if doe else _MODELS
-    best = adjust_scene(scene, sightings, models[0], settings)
+    best = adjust_scene(scene, sightings, models[0])
     chosen, best_loss = models[0], None
     for model in models[1:]:
-        larger = adjust_scene(_restarted(best.scene, scene, model), sightings, model, settings)
+        larger = adjust_scene(_restarted(best.scene, scene, model), sightings, model)
         extra = [k for k in model if k not in models[0]]
         away = np.abs(_further(larger.scene.devices[-1], extra) - _further(scene.devices[-1], extra))
         sigma = np.sqrt(np.diag(larger.covariance))[[model.index(k) for k in extra]]
-        if (away < settings.standard_errors * settings.dependence * sigma).any():
+        if (away < STANDARD_ERRORS * DEPENDENCE * sigma).any():
             continue  # what does not differ from its usual value by more than chance cannot help
-        base = _left_out(best.scene, sightings, chosen, settings) if best_loss is None else best_loss
-        loss = _left_out(larger.scene, sightings, model, settings)
+        base = _left_out(best.scene, sightings, chosen) if best_loss is None else best_loss
+        loss = _left_out(larger.scene, sightings, model)
         gain = base - loss
-        if gain.sum() > settings.standard_errors * np.sqrt((gain**2).sum()):
+        if gain.sum() > STANDARD_ERRORS * np.sqrt((gain**2).sum()):
             best, chosen, best_loss = larger, model, loss
     return best, chosen
 
@@ -883,18 +815,15 @@ def _further(device: Device, names: Sequence[int]) -> Float64[ndarray, "m"]:
     return np.array([values[k] for k in names])
 
 
-def _left_out(
-    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], settings: StaticSettings
-) -> Float64[ndarray, "points"]:
+def _left_out(scene: StaticScene, sightings: CellSightings, free: tuple[int, ...]) -> Float64[ndarray, "points"]:
     """Error of the projector's view of every point (capped), when its coordinate takes no part in the fit."""
     out = np.zeros(len(scene.points))
     projector = sightings.device == sightings.cameras
-    short = replace(settings, iterations=5)
-    for fold in range(settings.folds):
-        left = projector & (sightings.point % settings.folds == fold)
+    for fold in range(FOLDS):
+        left = projector & (sightings.point % FOLDS == fold)
         kept = CellSightings(sightings.device[~left], sightings.point[~left], sightings.uv[~left], sightings.cameras)
-        found = adjust_scene(scene, kept, free, short)
-        loss = view_error(found.scene, sightings, left, settings.kernel_sigmas * found.noise_px)
+        found = adjust_scene(scene, kept, free, FOLD_ITERATIONS)
+        loss = view_error(found.scene, sightings, left, KERNEL_SIGMAS * found.noise_px)
         out[sightings.point[left]] = loss
     return out
 

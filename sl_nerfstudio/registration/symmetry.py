@@ -12,11 +12,65 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
 from sl_nerfstudio.registration.agreement import Hypotheses, Side, Tolerance, agreement
-from sl_nerfstudio.registration.assembly import Component, Nodes, PoseGraphSolution, node_at
-from sl_nerfstudio.registration.pairs import PairMatch, is_accepted, quality, register_pair
-from sl_nerfstudio.registration.settings import EdgeSettings, RegistrationSettings, Search
+from sl_nerfstudio.registration.assembly import (
+    CROSS_SIGMAS,
+    LEAST_MISFIT,
+    LEAST_SIGHT_COSINE,
+    MISFIT_FACTOR,
+    SAME_SIDE_DEG,
+    Component,
+    Nodes,
+    PoseGraphSolution,
+    node_at,
+)
+from sl_nerfstudio.registration.pairs import (
+    AMBIGUOUS_RATIO,
+    BOUNDED_SLIP_DEG,
+    GOOD_QUANTILE,
+    KERNEL_SIGMAS,
+    PairMatch,
+    Search,
+    is_accepted,
+    quality,
+    register_pair,
+)
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 from sl_nerfstudio.registration.view_graph import ViewGraph
+
+# By the order of capture.
+SEQUENCE_GAPS = (1, 2)  # differences between the numbers of frames that are paired in a sequence
+LEAST_STEPS = 0.5  # share of the successive frames that must agree for their usual step to be known
+DIFFERENT_SIDES_DEG = 20.0  # rotation between two results of a pair beyond which they show different sides
+LARGEST_STEP = 2.0  # rotation between successive frames, in usual steps
+SPACING = 0.5  # of the rotations from which a step is searched for, in usual steps
+LEAST_RATIO = 0.5  # score of a small step, relative to the best result of its pair, from which it may be right
+
+# Symmetric turns.
+LARGEST_LOG_SCALE_OF_TURN = 0.05  # which is 0 but for the errors of the pairs
+LEAST_COVERED = 0.25  # points that must agree after a turn, relative to before it: one side covers little upside down
+TURN_NEIGHBOURS = 6  # frames with which each one is compared after a turn
+MOST_TURNS = 12  # that are tried
+EXACT_WIDTHS = (0.06, 0.04, 0.03, 0.02, 0.01, 0.0, 0.0)  # of the kernel in each step that makes a turn exact, radii
+EXACT_RCOND = 1e-6  # singular values, relative to the largest, along which a turn stays: what is round slips
+LEAST_EXCESS = (
+    8.0  # times as much must contradict after a part of a turn as after all of it; less: it is round, or long
+)
+
+# Turned blocks. Points are counted in frames: 1 is all points of one.
+FEWEST_FRAMES = 3  # of a component in which blocks are looked for
+BLOCK_NEIGHBOURS = 16  # frames with which each one is compared
+LEAST_JUDGED = 0.1  # minimum overlap for a pair to enter the usual share of contradictions
+BETTER_QUANTILE = 0.25  # of those shares: pairs inside a block, even if blocks contradict each other
+BLOCK_MISFIT = 0.003  # share that may contradict in such pairs: points at edges do in every pair
+USUAL_FACTOR = 1.5  # on that share: what counts against nobody
+LEAST_CONTRADICTING = 0.5  # points that must contradict beyond the usual for a block to be looked for
+STARTS = 24  # frames from which a block is grown
+BLOCK_AGREEING = 1.0  # points of a block that must agree with the other frames after the turn
+BLOCK_OVERLAP = 0.1  # the same, relative to those that agreed before it
+LARGEST_REMAINDER = 0.5  # share that contradicts across a block after the turn, relative to before it
+LEAST_IMPROVEMENT = 0.8  # share that contradicts among all frames after the turn, relative to before it
+MOST_TRIED = 2  # turned blocks of a component, those that contradict most
+MOST_TURNED = 4  # blocks one after the other
 
 # Objects that look the same after a turn, placed by the order of capture: surfaces do not tell their sides apart.
 #
@@ -26,40 +80,38 @@ from sl_nerfstudio.registration.view_graph import ViewGraph
 # there.
 
 
-def typical_step_deg(matches: Sequence[PairMatch], settings: RegistrationSettings) -> float | None:
+def typical_step_deg(matches: Sequence[PairMatch]) -> float | None:
     """By how much successive frames are turned, in degrees (median); None if few of them hold each other in place."""
     steps = [m for m in matches if m.target - m.source == 1]
-    said = [angle_deg(m.S_target_source.R) for m in steps if _holds(m, settings)]
-    return float(np.median(said)) if len(said) > settings.order.least_steps * len(steps) else None
+    said = [angle_deg(m.S_target_source.R) for m in steps if _holds(m)]
+    return float(np.median(said)) if len(said) > LEAST_STEPS * len(steps) else None
 
 
-def sides_are_open(matches: Sequence[PairMatch], settings: RegistrationSettings) -> bool:
+def sides_are_open(matches: Sequence[PairMatch]) -> bool:
     """Whether a pair of frames of a sequence fits nearly as well after a clearly different rotation."""
     return any(
-        rival.ratio > settings.edge.ambiguous_ratio
-        and angle_deg(rival.S_target_source.R @ m.S_target_source.R.T) > settings.order.different_sides_deg
+        rival.ratio > AMBIGUOUS_RATIO
+        and angle_deg(rival.S_target_source.R @ m.S_target_source.R.T) > DIFFERENT_SIDES_DEG
         for m in matches
-        if m.target - m.source <= max(settings.selection.sequence_gaps) and _holds(m, settings)
+        if m.target - m.source <= max(SEQUENCE_GAPS) and _holds(m)
         for rival in m.rivals
     )
 
 
-def _holds(match: PairMatch, settings: RegistrationSettings) -> bool:
+def _holds(match: PairMatch) -> bool:
     """Whether two surfaces agree, and hold each other in place."""
-    return is_accepted(match, settings.edge) and match.shape_slip_deg <= settings.pair.bounded_slip_deg
+    return is_accepted(match) and match.shape_slip_deg <= BOUNDED_SLIP_DEG
 
 
-def chain_of_small_steps(
-    maps: Sequence[SurfaceMap], step_deg: float, rng: np.random.Generator, settings: RegistrationSettings
-) -> Nodes:
+def chain_of_small_steps(maps: Sequence[SurfaceMap], step_deg: float, rng: np.random.Generator) -> Nodes:
     """`S_world_camera` of the longest run of successive frames that small steps connect; None for all others."""
-    largest = settings.order.largest_step * step_deg
-    search = Search(largest, settings.order.spacing * step_deg)
+    largest = LARGEST_STEP * step_deg
+    search = Search(largest, SPACING * step_deg)
     tasks = [
-        partial(register_pair, (maps[k], maps[k + 1]), (k, k + 1), search, own, None, settings.pair)
+        partial(register_pair, (maps[k], maps[k + 1]), (k, k + 1), search, own, None)
         for k, own in enumerate(rng.spawn(len(maps) - 1))
     ]
-    steps = [_small(match, largest, settings) for match in tracked(tasks, "following the order of capture")]
+    steps = [_small(match, largest) for match in tracked(tasks, "following the order of capture")]
     return _longest_run(steps)
 
 
@@ -76,14 +128,14 @@ def _longest_run(steps: Sequence[Similarity | None]) -> Nodes:
     return [S if k in longest and len(longest) > 1 else None for k, S in enumerate(nodes)]
 
 
-def _small(match: PairMatch | None, largest_deg: float, settings: RegistrationSettings) -> Similarity | None:
+def _small(match: PairMatch | None, largest_deg: float) -> Similarity | None:
     """The best of a pair's results, or one that clearly turns less; None if it is larger than a step can be."""
-    if match is None or not is_accepted(match, settings.edge):
+    if match is None or not is_accepted(match):
         return None
     S = match.S_target_source
     for rival in match.rivals:
         less = angle_deg(S.R) - angle_deg(rival.S_target_source.R)
-        if rival.ratio >= settings.order.least_ratio and less > settings.order.different_sides_deg:
+        if rival.ratio >= LEAST_RATIO and less > DIFFERENT_SIDES_DEG:
             S = rival.S_target_source
     return S if angle_deg(S.R) <= largest_deg else None
 
@@ -122,25 +174,19 @@ def share(agreeing: float, contradicting: float) -> float:
     return contradicting / (agreeing + contradicting) if agreeing + contradicting else 1.0
 
 
-def judged(
-    sides: Sequence[Side], nodes: Nodes, turn: Similarity, neighbours: int, settings: RegistrationSettings
-) -> Judged:
+def judged(sides: Sequence[Side], nodes: Nodes, turn: Similarity, neighbours: int) -> Judged:
     """Every frame that has a pose, moved, against `neighbours` others that then look most nearly its way."""
     row = {k: n for n, k in enumerate(k for k, S in enumerate(nodes) if S is not None)}
     agreeing, contradicting = np.zeros((2, len(row), len(row)))
-    width, agrees = Tolerance(0.0, settings.assembly.tolerance_sigmas), settings.pair.agreement
-    for i, j, S in facing(nodes, turn, neighbours, settings):
-        found = agreement(sides[i], sides[j], Hypotheses.of(S), width, width, agrees)
+    for i, j, S in facing(nodes, turn, neighbours):
+        found = agreement(sides[i], sides[j], Hypotheses.of(S), Tolerance(0.0, CROSS_SIGMAS))
         agreeing[row[i], row[j]] = found.agreeing[0]
-        contradicting[row[i], row[j]] = found.contradicting(agrees.behind)[0]
+        contradicting[row[i], row[j]] = found.contradicting[0]
     return Judged(agreeing, contradicting)
 
 
-def facing(
-    nodes: Nodes, turn: Similarity, neighbours: int, settings: RegistrationSettings
-) -> Iterator[tuple[int, int, Similarity]]:
+def facing(nodes: Nodes, turn: Similarity, neighbours: int) -> Iterator[tuple[int, int, Similarity]]:
     """A moved frame, another that looks nearly its way, and the first in the second's axes."""
-    least_cosine = np.cos(np.radians(settings.selection.largest_view_angle_deg))
     frames = [k for k, S in enumerate(nodes) if S is not None]
     sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
     for n, i in enumerate(frames):
@@ -148,7 +194,7 @@ def facing(
         cosine = np.asarray(sight @ moved.R[:, 2], dtype=np.float64)
         cosine[n] = -np.inf
         for k in np.argsort(-cosine, kind="stable")[:neighbours].tolist():
-            if cosine[k] > least_cosine:
+            if cosine[k] > LEAST_SIGHT_COSINE:
                 yield i, frames[k], node_at(nodes, frames[k]).inverse() @ moved
 
 
@@ -159,20 +205,19 @@ def facing(
 # an object as it is has no scale, and every frame says something of it.
 
 
-def exact_turn(sides: Sequence[Side], nodes: Nodes, turn: Similarity, settings: RegistrationSettings) -> Similarity:
+def exact_turn(sides: Sequence[Side], nodes: Nodes, turn: Similarity) -> Similarity:
     """Gauss-Newton from `turn`: rigid, by the point-to-plane distances of every frame, moved, from those it faces."""
-    s = settings.symmetry
     centre = _centre(sides, nodes)
     turn = Similarity(1.0, turn.R, turn.points(centre[None])[0] - turn.R @ centre)
-    for radii in s.exact_widths:
-        width = Tolerance(radii, settings.pair.kernel_sigmas)
+    for radii in EXACT_WIDTHS:
+        width = Tolerance(radii, KERNEL_SIGMAS)
         H, g = np.zeros((6, 6)), np.zeros(6)
-        for i, j, S in facing(nodes, turn, s.neighbours, settings):
-            sums = agreement(sides[i], sides[j], Hypotheses.of(S), width, width, settings.pair.agreement)
+        for i, j, S in facing(nodes, turn, TURN_NEIGHBOURS):
+            sums = agreement(sides[i], sides[j], Hypotheses.of(S), width)
             M = _motion_in_camera(node_at(nodes, j), sides[j].map.centroid, centre)
             H += M.T @ sums.H[0] @ M
             g += M.T @ sums.g[0] * node_at(nodes, j).scale
-        step = -np.linalg.lstsq(H, g, rcond=s.exact_rcond)[0]
+        step = -np.linalg.lstsq(H, g, rcond=EXACT_RCOND)[0]
         R = Rotation.from_rotvec(step[3:]).as_matrix()
         turn = Similarity(1.0, R, centre - R @ centre + step[:3]) @ turn
     return turn
@@ -203,24 +248,22 @@ def _motion_in_camera(
 # By which motions of the world pairs of frames differ from the poses that were found.
 
 
-def distinct_turns(
-    edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: RegistrationSettings
-) -> list[Similarity]:
+def distinct_turns(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> list[Similarity]:
     """Clearly different turns of the world; those that the best pairs say come first."""
-    s, found = settings.symmetry, list[Similarity]()
-    for turn in _said(edges, solution, settings.edge):
-        if abs(np.log(turn.scale)) < s.largest_log_scale and not is_known(turn, found, settings):
+    found: list[Similarity] = []
+    for turn in _said(edges, solution):
+        if abs(np.log(turn.scale)) < LARGEST_LOG_SCALE_OF_TURN and not is_known(turn, found):
             found.append(turn)
     return found
 
 
-def is_known(turn: Similarity, found: Sequence[Similarity], settings: RegistrationSettings) -> bool:
+def is_known(turn: Similarity, found: Sequence[Similarity]) -> bool:
     """Whether a turn is none, or about one of those found, forwards or backwards."""
     known = (Similarity.identity(), *found, *(T.inverse() for T in found))
-    return any(angle_deg((turn @ T.inverse()).R) <= settings.symmetry.same_rotation_deg for T in known)
+    return any(angle_deg((turn @ T.inverse()).R) <= SAME_SIDE_DEG for T in known)
 
 
-def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: EdgeSettings) -> Iterator[Similarity]:
+def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> Iterator[Similarity]:
     """By which motions of the world pairs, or their rivals, differ from the solution."""
     nodes = solution.S_world_camera
     placed = [
@@ -228,7 +271,7 @@ def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution, settings: Edg
         for e, used in zip(edges, solution.consistent, strict=True)
         if nodes[e.source] is not None and nodes[e.target] is not None
     ]
-    for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0], settings))):
+    for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0]))):
         target, source = node_at(nodes, e.target), node_at(nodes, e.source).inverse()
         results = [*([] if used else [e.S_target_source]), *(rival.S_target_source for rival in e.rivals)]
         yield from (target @ S @ source for S in results)
@@ -253,35 +296,34 @@ def symmetric_turns_deg(
     sides: Sequence[Side],
     edges: Sequence[PairMatch],
     solution: PoseGraphSolution,
-    settings: RegistrationSettings,
     others: Sequence[PairMatch] = (),
 ) -> tuple[float, ...]:
     """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is.
 
     `others`: pairs that are not edges of the solution, which may say turns as well.
     """
-    s, nodes = settings.symmetry, solution.S_world_camera
+    nodes = solution.S_world_camera
     fitness = [e.fitness for e, used in zip(edges, solution.consistent, strict=True) if used]
     unused = np.zeros(len(others), dtype=bool)
     with_others = replace(solution, consistent=np.append(solution.consistent, unused))
-    said = distinct_turns([*edges, *others], with_others, settings)[: s.most_compared]
+    said = distinct_turns([*edges, *others], with_others)[:MOST_TURNS]
     if not fitness or not said:
         return ()
-    usual = float(np.quantile(fitness, settings.edge.good_quantile))
-    as_it_is = judged(sides, nodes, Similarity.identity(), s.neighbours, settings)
+    usual = float(np.quantile(fitness, GOOD_QUANTILE))
+    as_it_is = judged(sides, nodes, Similarity.identity(), TURN_NEIGHBOURS)
     by_errors = as_it_is.share if as_it_is.total else 0.0
     # as much as a good connection may have: what assembly would take for right is not told from what is
-    misfit = by_errors + settings.assembly.misfit_factor * max(settings.assembly.least_misfit, 1 - usual)
+    misfit = by_errors + MISFIT_FACTOR * max(LEAST_MISFIT, 1 - usual)
     turns: list[Similarity] = []
     for one in said:
-        turn = exact_turn(sides, nodes, one, settings)
-        if angle_deg(turn.R @ one.R.T) > s.same_rotation_deg or is_known(turn, turns, settings):
+        turn = exact_turn(sides, nodes, one)
+        if angle_deg(turn.R @ one.R.T) > SAME_SIDE_DEG or is_known(turn, turns):
             continue
-        turned = judged(sides, nodes, turn, s.neighbours, settings)
-        if turned.total < s.least_agreeing * as_it_is.total or turned.share > misfit:
+        turned = judged(sides, nodes, turn, TURN_NEIGHBOURS)
+        if turned.total < LEAST_COVERED * as_it_is.total or turned.share > misfit:
             continue
-        within = max(judged(sides, nodes, part, s.neighbours, settings).share for part in _parts(turn))
-        if within - by_errors > s.least_excess * max(turned.share - by_errors, 0.0):
+        within = max(judged(sides, nodes, part, TURN_NEIGHBOURS).share for part in _parts(turn))
+        if within - by_errors > LEAST_EXCESS * max(turned.share - by_errors, 0.0):
             turns.append(turn)
     return tuple(sorted(angle_deg(turn.R) for turn in turns))
 
@@ -326,41 +368,40 @@ def turned_blocks(
     edges: Sequence[PairMatch],
     solution: PoseGraphSolution,
     before: Judged,
-    settings: RegistrationSettings,
 ) -> list[TurnedBlock]:
     """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first.
 
     `before`: the frames of the solution as they are.
     """
-    s, nodes = settings.blocks, solution.S_world_camera
+    nodes = solution.S_world_camera
     frames = [k for k, S in enumerate(nodes) if S is not None]
-    if len(frames) < s.fewest_frames:
+    if len(frames) < FEWEST_FRAMES:
         return []
-    usual = _usual(before, settings)
+    usual = _usual(before)
     contradicting, found = _excess(before, usual), list[TurnedBlock]()
-    if contradicting.sum() < s.least_contradicting:
+    if contradicting.sum() < LEAST_CONTRADICTING:
         return []
-    for turn in distinct_turns(edges, solution, settings)[: s.most_compared]:
-        after = judged(sides, nodes, turn, s.neighbours, settings)
-        block = _best_cut(contradicting - _excess(after, usual), s.starts)
+    for turn in distinct_turns(edges, solution)[:MOST_TURNS]:
+        after = judged(sides, nodes, turn, BLOCK_NEIGHBOURS)
+        block = _best_cut(contradicting - _excess(after, usual))
         if block is None:
             continue
         agreed, contradicted = before.across(block)
         agrees, contradicts = after.across(block)
-        if agrees < max(s.least_agreeing, s.least_overlap * agreed):
+        if agrees < max(BLOCK_AGREEING, BLOCK_OVERLAP * agreed):
             continue
-        if share(agrees, contradicts) < s.largest_remainder * share(agreed, contradicted):
+        if share(agrees, contradicts) < LARGEST_REMAINDER * share(agreed, contradicted):
             inside = tuple(np.array(frames)[block].tolist())
             found.append(TurnedBlock(inside, turn, contradicted - contradicts))
     return sorted(found, key=lambda one: -one.relief)
 
 
-def _usual(found: Judged, settings: RegistrationSettings) -> float:
+def _usual(found: Judged) -> float:
     """Share of the points that may contradict: a little more than in the better part of the pairs."""
-    s, total = settings.blocks, found.agreeing + found.contradicting
-    shares = found.contradicting[total > s.least_judged] / total[total > s.least_judged]
-    better = float(np.quantile(shares, s.better_quantile)) if len(shares) else 0.0
-    return s.usual_factor * max(better, s.least_misfit)
+    total = found.agreeing + found.contradicting
+    shares = found.contradicting[total > LEAST_JUDGED] / total[total > LEAST_JUDGED]
+    better = float(np.quantile(shares, BETTER_QUANTILE)) if len(shares) else 0.0
+    return USUAL_FACTOR * max(better, BLOCK_MISFIT)
 
 
 def _excess(found: Judged, usual: float) -> Float64[ndarray, "n n"]:
@@ -368,14 +409,14 @@ def _excess(found: Judged, usual: float) -> Float64[ndarray, "n n"]:
     return np.maximum(found.contradicting - usual * (found.agreeing + found.contradicting), 0.0)
 
 
-def _best_cut(relief: Float64[ndarray, "n n"], starts: int) -> Bool[ndarray, "n"] | None:
+def _best_cut(relief: Float64[ndarray, "n n"]) -> Bool[ndarray, "n"] | None:
     """The frames whose turn relieves the pairs across most; None if none does.
 
     Blocks grow from each of the frames that would be relieved most alone, by the frame that is best then, until all but
     one are in it (as in Kernighan and Lin, 1970).
     """
     n, most, best = len(relief), 0.0, None
-    for first in np.argsort(-relief.sum(1), kind="stable")[:starts].tolist():
+    for first in np.argsort(-relief.sum(1), kind="stable")[:STARTS].tolist():
         block = np.zeros(n, dtype=bool)
         gain, sum_, nearest = relief.sum(1), 0.0, first  # gain: of each frame outside, if it came in
         for _ in range(n - 1):
@@ -390,17 +431,17 @@ def _best_cut(relief: Float64[ndarray, "n n"], starts: int) -> Bool[ndarray, "n"
 
 def turn_blocks_back(graph: ViewGraph) -> None:
     """Register pairs across turned blocks anew, in all components, until no block contradicts the rest of its own."""
-    for _ in range(graph.settings.blocks.most_turned):
+    for _ in range(MOST_TURNED):
         if not any(turned_back(graph, component) for component in graph.assemble()):
             return
 
 
 def turned_back(graph: ViewGraph, component: Component) -> bool:
     """Turn the block of a component back that contradicts most; whether there was one."""
-    solution, settings = graph.solve(component), graph.settings
+    solution = graph.solve(component)
     before = _as_they_are(graph, solution)
-    blocks = turned_blocks(graph.sides, graph.holding(component), solution, before, settings)
-    for block in blocks[: settings.blocks.most_tried]:
+    blocks = turned_blocks(graph.sides, graph.holding(component), solution, before)
+    for block in blocks[:MOST_TRIED]:
         moved = {k: node_at(solution.S_world_camera, k) for k in component}
         moved |= {k: block.turn @ moved[k] for k in block.frames}
         known = graph.snapshot()
@@ -422,10 +463,9 @@ def _confirmed(graph: ViewGraph, moved: Component, before: float) -> bool:
     solution = graph.solve(moved)
     if not graph.connected(moved, solution.consistent):
         return False
-    return _as_they_are(graph, solution).share < graph.settings.blocks.least_improvement * before
+    return _as_they_are(graph, solution).share < LEAST_IMPROVEMENT * before
 
 
 def _as_they_are(graph: ViewGraph, solution: PoseGraphSolution) -> Judged:
     """How the frames of a solution agree and contradict each other."""
-    neighbours = graph.settings.blocks.neighbours
-    return judged(graph.sides, solution.S_world_camera, Similarity.identity(), neighbours, graph.settings)
+    return judged(graph.sides, solution.S_world_camera, Similarity.identity(), BLOCK_NEIGHBOURS)
