@@ -258,7 +258,7 @@ def test_a_screw_motion_is_the_integral_of_its_velocity(x):
     turned = np.exp(growth) * (p - SURFACE.centroid) @ Rotation.from_rotvec(w).as_matrix().T
     np.testing.assert_allclose(found.points(p), SURFACE.centroid + turned + shift, atol=1e-9)
     errors = [
-        np.abs((screw_motion(h * x, SURFACE).matrix() - exp_at(h * x, SURFACE.centroid, SURFACE.radius, 1.0).matrix()))
+        np.abs(screw_motion(h * x, SURFACE).matrix() - exp_at(h * x, SURFACE.centroid, SURFACE.radius, 1.0).matrix())
         for h in (1e-2, 1e-3)
     ]
     assert errors[1].max() <= errors[0].max() / 80 + 1e-12  # of second order: a hundredth
