@@ -1,7 +1,8 @@
 """All frames under a projector that stands still: cameras, then the projector, then everything together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Literal
 
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
@@ -53,6 +55,7 @@ LEAST_RELIEF = 1e-3  # extent of the points across their plane, as a share of th
 # Everything together.
 MOST_POINTS = 2500  # squares in the adjustment
 ITERATIONS = 40  # Levenberg-Marquardt steps
+STEPS_PER_WIDTH = 4  # of them with one width of the kernel
 FOLD_ITERATIONS = 5  # of them, with a part of the squares left out
 KERNEL_SIGMAS = 3.0  # width of the robust kernel, in standard deviations of the residuals
 NOISE_QUANTILE = 0.8  # of the residuals whose size tells the noise: imperfect lenses make half too few
@@ -247,7 +250,6 @@ def triangulated(
 
 
 def place_next(
-    k: int,
     rays: Float64[ndarray, "cells 3"],
     points: Float64[ndarray, "cells 3"],
     camera: Device,
@@ -367,9 +369,8 @@ def place_known(
 
 # Bundle adjustment of cameras, one projector and points; points are eliminated (Schur complement).
 #
-# The projector is one more device, whose intrinsics may be free. Residuals are pixels of each device, divided by
-# the
-# noise of its kind. Increments: `T_world_device <- T_world_device exp(v, w)`.
+# The projector is one more device, whose intrinsics may be free. Residuals are pixels of each device, divided by the
+# noise of all. Increments: `T_world_device <- T_world_device exp(v, w)`, then the free intrinsics.
 
 
 @dataclass(frozen=True)
@@ -390,6 +391,10 @@ class CellSightings:
     uv: Float64[ndarray, "n 2"]
     cameras: int  # devices from this number on are projectors
 
+    def chosen(self, rows: Bool[ndarray, "n"]) -> "CellSightings":
+        """Some of the sightings."""
+        return CellSightings(self.device[rows], self.point[rows], self.uv[rows], self.cameras)
+
 
 @dataclass(frozen=True)
 class AdjustedScene:
@@ -403,57 +408,32 @@ class AdjustedScene:
 def adjust_scene(
     scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], iterations: int = ITERATIONS
 ) -> AdjustedScene:
-    """Levenberg-Marquardt from a start that is right to within a few pixels."""
-    damping, cost, width = 1e-4, np.inf, np.inf
-    prior = _Prior.of(scene.devices[-1], free)
-    for _ in range(iterations):
-        r = residuals(scene, sightings)
-        width = min(width, KERNEL_SIGMAS * _noise(r, scene))
-        cost = _cost(r, sightings, width, prior, scene)
-        equations = _equations(scene, sightings, r, width, free, prior)
-        for _ in range(8):
-            new = _stepped(scene, equations, damping, free)
-            new_cost = _cost(residuals(new, sightings), sightings, width, prior, new)
-            if new_cost <= cost:
-                damping = max(damping / 10, 1e-10)
-                break
-            damping *= 10
-        else:
+    """Levenberg-Marquardt from a start that is right to within a few pixels; the kernel narrows with the residuals."""
+    problem, width = _Adjustment(sightings, free, values_of(scene.devices[-1])), np.inf
+    while iterations > 0:
+        width = min(width, KERNEL_SIGMAS * _noise(residuals(scene, sightings), scene))
+        found = minimise(
+            scene,
+            partial(problem.equations, width=width),
+            problem.moved,
+            partial(problem.cost, width=width),
+            iterations=min(iterations, STEPS_PER_WIDTH),
+            tolerance=CONVERGED,
+        )
+        if not found.iterations:
             break
-        scene, gain = new, cost - new_cost
-        if gain <= CONVERGED * cost:
-            break
-    r = residuals(scene, sightings)
-    noise = _noise(r, scene)
-    equations = _equations(scene, sightings, r, KERNEL_SIGMAS * noise, free, prior)
-    return AdjustedScene(scene, noise, _covariance(equations, sightings, scene, len(free)))
+        scene, iterations = found.state, iterations - found.iterations
+    noise = _noise(residuals(scene, sightings), scene)
+    return AdjustedScene(scene, noise, problem.covariance(scene, KERNEL_SIGMAS * noise))
 
 
-@dataclass(frozen=True)
-class _Prior:
-    mean: Float64[ndarray, "5"]
-    sigma: Float64[ndarray, "5"]
-    free: tuple[int, ...]
-
-    @staticmethod
-    def of(projector: Device, free: tuple[int, ...]) -> "_Prior":
-        return _Prior(values_of(projector), prior_sigma(IntrinsicsPrior()), free)
-
-    def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
-        index = list(self.free)
-        return (values_of(scene.devices[-1]) - self.mean)[index] / self.sigma[index]
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """Normal equations in units of the noise: devices and intrinsics, points, and what couples them."""
-
-    H: Float64[ndarray, "m m"]
-    g: Float64[ndarray, "m"]
-    points_H: Float64[ndarray, "points 3 3"]
-    points_g: Float64[ndarray, "points 3"]
-    gradients: Float64[ndarray, "m points"]  # what each point adds to g
-    coupling: Float64[ndarray, "m points*3"]
+def residuals(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 2"]:
+    """Pixels by which devices see the points elsewhere than they should; far off where a point is behind."""
+    p, out = _in_devices(scene, s), np.zeros((len(s.device), 2))
+    for intrinsics, rows in _intrinsics(scene, s):
+        uv, front = project(intrinsics, torch.from_numpy(p[rows]))
+        out[rows] = np.where(front.numpy()[:, None], uv.numpy() - s.uv[rows], 1e6)
+    return out
 
 
 def _in_devices(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 3"]:
@@ -461,24 +441,15 @@ def _in_devices(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 3"]
     return np.einsum("nji,nj->ni", T[:, :3, :3], scene.points[s.point] - T[:, :3, 3])
 
 
-def _intrinsics(devices: Sequence[Device], s: CellSightings) -> list[tuple[Intrinsics, ndarray]]:
-    """Devices that share intrinsics are projected together."""
+def _intrinsics(scene: StaticScene, s: CellSightings) -> list[tuple[Intrinsics, ndarray]]:
+    """Intrinsics, and the sightings of all devices that share them: these are projected together."""
     groups: dict[Device, list[int]] = {}
-    for k, device in enumerate(devices):
+    for k, device in enumerate(scene.devices):
         groups.setdefault(device, []).append(k)
     return [
         (Intrinsics.of(device, torch.float64), np.flatnonzero(np.isin(s.device, index)))
         for device, index in groups.items()
     ]
-
-
-def residuals(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 2"]:
-    """Pixels by which devices see the points elsewhere than they should; far off where a point is behind."""
-    p, out = _in_devices(scene, s), np.zeros((len(s.device), 2))
-    for intrinsics, rows in _intrinsics(scene.devices, s):
-        uv, front = project(intrinsics, torch.from_numpy(p[rows]))
-        out[rows] = np.where(front.numpy()[:, None], uv.numpy() - s.uv[rows], 1e6)
-    return out
 
 
 def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene) -> float:
@@ -493,136 +464,124 @@ def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene) -> float:
     return max(lost * size / float(norm.ppf((1 + NOISE_QUANTILE) / 2)), NOISE_FLOOR_PX)
 
 
-def _cost(r: Float64[ndarray, "n 2"], s: CellSightings, width: float, prior: _Prior, scene: StaticScene) -> float:
-    data = 9 * float(geman_mcclure_cost((r**2).sum(-1) / width**2).sum())
-    return data + float((prior.departure(scene) ** 2).sum())
+@dataclass(frozen=True)
+class _Adjustment:
+    """The least-squares problem: which sightings, which intrinsics of the projector are free, and their prior."""
 
+    sightings: CellSightings
+    free: tuple[int, ...]
+    mean: Float64[ndarray, "5"]  # of the prior
 
-def _equations(
-    scene: StaticScene,
-    s: CellSightings,
-    r: Float64[ndarray, "n 2"],
-    width: float,
-    free: tuple[int, ...],
-    prior: _Prior,
-) -> _Equations:
-    p, n = _in_devices(scene, s), len(s.device)
-    by_p = np.zeros((n, 2, 3))
-    for intrinsics, rows in _intrinsics(scene.devices, s):
-        by_p[rows] = project_jacobian(intrinsics, torch.from_numpy(p[rows])).numpy()
-    x, y, z, o = *p.T, np.zeros(n)
-    hat = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(n, 3, 3)
-    by_pose = np.concatenate([-by_p, by_p @ hat], -1)
-    by_point = by_p @ scene.T_world_device[s.device, :3, :3].transpose(0, 2, 1)
-    w = geman_mcclure_weight((r**2).sum(-1) / width**2) / (width / 3) ** 2
-    D, C, m = len(scene.devices), len(scene.points), 6 * len(scene.devices) + len(free)
-    columns = np.broadcast_to(6 * s.device[:, None] + np.arange(6), (n, 6))
-    J = by_pose
-    if free:
-        by_free = np.zeros((n, 2, len(free)))
-        rows = np.flatnonzero(s.device == D - 1)
-        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free)
-        J = np.concatenate([J, by_free], -1)
-        columns = np.concatenate([columns, np.broadcast_to(6 * D + np.arange(len(free)), (n, len(free)))], 1)
-    H, gradients, coupling = np.zeros((m, m)), np.zeros((m, C)), np.zeros((m, 3 * C))
-    JtW = J.transpose(0, 2, 1) * w[:, None, None]
-    np.add.at(H, (columns[:, :, None], columns[:, None, :]), JtW @ J)
-    np.add.at(gradients, (columns, s.point[:, None]), (JtW @ r[..., None])[..., 0])
-    at = 3 * s.point[:, None] + np.arange(3)
-    np.add.at(coupling, (columns[:, :, None], at[:, None, :]), JtW @ by_point)
-    points_H, points_g = np.zeros((C, 3, 3)), np.zeros((C, 3))
-    PtW = by_point.transpose(0, 2, 1) * w[:, None, None]
-    np.add.at(points_H, s.point, PtW @ by_point)
-    np.add.at(points_g, s.point, (PtW @ r[..., None])[..., 0])
-    index, k = 6 * D + np.arange(len(free)), list(free)
-    H[index, index] += 1 / prior.sigma[k] ** 2
-    g = gradients.sum(1)
-    g[index] += prior.departure(scene) / prior.sigma[k]
-    return _Equations(H, g, points_H, points_g, gradients, coupling)
+    @property
+    def sigma(self) -> Float64[ndarray, "free"]:
+        """Standard deviations of the prior."""
+        return prior_sigma(IntrinsicsPrior())[list(self.free)]
 
+    def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
+        """Free intrinsics less their means."""
+        return (values_of(scene.devices[-1]) - self.mean)[list(self.free)]
 
-def _by_intrinsics(
-    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...]
-) -> Float64[ndarray, "n 2 free"]:
-    values, out = values_of(projector), []
-    for k in free:
-        ahead, behind = (
-            project(
-                Intrinsics.of(
-                    device_with(projector, values + sign * DIFFERENCE_STEP * np.eye(len(values))[k]), torch.float64
-                ),
-                torch.from_numpy(p),
-            )[0].numpy()
-            for sign in (1, -1)
-        )
-        out.append((ahead - behind) / (2 * DIFFERENCE_STEP))
-    return np.stack(out, -1)
+    def cost(self, scene: StaticScene, width: float) -> float:
+        """Half the robust cost in units of the noise, which is a third of the kernel's width, and that of the prior."""
+        r = residuals(scene, self.sightings)
+        data = 9 * float(geman_mcclure_cost((r**2).sum(-1) / width**2).sum())
+        return (data + float(((self.departure(scene) / self.sigma) ** 2).sum())) / 2
 
+    def moved(
+        self, scene: StaticScene, step: tuple[Float64[ndarray, "m"], Float64[ndarray, "points 3"]]
+    ) -> StaticScene:
+        """The scene after increments of the devices, the intrinsics and the points."""
+        devices, T, D = scene.devices, scene.T_world_device.copy(), len(scene.devices)
+        v, w = np.split(step[0][: 6 * D].reshape(D, 6), 2, axis=1)
+        T[:, :3, 3] += np.einsum("dij,dj->di", T[:, :3, :3], v)
+        T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(w).as_matrix()
+        if self.free:
+            values = values_of(devices[-1])
+            values[list(self.free)] += step[0][6 * D :].clip(-0.3, 0.3)
+            devices = (*devices[:-1], device_with(devices[-1], values))
+        return StaticScene(devices, T, scene.points + step[1])
 
-def _reduced(e: _Equations, damping: float) -> tuple[ndarray, ndarray, ndarray]:
-    """Equations of the devices with points eliminated, and the inverses of the points' blocks."""
-    blocks = (
-        e.points_H
-        + damping * e.points_H * np.eye(3)
-        + 1e-12 * np.eye(3) * e.points_H.trace(axis1=1, axis2=2)[:, None, None]
-    )
-    inverse = np.linalg.inv(np.where(blocks.any((1, 2))[:, None, None], blocks, np.eye(3)))
-    m = len(e.H)
-    by_point = e.coupling.reshape(m, -1, 3)
-    carried = np.einsum("mci,cij->mcj", by_point, inverse).reshape(m, -1)
-    S = e.H - carried @ e.coupling.T
-    return (S + S.T) / 2, e.g - carried @ e.points_g.reshape(-1), inverse
+    def equations(self, scene: StaticScene, width: float) -> BlockEquations:
+        """Normal equations in units of the noise: devices and intrinsics are shared, each point is a block."""
+        m, C = 6 * len(scene.devices) + len(self.free), len(scene.points)
+        H, g, coupling = np.zeros((m, m)), np.zeros(m), np.zeros((C, m, 3))
+        H_point, g_point = np.zeros((C, 3, 3)), np.zeros((C, 3))
+        for columns, point, r, J, weighted, by_point in self._linearised(scene, width):
+            H[np.ix_(columns, columns)] += weighted.reshape(-1, len(columns)).T @ J.reshape(-1, len(columns))
+            g[columns] += r.ravel() @ weighted.reshape(-1, len(columns))
+            # A device sees a point once.
+            coupling[point[:, None], columns] = weighted.transpose(0, 2, 1) @ by_point
+            weighted_point = self._weight(r, width)[:, None, None] * by_point.transpose(0, 2, 1)
+            H_point[point] += weighted_point @ by_point
+            g_point[point] += (weighted_point @ r[..., None])[..., 0]
+        index = np.arange(m - len(self.free), m)
+        H[index, index] += 1 / self.sigma**2
+        g[index] += self.departure(scene) / self.sigma**2
+        return BlockEquations(H, g, H_point, g_point, coupling)
 
+    def _linearised(self, scene: StaticScene, width: float) -> Iterator[tuple[ndarray, ...]]:
+        """For each device: columns of its unknowns, points, residuals, derivatives, these weighted, and by the points."""
+        s, last = self.sightings, len(scene.devices) - 1
+        p, r, by_p = _in_devices(scene, s), residuals(scene, s), np.zeros((len(s.device), 2, 3))
+        for intrinsics, rows in _intrinsics(scene, s):
+            by_p[rows] = project_jacobian(intrinsics, torch.from_numpy(p[rows])).numpy()
+        x, y, z, o = *p.T, np.zeros(len(p))
+        hat = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(-1, 3, 3)
+        by_device = np.concatenate([-by_p, by_p @ hat], -1)
+        by_point = by_p @ scene.T_world_device[s.device, :3, :3].transpose(0, 2, 1)
+        w = self._weight(r, width)[:, None, None]
+        for k in range(last + 1):
+            rows = np.flatnonzero(s.device == k)
+            columns, J = 6 * k + np.arange(6), by_device[rows]
+            if k == last and self.free:
+                columns = np.append(columns, 6 * last + 6 + np.arange(len(self.free)))
+                by_free = [_by_intrinsic(scene.devices[-1], p[rows], one) for one in self.free]
+                J = np.concatenate([J, np.stack(by_free, -1)], -1)
+            yield columns, s.point[rows], r[rows], J, w[rows] * J, by_point[rows]
 
-def _covariance(e: _Equations, s: CellSightings, scene: StaticScene, free: int) -> Float64[ndarray, "free free"]:
-    """Of the projector's intrinsics, cluster-robust: errors of points in one part of the pattern may be shared.
+    @staticmethod
+    def _weight(r: Float64[ndarray, "n 2"], width: float) -> Float64[ndarray, "n"]:
+        return geman_mcclure_weight((r**2).sum(-1) / width**2) / (width / 3) ** 2
 
-    Lenses that are modelled slightly wrong, and edges that are decoded wrong, push neighbouring points the same way.
-    """
-    if not free:
-        return np.zeros((0, 0))
-    S, _, inverse = _reduced(e, 0.0)
-    m, C = len(S), len(scene.points)
-    H_inverse = np.linalg.pinv(S, rcond=1e-13, hermitian=True)
-    pull = np.einsum("mci,cij,cj->mc", e.coupling.reshape(m, C, 3), inverse, e.points_g)
-    part = _parts(s, scene)
-    scores = np.stack([np.bincount(part, row) for row in e.gradients - pull], 1)
-    n = len(scores)
-    meat = scores.T @ scores * (n / max(n - m, n / 4))
-    formal, robust = (matrix[m - free :, m - free :] for matrix in (H_inverse, H_inverse @ meat @ H_inverse))
-    growth = np.sqrt(np.maximum(np.diag(robust) / np.diag(formal), 1.0))
-    return growth[:, None] * formal * growth
+    def covariance(self, scene: StaticScene, width: float) -> Float64[ndarray, "free free"]:
+        """Covariance of the free intrinsics, cluster-robust: errors of points in one part of the pattern may be shared.
 
+        Lenses that are modelled slightly wrong, and edges that are decoded wrong, push neighbouring points the same
+        way.
+        """
+        free = len(self.free)
+        if not free:
+            return np.zeros((0, 0))
+        equations, part = self.equations(scene, width), self._parts(len(scene.points))
+        H_inverse = np.linalg.pinv(equations.reduced().H, rcond=1e-13, hermitian=True)
+        gradients = -(equations.coupling @ np.linalg.solve(equations.H_block, equations.g_block[..., None]))[..., 0]
+        for columns, point, r, _, weighted, _ in self._linearised(scene, width):
+            gradients[point[:, None], columns] += np.einsum("nki,nk->ni", weighted, r)
+        scores = np.stack([np.bincount(part, one) for one in gradients.T], 1)
+        n, m = scores.shape
+        meat = scores.T @ scores * (n / max(n - m, n / 4))
+        formal, robust = (matrix[m - free :, m - free :] for matrix in (H_inverse, H_inverse @ meat @ H_inverse))
+        growth = np.sqrt(np.maximum(np.diag(robust) / np.diag(formal), 1.0))
+        return growth[:, None] * formal * growth
 
-def _parts(s: CellSightings, scene: StaticScene) -> Int64[ndarray, "points"]:
-    """Number of the square part of the projector's image in which each point lies; one part without a projector."""
-    part = np.zeros(len(scene.points), dtype=np.int64)
-    beam = s.device >= s.cameras
-    uv = s.uv[beam]
-    if len(uv):
+    def _parts(self, points: int) -> Int64[ndarray, "points"]:
+        """Number of the square part of the projector's image in which each point lies."""
+        part, beam = np.zeros(points, dtype=np.int64), self.sightings.device >= self.sightings.cameras
+        uv = self.sightings.uv[beam]
         low, high = uv.min(0), uv.max(0)
         cell = ((uv - low) / (high - low).max() * PARTS_ALONG).astype(np.int64).clip(0, PARTS_ALONG - 1)
-        part[s.point[beam]] = cell[:, 1] * PARTS_ALONG + cell[:, 0]
-    return part
+        part[self.sightings.point[beam]] = cell[:, 1] * PARTS_ALONG + cell[:, 0]
+        return part
 
 
-def _stepped(scene: StaticScene, e: _Equations, damping: float, free: tuple[int, ...]) -> StaticScene:
-    S, g, inverse = _reduced(e, damping)
-    S = S + damping * np.diag(np.diag(e.H)) + 1e-12 * np.trace(S) / len(S) * np.eye(len(S))
-    step = -np.linalg.solve(S, g)
-    D, C = len(scene.devices), len(scene.points)
-    pull = e.points_g + (e.coupling.T @ step).reshape(C, 3)
-    points = scene.points - np.einsum("cij,cj->ci", inverse, pull)
-    T = scene.T_world_device.copy()
-    v, w = step[: 6 * D].reshape(D, 6)[:, :3], step[: 6 * D].reshape(D, 6)[:, 3:]
-    T[:, :3, 3] += np.einsum("dij,dj->di", T[:, :3, :3], v)
-    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(w).as_matrix()
-    devices = scene.devices
-    if free:
-        values = values_of(devices[-1])
-        values[list(free)] += step[6 * D :].clip(-0.3, 0.3)
-        devices = (*devices[:-1], device_with(devices[-1], values))
-    return replace(scene, devices=devices, T_world_device=T, points=points)
+def _by_intrinsic(projector: Device, p: Float64[ndarray, "n 3"], k: int) -> Float64[ndarray, "n 2"]:
+    """Derivative of the projector's pixels by one of its intrinsics."""
+    step = DIFFERENCE_STEP * np.eye(len(values_of(projector)))[k]
+    ahead, behind = (
+        project(Intrinsics.of(device_with(projector, values_of(projector) + x), torch.float64), torch.from_numpy(p))[0]
+        for x in (step, -step)
+    )
+    return (ahead - behind).numpy() / (2 * DIFFERENCE_STEP)
 
 
 Fault = Literal["no pair", "no projector", "uncertain"]
@@ -720,7 +679,7 @@ def _grown(
         left = sorted((int(k) for k in np.flatnonzero(~placed) if k not in failed), key=lambda k: -seen[k])
         if not left:
             return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras)
-        pose = place_next(left[0], rays[left[0]], points, cameras[left[0]])
+        pose = place_next(rays[left[0]], points, cameras[left[0]])
         if pose is None:
             failed.add(left[0])
         else:
@@ -821,19 +780,8 @@ def _left_out(scene: StaticScene, sightings: CellSightings, free: tuple[int, ...
     projector = sightings.device == sightings.cameras
     for fold in range(FOLDS):
         left = projector & (sightings.point % FOLDS == fold)
-        kept = CellSightings(sightings.device[~left], sightings.point[~left], sightings.uv[~left], sightings.cameras)
-        found = adjust_scene(scene, kept, free, FOLD_ITERATIONS)
-        loss = view_error(found.scene, sightings, left, KERNEL_SIGMAS * found.noise_px)
-        out[sightings.point[left]] = loss
+        found = adjust_scene(scene, sightings.chosen(~left), free, FOLD_ITERATIONS)
+        r = residuals(found.scene, sightings.chosen(left))
+        width = KERNEL_SIGMAS * found.noise_px
+        out[sightings.point[left]] = geman_mcclure_cost((r**2).sum(-1) / width**2)
     return out
-
-
-def view_error(
-    scene: StaticScene, sightings: CellSightings, rows: Bool[ndarray, "n"], width: float
-) -> Float64[ndarray, "m"]:
-    """Robust cost of some sightings, 0 to 1."""
-    r = residuals(
-        scene, CellSightings(sightings.device[rows], sightings.point[rows], sightings.uv[rows], sightings.cameras)
-    )
-    x = (r**2).sum(-1) / width**2
-    return x / (1 + x)
