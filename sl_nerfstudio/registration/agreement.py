@@ -352,10 +352,7 @@ def agreement(source: Side, target: Side, hypotheses: Hypotheses, tolerance: Tol
 
 
 def agreement_at(
-    maps: tuple[SurfaceMap, SurfaceMap],
-    S_target_source: Similarity,
-    rng: np.random.Generator,
-    tolerance: Tolerance,
+    maps: tuple[SurfaceMap, SurfaceMap], S_target_source: Similarity, rng: np.random.Generator, tolerance: Tolerance
 ) -> Agreement:
     """How two frames agree under one similarity."""
     source, target = (Side.sampled(m, COARSE_POINTS, rng) for m in maps)

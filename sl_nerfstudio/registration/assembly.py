@@ -142,10 +142,7 @@ class PoseGraphSolution:
 
 
 def optimise_pose_graph(
-    edges: Sequence[PairMatch],
-    pivots: Pivots,
-    start: Mapping[int, Similarity],
-    weight: Float64[ndarray, "edges"],
+    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity], weight: Float64[ndarray, "edges"]
 ) -> PoseGraphSolution:
     """All edges inside a component together, robustly, each with its weight. The first frame of `start` stays."""
     nodes: Nodes = [start.get(k) for k in range(len(pivots))]
@@ -164,11 +161,7 @@ def optimise_pose_graph(
 
 
 def _optimised(
-    edges: EdgeArrays,
-    nodes: Similarities,
-    pivots: Pivots,
-    free: Int64[ndarray, "m"],
-    weight: Float64[ndarray, "edges"],
+    edges: EdgeArrays, nodes: Similarities, pivots: Pivots, free: Int64[ndarray, "m"], weight: Float64[ndarray, "edges"]
 ) -> Similarities:
     """Gauss-Newton with a kernel that narrows. Far from a minimum a step may lead away: it is shortened if it costs."""
     adjoints = edges.adjoints(pivots)

@@ -206,12 +206,7 @@ def _moved_points(side: Side, still: Similarity, moved: Similarity) -> Side:
     return Side(side.map, side.points[some], side.normals[some], side.sigma[some])
 
 
-def slip_deg(
-    sides: Sides,
-    S_target_source: Similarity,
-    direction: Float64[ndarray, "7"],
-    common: Tolerance,
-) -> float:
+def slip_deg(sides: Sides, S_target_source: Similarity, direction: Float64[ndarray, "7"], common: Tolerance) -> float:
     """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
 
     A motion is noticed where the mean robust cost of all points, or of those that it moves, rises, with a kernel as
@@ -237,12 +232,7 @@ def slip_deg(
     return float(angles[noticed[0]] if len(noticed) else angles[-1])
 
 
-def followed(
-    sides: Sides,
-    moved: Hypotheses,
-    held: Float64[ndarray, "3"],
-    kernel: Tolerance,
-) -> Hypotheses:
+def followed(sides: Sides, moved: Hypotheses, held: Float64[ndarray, "3"], kernel: Tolerance) -> Hypotheses:
     """After a Gauss-Newton step of each that does not rotate about the axis `held`."""
     target = sides[1].map
     sums = agreement(*sides, moved, kernel)
@@ -288,10 +278,7 @@ class ToneTurn:
 
 
 def turn_by_tone(
-    sides: Sides,
-    S_target_source: Similarity,
-    slip: tuple[Float64[ndarray, "7"], float],
-    common: Tolerance,
+    sides: Sides, S_target_source: Similarity, slip: tuple[Float64[ndarray, "7"], float], common: Tolerance
 ) -> ToneTurn | None:
     """The similarity along a motion at which tones agree; None where none stands out.
 
@@ -484,10 +471,7 @@ class PairMatch:
         covariance = np.linalg.inv(self.information) + slip**2 * np.outer(d, d)
         sigma_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
         return replace(
-            self,
-            information=np.linalg.inv(covariance),
-            rotation_sigma_deg=sigma_deg,
-            slip_deg=self.shape_slip_deg,
+            self, information=np.linalg.inv(covariance), rotation_sigma_deg=sigma_deg, slip_deg=self.shape_slip_deg
         )
 
     def between(self, source: int, target: int) -> Similarity:
@@ -625,11 +609,7 @@ def register_pair(
     return _best_match(fine, found, common, pair)
 
 
-def search_score(
-    maps: tuple[SurfaceMap, SurfaceMap],
-    search: Search,
-    rng: np.random.Generator,
-) -> float:
+def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator) -> float:
     """How well the best of all starts agrees, before any refinement: which pairs are worth registering."""
     source, target = maps
     if not (source.valid.any() and target.valid.any()):

@@ -131,10 +131,7 @@ def accept_frames(
 
 
 def _doubtful(
-    names: Sequence[str],
-    inside: Bool[ndarray, "n"],
-    edges: Sequence[PairMatch],
-    consistent: Bool[ndarray, "edges"],
+    names: Sequence[str], inside: Bool[ndarray, "n"], edges: Sequence[PairMatch], consistent: Bool[ndarray, "edges"]
 ) -> dict[int, PairsContradict]:
     """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
     found = {}
@@ -367,11 +364,7 @@ def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[F
 
 
 @one_library_thread()
-def choose_projectors(
-    clouds: Sequence[FrameCloud],
-    sequence: bool = True,
-    seed: int = 0,
-) -> ProjectorChoice:
+def choose_projectors(clouds: Sequence[FrameCloud], sequence: bool = True, seed: int = 0) -> ProjectorChoice:
     """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
     open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
     if not open_frames:

@@ -250,9 +250,7 @@ def triangulated(
 
 
 def place_next(
-    rays: Float64[ndarray, "cells 3"],
-    points: Float64[ndarray, "cells 3"],
-    camera: Device,
+    rays: Float64[ndarray, "cells 3"], points: Float64[ndarray, "cells 3"], camera: Device
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a camera against known points (PnP with RANSAC); None where it has too few or no pose fits."""
     both = np.isfinite(rays[:, 0]) & np.isfinite(points[:, 0])
@@ -281,9 +279,7 @@ def posed(
 
 
 def resect(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Focal length, principal point (anywhere) and pose of a pinhole projector; its pixels count as square.
 
@@ -355,9 +351,7 @@ def _device_of(
 
 
 def place_known(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a projector with known intrinsics; None where no pose fits most of the points."""
     d = directions(projector, uv)
@@ -520,7 +514,7 @@ class _Adjustment:
         return BlockEquations(H, g, H_point, g_point, coupling)
 
     def _linearised(self, scene: StaticScene, width: float) -> Iterator[tuple[ndarray, ...]]:
-        """For each device: columns of its unknowns, points, residuals, derivatives, these weighted, and by the points."""
+        """For each device: columns of its unknowns, points, residuals, derivatives, also weighted, and by the points."""
         s, last = self.sightings, len(scene.devices) - 1
         p, r, by_p = _in_devices(scene, s), residuals(scene, s), np.zeros((len(s.device), 2, 3))
         for intrinsics, rows in _intrinsics(scene, s):
@@ -615,11 +609,7 @@ class NoPlacement:
 
 @one_library_thread()
 def place_under_static_projector(
-    coords: Sequence[Float32[ndarray, "_ _ 2"]],
-    cameras: Sequence[Device],
-    projector: Device,
-    known: bool,
-    stated: bool,
+    coords: Sequence[Float32[ndarray, "_ _ 2"]], cameras: Sequence[Device], projector: Device, known: bool, stated: bool
 ) -> StaticPlacement | NoPlacement:
     """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
 
@@ -721,11 +711,7 @@ def _sightings(cells: PatternCells, placed: Int64[ndarray, "m"], *, with_project
 
 
 def _projector(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
-    known: bool,
-    stated: bool,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device, known: bool, stated: bool
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Intrinsics and pose to start from."""
     if known or projector.model == "DOE":

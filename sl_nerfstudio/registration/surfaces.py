@@ -505,9 +505,7 @@ def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray
 
 
 def _views(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"] | None,
-    camera: Device,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"] | None, camera: Device
 ) -> tuple[FrameView, ...]:
     """Everything that the frame sees; and what lies in the middle of its image, at what depth that is.
 

@@ -293,10 +293,7 @@ def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> Iterator[S
 
 
 def symmetric_turns_deg(
-    sides: Sequence[Side],
-    edges: Sequence[PairMatch],
-    solution: PoseGraphSolution,
-    others: Sequence[PairMatch] = (),
+    sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, others: Sequence[PairMatch] = ()
 ) -> tuple[float, ...]:
     """Angles of the turns, in degrees, that pairs of registered frames say and that leave the surface as it is.
 
@@ -364,10 +361,7 @@ class TurnedBlock:
 
 
 def turned_blocks(
-    sides: Sequence[Side],
-    edges: Sequence[PairMatch],
-    solution: PoseGraphSolution,
-    before: Judged,
+    sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, before: Judged
 ) -> list[TurnedBlock]:
     """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first.
 

@@ -68,12 +68,7 @@ def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots) -> list[Pai
     ]
 
 
-def _confirmed(
-    e: PairMatch,
-    of_source: dict[int, PairMatch],
-    of_target: dict[int, PairMatch],
-    pivots: Pivots,
-) -> bool:
+def _confirmed(e: PairMatch, of_source: dict[int, PairMatch], of_target: dict[int, PairMatch], pivots: Pivots) -> bool:
     """Whether the way over a third frame leads to the same similarity."""
     around = (
         of_target[k].between(k, e.target) @ of_source[k].between(e.source, k) for k in of_source if k in of_target
@@ -94,8 +89,7 @@ def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int) -> bool:
 
 
 def starting_similarities(
-    T_world_camera: Float64[ndarray, "n 4 4"],
-    maps: Sequence[SurfaceMap],
+    T_world_camera: Float64[ndarray, "n 4 4"], maps: Sequence[SurfaceMap]
 ) -> list[Similarity | None]:
     """`S_world_camera` of frames with known camera poses; None where a pose holds NaN.
 

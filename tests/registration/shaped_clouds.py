@@ -36,14 +36,7 @@ def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100
     points = ray / -ray[:, 2:] * depth(x, y)[:, None]
     even = np.full(len(uv), sigma / np.sqrt(2))
     errors = np.outer(even, np.eye(5)[0])
-    return replace(
-        _template(),
-        camera=camera,
-        uv_camera=uv,
-        points=points,
-        sigma_noise=even,
-        pose_errors=errors,
-    )
+    return replace(_template(), camera=camera, uv_camera=uv, points=points, sigma_noise=even, pose_errors=errors)
 
 
 def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:

@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.geometry.triangulation import pixel_centres
 from sl_nerfstudio.registration import agreement as module
@@ -35,13 +30,7 @@ from sl_nerfstudio.registration.agreement import (
     agreement_at,
 )
 from sl_nerfstudio.registration.pairs import ANYWHERE, register_pair
-from sl_nerfstudio.registration.surfaces import (
-    EmptyPlaces,
-    FrameView,
-    SurfaceMap,
-    build_surface_map,
-    tangent_planes,
-)
+from sl_nerfstudio.registration.surfaces import EmptyPlaces, FrameView, SurfaceMap, build_surface_map, tangent_planes
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
 from tests.registration.shaped_clouds import rendered

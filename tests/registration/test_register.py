@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import (
-    RegisteredFramesSettings,
-    adjust_registered,
-)
+from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity

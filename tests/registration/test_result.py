@@ -1,6 +1,5 @@
 """What registration found, and the known length that sets its scale."""
 
-
 import numpy as np
 import pytest
 
