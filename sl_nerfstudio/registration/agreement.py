@@ -220,9 +220,10 @@ class Hypotheses:
     log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
 
     @staticmethod
-    def of(S: Similarity) -> "Hypotheses":
-        """One similarity alone."""
-        return Hypotheses(np.array([S.scale]), S.R[None], S.t[None], np.log([S.scale]))
+    def of(*each: Similarity) -> "Hypotheses":
+        """Stack at least one similarity."""
+        scale = np.array([S.scale for S in each])
+        return Hypotheses(scale, np.stack([S.R for S in each]), np.stack([S.t for S in each]), np.log(scale))
 
     @staticmethod
     def joined(parts: Sequence["Hypotheses"]) -> "Hypotheses":
@@ -291,6 +292,9 @@ class Tolerance:
     sigmas: float
 
 
+AGREES = Tolerance(0.0, AGREEING_SIGMAS)
+
+
 @dataclass(frozen=True)
 class Agreement:
     """Sums for each of k similarities; distances in units of the target's baseline."""
@@ -354,6 +358,6 @@ def agreement(source: Side, target: Side, hypotheses: Hypotheses, tolerance: Tol
 def agreement_at(
     maps: tuple[SurfaceMap, SurfaceMap], S_target_source: Similarity, rng: np.random.Generator, tolerance: Tolerance
 ) -> Agreement:
-    """How two frames agree under one similarity."""
+    """Compare two frames under one similarity."""
     source, target = (Side.sampled(m, COARSE_POINTS, rng) for m in maps)
     return agreement(source, target, Hypotheses.of(S_target_source), tolerance)

@@ -58,11 +58,13 @@ SAME_SIDE_SHIFT = 0.2  # shift between two similarities, radii, below which they
 MOST_PAIRS = 12  # of frames across two components that are compared
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
-# Residuals of the pose graph: the similarity by which an edge and the nodes at its ends disagree.
+Component = dict[int, Similarity]  # S_world_camera of some frames, in a world of their own
+
+# The pose graph: frames are nodes, similarities between pairs are edges, some of which are wrong. The start is an
+# assembled component, so most edges agree with it to within their errors; a Geman-McClure kernel that starts wide and
+# narrows (Yang et al., RA-L 2020) keeps the others from doing harm.
 #
 # Increments (v, w, l) of a node act in its own axes, about a pivot c: `p -> c + exp(l) exp(w) (p - c) + radius v`.
-
-Nodes = Sequence[Similarity | None]  # S_world_camera of every frame; None where it is not known
 
 
 @dataclass(frozen=True)
@@ -77,14 +79,6 @@ class Pivots:
         return len(self.radius)
 
 
-def node_at(nodes: Nodes, k: int) -> Similarity:
-    """The similarity of a frame. Raises ValueError where it is not known."""
-    S = nodes[k]
-    if S is None:
-        raise ValueError(f"frame {k} has no pose in the graph")
-    return S
-
-
 @dataclass(frozen=True)
 class EdgeArrays:
     """Edges one after the other."""
@@ -96,7 +90,7 @@ class EdgeArrays:
 
     @staticmethod
     def of(edges: Sequence[PairMatch]) -> "EdgeArrays":
-        """From at least one."""
+        """Stack a non-empty sequence."""
         ends = np.array([(e.source, e.target) for e in edges])
         S = Similarities.of([e.S_target_source for e in edges])
         return EdgeArrays(ends[:, 0], ends[:, 1], S, np.stack([e.information for e in edges]))
@@ -126,37 +120,34 @@ class EdgeArrays:
         return A
 
 
-# Pose graph optimisation: frames are nodes, similarities between pairs are edges, some of which are wrong.
-#
-# The start is an assembled component, so most edges agree with it to within their errors. A Geman-McClure kernel
-# that
-# starts wide and narrows (Yang et al., RA-L 2020) keeps the others from doing harm.
-
-
 @dataclass(frozen=True)
 class PoseGraphSolution:
     """One component of frames in its own world."""
 
-    S_world_camera: Nodes  # None for frames outside
+    S_world_camera: Component  # in the order of the frames
     consistent: Bool[ndarray, "edges"]  # edges that agree with the solution; False where an end is outside
 
 
 def optimise_pose_graph(
     edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity], weight: Float64[ndarray, "edges"]
 ) -> PoseGraphSolution:
-    """All edges inside a component together, robustly, each with its weight. The first frame of `start` stays."""
-    nodes: Nodes = [start.get(k) for k in range(len(pivots))]
+    """Optimise all edges inside a component together, robustly, each with its weight.
+
+    The first frame of `start` stays.
+    """
+    nodes = {k: start[k] for k in sorted(start)}
     inside = np.array([e.source in start and e.target in start for e in edges], dtype=bool)
     connected = [e for e, here in zip(edges, inside, strict=True) if here]
     chi2 = np.full(len(edges), np.inf)
     if connected:
         arrays = EdgeArrays.of(connected)
-        every = Similarities.of([S or Similarity.identity() for S in nodes]).orthonormal()
+        every = Similarities.of([nodes.get(k, Similarity.identity()) for k in range(len(pivots))]).orthonormal()
         root = next(iter(start))
-        free = np.array([k for k, S in enumerate(nodes) if S is not None and k != root], dtype=np.int64)
+        free = np.array([k for k in nodes if k != root], dtype=np.int64)
         every = _optimised(arrays, every, pivots, free, weight[inside])
         chi2[inside] = arrays.chi_square(arrays.residuals(every, pivots))
-        nodes = [None if S is None else found for S, found in zip(nodes, every.each(), strict=True)]
+        each = every.each()
+        nodes = {k: each[k] for k in nodes}
     return PoseGraphSolution(nodes, chi2 < REJECTION_FACTOR * KERNEL_CHI2)
 
 
@@ -222,7 +213,7 @@ def _step(
     return -factor.solve(g[free].ravel()).reshape(-1, 7)
 
 
-Component = dict[int, Similarity]  # S_component_camera of each frame
+# Assembly.
 
 
 @dataclass(frozen=True)
@@ -316,8 +307,8 @@ class Assembly:
     def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
         """Both in the world of the first, with all pairs inside optimised together."""
         both = {**first, **{k: S @ S_second for k, S_second in second.items()}}
-        nodes = optimise_pose_graph(self._edges, self._pivots, both, self._weight)
-        return {k: node_at(nodes.S_world_camera, k) for k in both}
+        found = optimise_pose_graph(self._edges, self._pivots, both, self._weight).S_world_camera
+        return {k: found[k] for k in both}
 
     def decide(self, first: Component, second: Component) -> Joint | None:
         """The similarity between two components; None where it is not certain."""
@@ -367,15 +358,12 @@ class Assembly:
 
     def _joints(self, first: Component, second: Component) -> list[Joint]:
         """The clearly different similarities between two components that pairs across say, with their votes."""
-        links = [self._links(e, first, second) for e in self._crossing(first, second)]
+        links = [self._links(e, first, second) for e in self._between(self._edges, first, second)]
         distinct: list[Link] = []
         for link in sorted((one for of_pair in links for one in of_pair), key=lambda one: -one.quality):
             if not any(self._same(link, other.S_first_second, first, second) for other in distinct):
                 distinct.append(link)
         return [self._judge(first, second, one.S_first_second, links) for one in distinct[:MOST_COMPARED]]
-
-    def _crossing(self, first: Component, second: Component) -> list[PairMatch]:
-        return self._between(self._edges, first, second)
 
     @staticmethod
     def _between(edges: Sequence[PairMatch], first: Component, second: Component) -> list[PairMatch]:
@@ -439,7 +427,7 @@ class Assembly:
         """Whether tones tell what surfaces do not notice: a pair across that they hold says the same."""
         return any(
             self._same(self._links(e, first, second)[0], joint.S_first_second, first, second)
-            for e in self._crossing(first, second)
+            for e in self._between(self._edges, first, second)
             if e.by_tone
         )
 
@@ -484,7 +472,7 @@ class Assembly:
             and e.rotation_sigma_deg < LARGEST_SIGMA_DEG
             and e.second_best_ratio < LARGEST_RIVAL
             and 1 - e.fitness < self._largest_misfit
-            for e in self._crossing(first, second)
+            for e in self._between(self._edges, first, second)
         )
 
     def _facing(self, first: Component, second: Component, S: Similarity) -> list[tuple[int, int]]:

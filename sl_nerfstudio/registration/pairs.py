@@ -18,6 +18,7 @@ from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.registration.agreement import (
     AGREEING_SIGMAS,
+    AGREES,
     COARSE_POINTS,
     LEAST_FACING_COSINE,
     PENALTY,
@@ -104,7 +105,289 @@ GOOD_QUANTILE = 0.75  # of the fitness of all pairs: that of good ones
 FITNESS_SCALE = 0.05  # fitness below that of good pairs at which a pair's weight falls to 1/e
 LEAST_WEIGHT = 0.02  # of the worst pair
 
-# Similarities from which the registration of a pair starts.
+
+@dataclass(frozen=True)
+class Rival:
+    """A clearly different similarity between the same two frames."""
+
+    S_target_source: Similarity
+    ratio: float  # its score over that of the best one: 1 is as good
+
+
+@dataclass(frozen=True)
+class PairMatch:
+    """One frame on another. Similarities map camera axes to camera axes, each in units of its own baseline."""
+
+    source: int
+    target: int
+    S_target_source: Similarity
+    information: Float64[ndarray, "7 7"]  # of (v, w, l), see surface_agreement; lengths in radii of the target
+    overlap: float  # fraction of all points that lie on the other frame's surface
+    fitness: float  # the same among the points that could be judged
+    rms: float  # distance of agreeing points from the surface, in radii
+    rivals: tuple[Rival, ...]  # the best first
+    rotation_sigma_deg: float  # standard deviation of the least known rotation
+    slip_deg: float  # rotation that nothing tells from none: above zero on planes and surfaces of revolution
+    slip_direction: Float64[ndarray, "7"]  # the motion (v, w, l) in the target's axes, about its centroid, |w| = 1
+    shape_slip_deg: float = 0.0  # the rotation that surfaces alone do not tell: larger than `slip_deg` where tones do
+
+    @property
+    def second_best_ratio(self) -> float:
+        """Score of the best rival over that of this similarity: 1 is ambiguous."""
+        return self.rivals[0].ratio if self.rivals else 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the pair holds its frames in place, to within a slip that other pairs end."""
+        return self.slip_deg <= BOUNDED_SLIP_DEG
+
+    @property
+    def by_tone(self) -> bool:
+        """Whether tones hold the frames where surfaces alone would let them slip."""
+        return self.shape_slip_deg > self.slip_deg
+
+    def without_tone(self) -> "PairMatch":
+        """The same pair as one that slips."""
+        d, slip = self.slip_direction, np.radians(self.shape_slip_deg)
+        covariance = np.linalg.inv(self.information) + slip**2 * np.outer(d, d)
+        sigma_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
+        return replace(
+            self, information=np.linalg.inv(covariance), rotation_sigma_deg=sigma_deg, slip_deg=self.shape_slip_deg
+        )
+
+    def between(self, source: int, target: int) -> Similarity:
+        """The similarity from `source` to `target`, whichever way it was found."""
+        forward = (self.source, self.target) == (source, target)
+        return self.S_target_source if forward else self.S_target_source.inverse()
+
+    def other(self, frame: int) -> int:
+        """The frame at the other end."""
+        return self.target if self.source == frame else self.source
+
+
+def is_accepted(match: PairMatch) -> bool:
+    """Whether a pair overlaps and agrees well enough to be an edge."""
+    return match.fitness > LEAST_FITNESS and match.overlap > LEAST_OVERLAP
+
+
+def support(match: PairMatch) -> float:
+    """Between 0 and 1: how much two surfaces agree, and how little contradicts."""
+    return support_of(match.overlap, match.fitness)
+
+
+def support_of(overlap: float, fitness: float) -> float:
+    """The same from the share of points that agree, and the share of those that could be judged."""
+    return overlap * fitness**2
+
+
+def quality(match: PairMatch) -> float:
+    """Between 0 and 1: which of two results for a pair is better, and which pair of a frame."""
+    clear = match.second_best_ratio < AMBIGUOUS_RATIO
+    return support(match) * (1.0 if clear else AMBIGUOUS_WEIGHT)
+
+
+def is_ambiguous(match: PairMatch) -> bool:
+    """Whether a clearly different similarity fits nearly as well."""
+    return match.second_best_ratio > AMBIGUOUS_RATIO
+
+
+def edge_weights(edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
+    """Weight of each pair: smaller where its surfaces agree less than those of the scan's good pairs do.
+
+    On smooth surfaces frames slide: neighbours that are wrong in the same way close cycles with each other and
+    outnumber the right pairs. But they fit a little worse.
+    """
+    fitness = np.array([e.fitness for e in edges])
+    if not len(fitness):
+        return fitness
+    deficit = np.maximum(np.quantile(fitness, GOOD_QUANTILE) - fitness, 0) / FITNESS_SCALE
+    factor = np.array([AMBIGUOUS_WEIGHT if is_ambiguous(e) else 1.0 for e in edges])
+    return np.maximum(np.exp(-(deficit**2)) * factor, LEAST_WEIGHT)
+
+
+# Search and refinement.
+
+
+def register_pair(
+    maps: tuple[SurfaceMap, SurfaceMap],
+    pair: tuple[int, int],
+    search: Search,
+    rng: np.random.Generator,
+    guess: Similarity | None = None,
+) -> PairMatch | None:
+    """Frame `pair[0]` onto frame `pair[1]`; None where no similarity makes anything agree.
+
+    With a guess the search rotates it about the object; without one it starts from both cameras looking at the object
+    from the same side.
+    """
+    source, target = maps
+    if not (source.valid.any() and target.valid.any()):
+        return None
+
+    def sides(count: int) -> Sides:
+        return Side.sampled(source, count, rng), Side.sampled(target, count, rng)
+
+    found = without_guess(source, target, search) if guess is None else around_guess(target, search, guess)
+    few = sides(SEARCH_POINTS)
+    best = _ranked(few, found, SEARCH_TOLERANCE)
+    found = found[best[:COARSE_STARTS]]
+    coarse = sides(COARSE_POINTS)
+    for width in COARSE_WIDTHS:
+        found = _improved(coarse, found, Tolerance(width, KERNEL_SIGMAS))
+    best = _ranked(coarse, found, COARSE_TOLERANCE)
+    found = found[_distinct(found, best, FINE_STARTS, target)]
+    fine = sides(FINE_POINTS)
+    for width in FINE_WIDTHS:
+        found = _improved(fine, found, Tolerance(width, KERNEL_SIGMAS))
+    common = Tolerance(0.0, _common_width(fine, found))
+    for _ in range(COMMON_STEPS):
+        found = _improved(fine, found, common)
+    return _best_match(fine, found, common, pair)
+
+
+def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator) -> float:
+    """How well the best of all starts agrees, before any refinement: which pairs are worth registering."""
+    source, target = maps
+    if not (source.valid.any() and target.valid.any()):
+        return -1.0
+    sides = tuple(Side.sampled(m, LIKENESS_POINTS, rng) for m in maps)
+    found = without_guess(source, target, search)
+    tolerance = Tolerance(SEARCH_TOLERANCE, AGREEING_SIGMAS)
+    return float(agreement(sides[0], sides[1], found, tolerance).score().max())
+
+
+def _ranked(sides: Sides, found: Hypotheses, radii: float) -> list[int]:
+    """Their indices, the highest score first; points within some radii agree."""
+    tolerance = Tolerance(radii, AGREEING_SIGMAS)
+    score = agreement(*sides, found, tolerance).score()
+    return np.argsort(-score, kind="stable").tolist()
+
+
+def _distinct(found: Hypotheses, ranked: list[int], count: int, target: SurfaceMap) -> list[int]:
+    """The first `count` of the ranked ones, without those that are close to a better one."""
+    kept: list[int] = []
+    for k in ranked:
+        if len(kept) == count:
+            break
+        if all(_differ(found, k, j, target) for j in kept):
+            kept.append(k)
+    return kept
+
+
+def _differ(found: Hypotheses, a: int, b: int, target: SurfaceMap) -> bool:
+    angle_deg, shift = found.difference(a, b, target.centroid)
+    return angle_deg > SAME_ROTATION_DEG or shift / target.radius > SAME_SHIFT
+
+
+def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
+    """After one damped Gauss-Newton step of each."""
+    sums = agreement(*sides, found, kernel)
+    target = sides[1].map
+    radius, c, log_scale = target.radius, target.centroid, np.log(found.scale)
+    D = np.array([1, 1, 1, radius, radius, radius, radius])  # rotations and scalings as lengths at one radius
+    H, g = sums.H / D[:, None] / D, sums.g / D
+    trace = np.trace(H, axis1=1, axis2=2)[:, None, None].clip(1e-12)
+    H = H + DAMPING * trace * np.eye(7)
+    # Prior of the scale: a departure by its sigma costs as much as all independent points being off by the width.
+    width = max(kernel.radii, kernel.sigmas * float(np.median(sides[1].sigma)) / radius)
+    prior = trace[:, 0, 0] / 3 / INDEPENDENT_POINTS * width**2 / SCALE_SIGMA**2
+    H[:, 6, 6] += prior
+    g[:, 6] += prior * (log_scale - found.log_scale_prior) * radius
+    step = -np.linalg.solve(H, g[..., None])[..., 0] / D
+    size = np.linalg.norm(step * D, axis=1, keepdims=True)
+    step = step / np.maximum(size / (LARGEST_STEP * radius), 1)
+    bound = LARGEST_LOG_SCALE
+    bounded = found.log_scale_prior + np.clip(log_scale + step[:, 6] - found.log_scale_prior, -bound, bound)
+    return found.incremented(step[:, :3], step[:, 3:6], np.exp(bounded) / found.scale, c)
+
+
+def _common_width(sides: Sides, found: Hypotheses) -> float:
+    """Standard deviations within which surfaces agree if they are the same: from the result that agrees most closely.
+
+    How uncertain the surfaces are says how far they may be apart, not how far they are: most of it is common to all
+    points, and a similarity takes it up. What remains shows a relief that would otherwise be lost in it.
+    """
+    sums = agreement(*sides, found, AGREES)
+    likely = sums.agreeing >= LIKELY * sums.agreeing.max()
+    rms = float(np.sqrt(sums.squares[likely].min())) if likely.any() else 0.0
+    return float(np.clip(COMMON_RMS * rms, LEAST_WIDTH, AGREEING_SIGMAS))
+
+
+def _best_match(sides: Sides, found: Hypotheses, common: Tolerance, pair: tuple[int, int]) -> PairMatch | None:
+    """The result that explains most at the common width, with the others and how far they fall short."""
+    score = agreement(*sides, found, common).score(PENALTY)
+    sums = agreement(*sides, found, AGREES)
+    best, *others = np.argsort(-score, kind="stable").tolist()
+    if sums.agreeing[best] <= 0:
+        return None
+    target = sides[1].map
+    different: list[int] = []
+    for k in others:
+        if score[k] > 0 and all(_differ(found, k, j, target) for j in [best, *different]):
+            different.append(k)
+    rivals = tuple(Rival(found.similarity(k), float(score[k] / max(score[best], 1e-9))) for k in different)
+    match = match_from(pair, found.similarity(best), sums, best, rivals, sides, common)
+    return _held_by_tone(match, sides, common) or match
+
+
+def _held_by_tone(match: PairMatch, sides: Sides, common: Tolerance) -> PairMatch | None:
+    """A pair that slips, turned to where its tones agree; None if it does not slip, or where that is not certain.
+
+    Other results for the pair are passed over: tones were compared all the way around.
+    """
+    if match.slip_deg == 0:
+        return None
+    found = turn_by_tone(sides, match.S_target_source, match.slip_direction, common)
+    if found is None:
+        return None
+    S, sigma_deg = found
+    sums = agreement(*sides, Hypotheses.of(S), AGREES)
+    if sums.fitness[0] < match.fitness - TONE_LARGEST_LOSS:
+        return None
+    by_tone = match.slip_direction, match.slip_deg, sigma_deg
+    return match_from((match.source, match.target), S, sums, 0, (), sides, common, by_tone)
+
+
+def match_from(
+    pair: tuple[int, int],
+    S_target_source: Similarity,
+    found: Agreement,
+    k: int,
+    rivals: tuple[Rival, ...],
+    sides: Sides,
+    common: Tolerance,
+    by_tone: tuple[Float64[ndarray, "7"], float, float] | None = None,
+) -> PairMatch:
+    """The edge for similarity k of `found`, with the uncertainty that follows from the sums and from slipping.
+
+    `by_tone`: the motion along which surfaces slip, by how many degrees, and the sigma in degrees that tones leave.
+    """
+    target = sides[1].map
+    D = np.array([target.radius] * 3 + [1] * 4)
+    H = found.H[k] * D[:, None] * D / target.radius**2
+    # No pair is assumed to fit better than the surfaces are known: errors of the relative pose bend them.
+    typical = float(np.median(target.sigma[target.valid])) / target.radius
+    rms = max(float(np.sqrt(found.squares[k])), 1.0) * typical
+    count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
+    information = H * (INDEPENDENT_POINTS / count / rms**2) + LEAST_INFORMATION * np.eye(7)
+    # Errors of the two relative poses move and bend a surface as a whole: more points do not average them.
+    bending = np.array([SHIFT_SIGMAS] * 3 + [TURN_SIGMAS] * 4) * rms
+    covariance = np.linalg.inv(information) + np.diag(bending**2)
+    if by_tone is None:
+        direction = weakest_rotation(information)
+        shape_slip = slip = free = slip_deg(sides, S_target_source, direction, common)
+    else:
+        (direction, shape_slip, free), slip = by_tone, 0.0
+    covariance = covariance + np.radians(free) ** 2 * np.outer(direction, direction)
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])
+    agreeing, fitness = float(found.agreeing[k]), float(found.fitness[k])
+    return PairMatch(
+        *pair, S_target_source, np.linalg.inv(covariance), agreeing, fitness, rms, rivals, float(np.degrees(sigma)),
+        slip, direction, shape_slip,
+    )  # fmt: skip
+
+
+# Similarities to start from.
 
 
 def rotations(search: Search) -> Float64[ndarray, "k 3 3"]:
@@ -125,13 +408,12 @@ def rotations(search: Search) -> Float64[ndarray, "k 3 3"]:
 
 def around_guess(target: SurfaceMap, search: Search, guess: Similarity) -> Hypotheses:
     """A guess, rotated about what may be the object."""
-    return Hypotheses.joined([_rotated(rotations(search), view.centre, guess) for view in target.views])
-
-
-def _rotated(turn: Float64[ndarray, "k 3 3"], pivot: Float64[ndarray, "3"], guess: Similarity) -> Hypotheses:
-    t = pivot + np.einsum("kij,j->ki", turn, guess.t - pivot)
+    turn, parts = rotations(search), []
     scale = np.full(len(turn), guess.scale)
-    return Hypotheses(scale, turn @ guess.R, t, np.log(scale))
+    for view in target.views:
+        t = view.centre + np.einsum("kij,j->ki", turn, guess.t - view.centre)
+        parts.append(Hypotheses(scale, turn @ guess.R, t, np.log(scale)))
+    return Hypotheses.joined(parts)
 
 
 def without_guess(source: SurfaceMap, target: SurfaceMap, search: Search) -> Hypotheses:
@@ -147,11 +429,8 @@ def without_guess(source: SurfaceMap, target: SurfaceMap, search: Search) -> Hyp
     return Hypotheses.joined(parts)
 
 
-# How far one frame may slip along the surface of another without anything telling.
-#
-# A table, or a vase without texture, looks the same after some motions. The normal equations do not show it: noise
-# of the
-# normals makes information where there is none. So the motion that they know least is tried.
+# Slip: a table, or a vase without texture, looks the same after some motions. The normal equations do not show it,
+# because noise of the normals makes information where there is none. So the motion that they know least is tried.
 
 
 def weakest_rotation(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "7"]:
@@ -173,7 +452,7 @@ def motion_cost(sides: Sides, still: Similarity, moved: Similarity, kernel: Tole
     sum of the costs before and after, and how many points the other frame can judge before and after, in shares of all.
     """
     source, target = sides
-    both = Hypotheses.joined([Hypotheses.of(still), Hypotheses.of(moved)])
+    both = Hypotheses.of(still, moved)
     some = _moved_points(source, still, moved), _moved_points(target, still.inverse(), moved.inverse())
     share = (len(some[0].points) / len(source.points) + len(some[1].points) / len(target.points)) / 2
     out = np.empty((2, 4))
@@ -217,12 +496,8 @@ def slip_deg(sides: Sides, S_target_source: Similarity, direction: Float64[ndarr
     angles = np.array([0.0, *SLIP_ANGLES_DEG])
     rise = np.full(len(angles) - 1, np.inf)
     for sense in (1.0, -1.0):
-        moved = Hypotheses.joined(
-            [
-                Hypotheses.of(screw_motion(sense * angle * direction, surface) @ S_target_source)
-                for angle in np.radians(angles)
-            ]
-        )
+        motions = [screw_motion(sense * angle * direction, surface) for angle in np.radians(angles)]
+        moved = Hypotheses.of(*(motion @ S_target_source for motion in motions))
         for _ in range(SLIP_STEPS):
             moved = followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas))
         still, *others = (moved.similarity(k) for k in range(len(angles)))
@@ -260,32 +535,17 @@ def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
     return Similarity(scale, M[:3, :3] / scale, M[:3, 3])
 
 
-# Two frames turned against each other to where their tones agree, along a motion that their surfaces do not notice.
-#
-# A vase, a bottle or a ball looks the same from all around, but for its texture. So the whole way around is tried,
-# and
-# the place where the tones of both frames are most alike is taken if it is clearly better than all others.
-
-
-@dataclass(frozen=True)
-class ToneTurn:
-    """Where the tones agree."""
-
-    S_target_source: Similarity
-    direction: Float64[ndarray, "7"]  # the motion (v, w, l) along which the frames slip, |w| = 1
-    shape_slip_deg: float  # how far the surfaces alone let them
-    sigma_deg: float  # of the rotation along it, by tones
+# Tone: a vase, a bottle or a ball looks the same from all around, but for its texture. So the whole way around is
+# tried, and the place where the tones of both frames are most alike is taken if it is clearly better than all others.
 
 
 def turn_by_tone(
-    sides: Sides, S_target_source: Similarity, slip: tuple[Float64[ndarray, "7"], float], common: Tolerance
-) -> ToneTurn | None:
-    """The similarity along a motion at which tones agree; None where none stands out.
+    sides: Sides, S_target_source: Similarity, direction: Float64[ndarray, "7"], common: Tolerance
+) -> tuple[Similarity, float] | None:
+    """The similarity along a motion (v, w, l) at which tones agree, and the sigma of its rotation in degrees.
 
-    `slip` is the motion (v, w, l), and how far, in degrees, the surfaces do not notice it; `common` is how closely they
-    agree.
+    None where no place stands out. `common` is how closely the surfaces agree.
     """
-    direction, shape_slip_deg = slip
     if not all(np.isfinite(side.map.tone).any() for side in sides):
         return None
     way = _around(sides, S_target_source, direction, common)
@@ -298,7 +558,7 @@ def turn_by_tone(
     turned = Hypotheses.of(screw_motion(rest, sides[1].map) @ way.similarity(peak.index))
     for _ in range(SLIP_STEPS):
         turned = followed(sides, turned, direction[3:6], common)
-    return ToneTurn(turned.similarity(0), direction, shape_slip_deg, max(peak.sigma_deg, TONE_LEAST_SIGMA_DEG))
+    return turned.similarity(0), max(peak.sigma_deg, TONE_LEAST_SIGMA_DEG)
 
 
 def likeness(sides: Sides, ways: Hypotheses, common: Tolerance) -> Float64[ndarray, "k"]:
@@ -420,295 +680,3 @@ def _sums(
             out[k, 3] += p * p
             out[k, 4] += q * q
             out[k, 5] += p * q
-
-
-# The result of registering one frame to another: an edge of the pose graph.
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A clearly different similarity between the same two frames."""
-
-    S_target_source: Similarity
-    ratio: float  # its score over that of the best one: 1 is as good
-
-
-@dataclass(frozen=True)
-class PairMatch:
-    """One frame on another. Similarities map camera axes to camera axes, each in units of its own baseline."""
-
-    source: int
-    target: int
-    S_target_source: Similarity
-    information: Float64[ndarray, "7 7"]  # of (v, w, l), see surface_agreement; lengths in radii of the target
-    overlap: float  # fraction of all points that lie on the other frame's surface
-    fitness: float  # the same among the points that could be judged
-    rms: float  # distance of agreeing points from the surface, in radii
-    rivals: tuple[Rival, ...]  # the best first
-    rotation_sigma_deg: float  # standard deviation of the least known rotation
-    slip_deg: float  # rotation that nothing tells from none: above zero on planes and surfaces of revolution
-    slip_direction: Float64[ndarray, "7"]  # the motion (v, w, l) in the target's axes, about its centroid, |w| = 1
-    shape_slip_deg: float = 0.0  # the rotation that surfaces alone do not tell: larger than `slip_deg` where tones do
-
-    @property
-    def second_best_ratio(self) -> float:
-        """Score of the best rival over that of this similarity: 1 is ambiguous."""
-        return self.rivals[0].ratio if self.rivals else 0.0
-
-    @property
-    def holds(self) -> bool:
-        """Whether the pair holds its frames in place, to within a slip that other pairs end."""
-        return self.slip_deg <= BOUNDED_SLIP_DEG
-
-    @property
-    def by_tone(self) -> bool:
-        """Whether tones hold the frames where surfaces alone would let them slip."""
-        return self.shape_slip_deg > self.slip_deg
-
-    def without_tone(self) -> "PairMatch":
-        """The same pair as one that slips."""
-        d, slip = self.slip_direction, np.radians(self.shape_slip_deg)
-        covariance = np.linalg.inv(self.information) + slip**2 * np.outer(d, d)
-        sigma_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
-        return replace(
-            self, information=np.linalg.inv(covariance), rotation_sigma_deg=sigma_deg, slip_deg=self.shape_slip_deg
-        )
-
-    def between(self, source: int, target: int) -> Similarity:
-        """The similarity from `source` to `target`, whichever way it was found."""
-        forward = (self.source, self.target) == (source, target)
-        return self.S_target_source if forward else self.S_target_source.inverse()
-
-    def other(self, frame: int) -> int:
-        """The frame at the other end."""
-        return self.target if self.source == frame else self.source
-
-
-def match_from(
-    pair: tuple[int, int],
-    S_target_source: Similarity,
-    found: Agreement,
-    k: int,
-    rivals: tuple[Rival, ...],
-    sides: Sides,
-    common: Tolerance,
-    turn: ToneTurn | None = None,
-) -> PairMatch:
-    """The edge for similarity k of `found`, with the uncertainty that follows from the sums and from slipping.
-
-    `turn` is how tones hold two frames that slip.
-    """
-    target = sides[1].map
-    D = np.array([target.radius] * 3 + [1] * 4)
-    H = found.H[k] * D[:, None] * D / target.radius**2
-    # No pair is assumed to fit better than the surfaces are known: errors of the relative pose bend them.
-    typical = float(np.median(target.sigma[target.valid])) / target.radius
-    rms = max(float(np.sqrt(found.squares[k])), 1.0) * typical
-    count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
-    information = H * (INDEPENDENT_POINTS / count / rms**2) + LEAST_INFORMATION * np.eye(7)
-    # Errors of the two relative poses move and bend a surface as a whole: more points do not average them.
-    bending = np.array([SHIFT_SIGMAS] * 3 + [TURN_SIGMAS] * 4) * rms
-    covariance = np.linalg.inv(information) + np.diag(bending**2)
-    direction = weakest_rotation(information) if turn is None else turn.direction
-    slip = slip_deg(sides, S_target_source, direction, common) if turn is None else turn.shape_slip_deg
-    free = np.radians(slip if turn is None else turn.sigma_deg)
-    covariance = covariance + free**2 * np.outer(direction, direction)
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])
-    return PairMatch(
-        *pair,
-        S_target_source,
-        np.linalg.inv(covariance),
-        float(found.agreeing[k]),
-        float(found.fitness[k]),
-        rms,
-        rivals,
-        float(np.degrees(sigma)),
-        slip if turn is None else 0.0,
-        direction,
-        slip,
-    )
-
-
-# Which registered pairs become edges of the pose graph, and how much each counts.
-
-
-def is_accepted(match: PairMatch) -> bool:
-    """Whether a pair overlaps and agrees well enough to be an edge."""
-    return match.fitness > LEAST_FITNESS and match.overlap > LEAST_OVERLAP
-
-
-def support(match: PairMatch) -> float:
-    """Between 0 and 1: how much two surfaces agree, and how little contradicts."""
-    return support_of(match.overlap, match.fitness)
-
-
-def support_of(overlap: float, fitness: float) -> float:
-    """The same from the share of points that agree, and the share of those that could be judged."""
-    return overlap * fitness**2
-
-
-def quality(match: PairMatch) -> float:
-    """Between 0 and 1: which of two results for a pair is better, and which pair of a frame."""
-    clear = match.second_best_ratio < AMBIGUOUS_RATIO
-    return support(match) * (1.0 if clear else AMBIGUOUS_WEIGHT)
-
-
-def is_ambiguous(match: PairMatch) -> bool:
-    """Whether a clearly different similarity fits nearly as well."""
-    return match.second_best_ratio > AMBIGUOUS_RATIO
-
-
-def edge_weights(edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
-    """Weight of each pair: smaller where its surfaces agree less than those of the scan's good pairs do.
-
-    On smooth surfaces frames slide: neighbours that are wrong in the same way close cycles with each other and
-    outnumber the right pairs. But they fit a little worse.
-    """
-    fitness = np.array([e.fitness for e in edges])
-    if not len(fitness):
-        return fitness
-    deficit = np.maximum(np.quantile(fitness, GOOD_QUANTILE) - fitness, 0) / FITNESS_SCALE
-    factor = np.array([AMBIGUOUS_WEIGHT if is_ambiguous(e) else 1.0 for e in edges])
-    return np.maximum(np.exp(-(deficit**2)) * factor, LEAST_WEIGHT)
-
-
-def register_pair(
-    maps: tuple[SurfaceMap, SurfaceMap],
-    pair: tuple[int, int],
-    search: Search,
-    rng: np.random.Generator,
-    guess: Similarity | None = None,
-) -> PairMatch | None:
-    """Frame `pair[0]` onto frame `pair[1]`; None where no similarity makes anything agree.
-
-    With a guess the search rotates it about the object; without one it starts from both cameras looking at the object
-    from the same side.
-    """
-    source, target = maps
-    if not (source.valid.any() and target.valid.any()):
-        return None
-
-    def sides(count: int) -> Sides:
-        return Side.sampled(source, count, rng), Side.sampled(target, count, rng)
-
-    found = without_guess(source, target, search) if guess is None else around_guess(target, search, guess)
-    few = sides(SEARCH_POINTS)
-    best = _ranked(few, found, SEARCH_TOLERANCE)
-    found = found[best[:COARSE_STARTS]]
-    coarse = sides(COARSE_POINTS)
-    for width in COARSE_WIDTHS:
-        found = _improved(coarse, found, Tolerance(width, KERNEL_SIGMAS))
-    best = _ranked(coarse, found, COARSE_TOLERANCE)
-    found = found[_distinct(found, best, FINE_STARTS, target)]
-    fine = sides(FINE_POINTS)
-    for width in FINE_WIDTHS:
-        found = _improved(fine, found, Tolerance(width, KERNEL_SIGMAS))
-    common = Tolerance(0.0, _common_width(fine, found))
-    for _ in range(COMMON_STEPS):
-        found = _improved(fine, found, common)
-    return _best_match(fine, found, common, pair)
-
-
-def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator) -> float:
-    """How well the best of all starts agrees, before any refinement: which pairs are worth registering."""
-    source, target = maps
-    if not (source.valid.any() and target.valid.any()):
-        return -1.0
-    sides = tuple(Side.sampled(m, LIKENESS_POINTS, rng) for m in maps)
-    found = without_guess(source, target, search)
-    tolerance = Tolerance(SEARCH_TOLERANCE, AGREEING_SIGMAS)
-    return float(agreement(sides[0], sides[1], found, tolerance).score().max())
-
-
-def _ranked(sides: Sides, found: Hypotheses, radii: float) -> list[int]:
-    """Their indices, the highest score first; points within some radii agree."""
-    tolerance = Tolerance(radii, AGREEING_SIGMAS)
-    score = agreement(*sides, found, tolerance).score()
-    return np.argsort(-score, kind="stable").tolist()
-
-
-def _distinct(found: Hypotheses, ranked: list[int], count: int, target: SurfaceMap) -> list[int]:
-    """The first `count` of the ranked ones, without those that are close to a better one."""
-    kept: list[int] = []
-    for k in ranked:
-        if len(kept) == count:
-            break
-        if all(_differ(found, k, j, target) for j in kept):
-            kept.append(k)
-    return kept
-
-
-def _differ(found: Hypotheses, a: int, b: int, target: SurfaceMap) -> bool:
-    angle_deg, shift = found.difference(a, b, target.centroid)
-    return angle_deg > SAME_ROTATION_DEG or shift / target.radius > SAME_SHIFT
-
-
-def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
-    """After one damped Gauss-Newton step of each."""
-    sums = agreement(*sides, found, kernel)
-    target = sides[1].map
-    radius, c, log_scale = target.radius, target.centroid, np.log(found.scale)
-    D = np.array([1, 1, 1, radius, radius, radius, radius])  # rotations and scalings as lengths at one radius
-    H, g = sums.H / D[:, None] / D, sums.g / D
-    trace = np.trace(H, axis1=1, axis2=2)[:, None, None].clip(1e-12)
-    H = H + DAMPING * trace * np.eye(7)
-    # Prior of the scale: a departure by its sigma costs as much as all independent points being off by the width.
-    width = max(kernel.radii, kernel.sigmas * float(np.median(sides[1].sigma)) / radius)
-    prior = trace[:, 0, 0] / 3 / INDEPENDENT_POINTS * width**2 / SCALE_SIGMA**2
-    H[:, 6, 6] += prior
-    g[:, 6] += prior * (log_scale - found.log_scale_prior) * radius
-    step = -np.linalg.solve(H, g[..., None])[..., 0] / D
-    size = np.linalg.norm(step * D, axis=1, keepdims=True)
-    step = step / np.maximum(size / (LARGEST_STEP * radius), 1)
-    bound = LARGEST_LOG_SCALE
-    bounded = found.log_scale_prior + np.clip(log_scale + step[:, 6] - found.log_scale_prior, -bound, bound)
-    return found.incremented(step[:, :3], step[:, 3:6], np.exp(bounded) / found.scale, c)
-
-
-def _common_width(sides: Sides, found: Hypotheses) -> float:
-    """Standard deviations within which surfaces agree if they are the same: from the result that agrees most closely.
-
-    How uncertain the surfaces are says how far they may be apart, not how far they are: most of it is common to all
-    points, and a similarity takes it up. What remains shows a relief that would otherwise be lost in it.
-    """
-    tolerance = Tolerance(0.0, AGREEING_SIGMAS)
-    sums = agreement(*sides, found, tolerance)
-    likely = sums.agreeing >= LIKELY * sums.agreeing.max()
-    rms = float(np.sqrt(sums.squares[likely].min())) if likely.any() else 0.0
-    return float(np.clip(COMMON_RMS * rms, LEAST_WIDTH, AGREEING_SIGMAS))
-
-
-def _best_match(sides: Sides, found: Hypotheses, common: Tolerance, pair: tuple[int, int]) -> PairMatch | None:
-    """The result that explains most at the common width, with the others and how far they fall short."""
-    score = agreement(*sides, found, common).score(PENALTY)
-    tolerance = Tolerance(0.0, AGREEING_SIGMAS)
-    sums = agreement(*sides, found, tolerance)
-    best, *others = np.argsort(-score, kind="stable").tolist()
-    if sums.agreeing[best] <= 0:
-        return None
-    target = sides[1].map
-    different: list[int] = []
-    for k in others:
-        if score[k] > 0 and all(_differ(found, k, j, target) for j in [best, *different]):
-            different.append(k)
-    rivals = tuple(Rival(found.similarity(k), float(score[k] / max(score[best], 1e-9))) for k in different)
-    match = match_from(pair, found.similarity(best), sums, best, rivals, sides, common)
-    return _held_by_tone(match, sides, common) or match
-
-
-def _held_by_tone(match: PairMatch, sides: Sides, common: Tolerance) -> PairMatch | None:
-    """A pair that slips, turned to where its tones agree; None if it does not slip, or where that is not certain.
-
-    Other results for the pair are passed over: tones were compared all the way around.
-    """
-    if match.slip_deg == 0:
-        return None
-    turn = turn_by_tone(sides, match.S_target_source, (match.slip_direction, match.slip_deg), common)
-    if turn is None:
-        return None
-    tolerance = Tolerance(0.0, AGREEING_SIGMAS)
-    S = turn.S_target_source
-    sums = agreement(*sides, Hypotheses.of(S), tolerance)
-    if sums.fitness[0] < match.fitness - TONE_LARGEST_LOSS:
-        return None
-    return match_from((match.source, match.target), S, sums, 0, (), sides, common, turn)

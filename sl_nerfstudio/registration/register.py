@@ -16,14 +16,12 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
-from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, PENALTY, Tolerance, agreement_at
+from sl_nerfstudio.registration.agreement import AGREES, PENALTY, agreement_at
 from sl_nerfstudio.registration.assembly import (
     INNER_MISFIT_FACTOR,
     Assembly,
     Component,
-    Nodes,
     PoseGraphSolution,
-    node_at,
     see_same_side,
 )
 from sl_nerfstudio.registration.pairs import (
@@ -34,6 +32,7 @@ from sl_nerfstudio.registration.pairs import (
     NEIGHBOURS,
     SAME_ROTATION_DEG,
     PairMatch,
+    Search,
     is_accepted,
     is_ambiguous,
     quality,
@@ -75,6 +74,82 @@ UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservabl
 REACH = 2  # frames before and after one with which each pose of its projector is compared
 RIVAL = 0.8  # support of another pose, relative to the best, from which the choice is not certain
 
+
+@one_library_thread()
+def register(
+    clouds: Sequence[FrameCloud],
+    sequence: bool = True,
+    seed: int = 0,
+    start: Float64[ndarray, "n 4 4"] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Registration:
+    """Camera poses of all frames in one world; alternatives of the clouds are not considered.
+
+    Args:
+        clouds: the frames, in the order of capture if `sequence`.
+        sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
+        seed: of the choice of points.
+        start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
+        progress: called with a few words at the beginning of each stage.
+    """
+    report = progress or (lambda _: None)
+    n = len(clouds)
+    maps = tracked([partial(build_surface_map, c) for c in clouds], "averaging surfaces")
+    rough = {} if start is None else starting_similarities(start, maps)
+    centred = with_common_centre(rough, maps)
+    graph = ViewGraph(maps, centred, np.random.default_rng(seed))
+    report("registering pairs")
+    if start is not None:
+        graph.try_overlapping(rough)
+        graph.try_overlapping(centred)
+    ordered = sequence
+    if start is None and sequence:
+        for gap in SEQUENCE_GAPS:
+            graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
+        ordered = _in_order(graph.assemble(), n)
+    if start is None and not ordered:
+        report("comparing all frames")
+        graph = ViewGraph(maps, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
+        graph.try_all()
+    for _ in range(ROUNDS):
+        report("closing loops")
+        components = graph.assemble()
+        for component in (c for c in components if len(c) > 1):
+            graph.try_overlapping(graph.solve(component).S_world_camera)
+        graph.bridge(components)
+    turn_blocks_back(graph)
+    names = tuple(c.name for c in clouds)
+    found = accept_frames(names, graph, ordered)
+    most_are_lost = found.registered.sum() <= n / 2
+    if start is None and sequence and (found.turns_deg or most_are_lost):
+        return _by_order(names, graph) or found
+    return found
+
+
+def _by_order(names: tuple[str, ...], graph: ViewGraph) -> Registration | None:
+    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
+
+    `graph` is without it: frames are at other sides than they show, or most could not be placed.
+    """
+    step_deg = typical_step_deg(graph.matches)
+    if step_deg is None or not sides_are_open(graph.said):
+        return None
+    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng)
+    near = ViewGraph(graph.maps, {}, graph.rng)
+    near.try_overlapping(chain, DIFFERENT_SIDES_DEG)
+    for _ in range(ROUNDS):
+        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, DIFFERENT_SIDES_DEG)
+    placed = accept_frames(names, near, True, graph.said)
+    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
+
+
+def _in_order(components: Sequence[Component], n: int) -> bool:
+    """Whether successive frames mostly are in the same component."""
+    number = {k: c for c, frames in enumerate(components) for k in frames}
+    joined = sum(number[k] == number[k + 1] for k in range(n - 1))
+    return joined >= LEAST_JOINED * (n - 1)
+
+
 # Which frames are registered in the end, why the others are not, and what is uncertain.
 
 
@@ -91,16 +166,18 @@ def accept_frames(
     component = _numbers(components, len(names))
     solution = graph.solve(components[0])
     connected = component == 0
-    rngs = graph.rng.spawn(len(names))
-    fitness = np.array(
-        results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
-    )
+    tasks = [
+        partial(_fitness_of, k, solution, connected, graph, own) for k, own in enumerate(graph.rng.spawn(len(names)))
+    ]
+    fitness = np.array(results(tasks))
     agrees = connected & (fitness >= LEAST_FRAME_FITNESS)
     doubts = _doubtful(names, agrees, edges, solution.consistent)
     few = len(doubts) <= MOST_DOUBTFUL * agrees.sum()
     registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
+    index: list[int] = np.flatnonzero(registered).tolist()
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
+    sigma = {k: _least_sigma_deg([e for e in consistent if k in (e.source, e.target)]) for k in index}
     return Registration(
         names,
         poses,
@@ -123,7 +200,7 @@ def accept_frames(
             else _exclusion(k, names, components, main, graph)
             for k in np.flatnonzero(~registered).tolist()
         ),
-        tuple(_uncertainties(names, consistent, registered, graph)),
+        tuple(UncertainRotation(names[k], sigma[k]) for k in index if sigma[k] > LARGEST_SIGMA_ROTATION_DEG),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
         symmetric_turns_deg(graph.sides, edges, solution, [*others, *graph.put_aside]),
         ordered,
@@ -164,23 +241,20 @@ def _fitness_of(
     k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
 ) -> float:
     """Of a frame's points that other frames can judge, the share that agrees."""
-    S = solution.S_world_camera[k]
-    if S is None or not connected[k]:
+    if not connected[k]:
         return 0.0
-    agreeing = expected = 0.0
-    for j in np.flatnonzero(connected).tolist():
-        other = solution.S_world_camera[j]
-        if j == k or other is None or not see_same_side(S, other):
+    S, agreeing, expected = solution.S_world_camera[k], 0.0, 0.0
+    for j, other in solution.S_world_camera.items():
+        if j == k or not see_same_side(S, other):
             continue
-        maps = graph.maps[k], graph.maps[j]
-        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, AGREEING_SIGMAS))
+        found = agreement_at((graph.maps[k], graph.maps[j]), other.inverse() @ S, rng, AGREES)
         agreeing += found.agreeing[0]
         expected += found.expected[0]
     return agreeing / expected if expected else 0.0
 
 
 def _in_first_camera(
-    nodes: Nodes, registered: Bool[ndarray, "n"]
+    nodes: Component, registered: Bool[ndarray, "n"]
 ) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n"]]:
     """Camera poses and baselines in the axes of the first registered camera, geometric mean of the baselines one."""
     n = len(registered)
@@ -188,7 +262,7 @@ def _in_first_camera(
     frames: list[int] = np.flatnonzero(registered).tolist()
     if not frames:
         return poses, baseline
-    world = [node_at(nodes, k) for k in frames]
+    world = [nodes[k] for k in frames]
     unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
     gauge = Similarity.scaling(1 / unit) @ Similarity(1.0, world[0].R, world[0].t).inverse()
     for k, S in zip(frames, (gauge @ S for S in world), strict=True):
@@ -222,27 +296,16 @@ def _exclusion(
     return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 
 
-def _uncertainties(
-    names: Sequence[str], consistent: Sequence[PairMatch], registered: Bool[ndarray, "n"], graph: ViewGraph
-) -> list[UncertainRotation]:
-    """Registered frames that no pair determines well."""
-    out: list[UncertainRotation] = []
-    frames: list[int] = np.flatnonzero(registered).tolist()
-    for k in frames:
-        mine = [e for e in consistent if k in (e.source, e.target)]
-        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
-        if mine and all(e.slip_deg > 0 for e in mine):
-            out.append(UncertainRotation(names[k], UNKNOWN_SIGMA_ROTATION_DEG))
-        elif sigma_deg > LARGEST_SIGMA_ROTATION_DEG:
-            out.append(UncertainRotation(names[k], sigma_deg))
-    return out
+def _least_sigma_deg(pairs: Sequence[PairMatch]) -> float:
+    """Standard deviation of a frame's least known rotation by its best pair; 0 without pairs."""
+    if pairs and all(e.slip_deg > 0 for e in pairs):
+        return UNKNOWN_SIGMA_ROTATION_DEG
+    return min((e.rotation_sigma_deg for e in pairs), default=0.0)
 
 
-# Frames that were left out are placed against the others once those are adjusted.
-#
-# Before the joint adjustment every surface is bent by the errors of its own relative pose, and only as certain as
-# that.
-# Afterwards a weak frame has to agree with surfaces that are known far better.
+# Frames that were left out are placed against the others once those are adjusted. Before the joint adjustment every
+# surface is bent by the errors of its own relative pose; afterwards a weak frame has to agree with surfaces that are
+# known far better.
 
 
 def with_relative_pose(
@@ -278,8 +341,7 @@ def include_left_out(
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
-    n = len(clouds)
-    graph = ViewGraph([build_surface_map(c) for c in clouds], [None] * n, np.random.default_rng(seed))
+    graph = ViewGraph([build_surface_map(c) for c in clouds], {}, np.random.default_rng(seed))
     main: Component = {
         k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
         for k, T in enumerate(adjusted.T_world_camera)
@@ -345,9 +407,8 @@ def with_edges_at_poses(registration: Registration, frames: Collection[str]) -> 
     return replace(registration, edges=tuple(edges))
 
 
-# Frames of which two poses of the projector explain the coordinates: which one, by what neighbouring frames saw.
-#
-# A wrong pose of the projector bends the surface of its frame, so it agrees less with those of other frames.
+# Frames of which two poses of the projector explain the coordinates: a wrong pose bends the surface of its frame, so it
+# agrees less with those of other frames.
 
 
 @dataclass(frozen=True)
@@ -365,141 +426,54 @@ def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[F
 
 @one_library_thread()
 def choose_projectors(clouds: Sequence[FrameCloud], sequence: bool = True, seed: int = 0) -> ProjectorChoice:
-    """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
-    open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
-    if not open_frames:
-        return ProjectorChoice((0,) * len(clouds), ())
-    search = _Choice(clouds, sequence, np.random.default_rng(seed))
+    """Choose the cloud of every frame that agrees best with those of its neighbours; falls back to the first."""
+    choices = [(c, *c.alternatives) for c in clouds]
     chosen, undecided = [0] * len(clouds), []
+    open_frames = [k for k, every in enumerate(choices) if len(every) > 1]
+    built = iter(results([partial(build_surface_map, c) for every in choices for c in every]) if open_frames else [])
+    maps = [[next(built) for _ in every] for every in choices] if open_frames else []
+    rng = np.random.default_rng(seed)
     for k in track(open_frames, "comparing poses of projectors"):
-        support = search.support(k)
-        best = int(np.argmax(support))
-        chosen[k] = best
-        rivals = [h for h in range(len(support)) if h != best and support[h] >= RIVAL * support[best]]
+        scores = _support_of_choices(k, maps, sequence, rng)
+        best = chosen[k] = int(np.argmax(scores))
+        rivals = [h for h, score in enumerate(scores) if h != best and score >= RIVAL * scores[best]]
         if rivals:
-            angle = max(_angle_deg(search.choices[k][best], search.choices[k][h]) for h in rivals)
-            undecided.append(UndecidedProjector(clouds[k].name, angle))
+            R = [c.pose.T_camera_projector[:3, :3] for c in choices[k]]
+            undecided.append(UndecidedProjector(clouds[k].name, max(angle_deg(R[best] @ R[h].T) for h in rivals)))
     return ProjectorChoice(tuple(chosen), tuple(undecided))
 
 
-class _Choice:
-    """All clouds of all frames, and how well pairs of them agree."""
-
-    def __init__(self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator) -> None:
-        self.choices = [(c, *c.alternatives) for c in clouds]
-        maps = iter(results([partial(build_surface_map, c) for all_ in self.choices for c in all_]))
-        self._maps = [[next(maps) for _ in choice] for choice in self.choices]
-        self._sequence, self._rng = sequence, rng
-
-    def support(self, k: int) -> list[float]:
-        """For every cloud of a frame the sum of what agrees with its neighbours, less what contradicts."""
-        partners = self._partners(k)
-        pairs = [(m, j) for m in self._maps[k] for j in partners]
-        tasks = [
-            partial(self._agreement, *pair, rng) for pair, rng in zip(pairs, self._rng.spawn(len(pairs)), strict=True)
-        ]
-        return np.reshape(results(tasks), (len(self._maps[k]), -1)).sum(1).tolist()
-
-    def _partners(self, k: int) -> list[int]:
-        """Frames taken shortly before and after; of an unordered set those that look most alike."""
-        n = len(self.choices)
-        if self._sequence:
-            return [j for j in range(max(0, k - REACH), min(n, k + REACH + 1)) if j != k]
-        others = [j for j in range(n) if j != k]
-        tasks = [
-            partial(search_score, (self._maps[k][0], self._maps[j][0]), ANYWHERE, rng)
-            for j, rng in zip(others, self._rng.spawn(len(others)), strict=True)
-        ]
-        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * REACH]]
-
-    def _agreement(self, own: SurfaceMap, partner: int, rng: np.random.Generator) -> float:
-        search = NEIGHBOURS if self._sequence else ANYWHERE
-        best = 0.0
-        for other in self._maps[partner]:
-            match = register_pair((own, other), (0, 1), search, rng)
-            if match is not None and is_accepted(match):
-                contradicting = match.overlap * (1 / match.fitness - 1)
-                best = max(best, match.overlap - PENALTY * contradicting)
-        return best
+def _support_of_choices(
+    k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator
+) -> list[float]:
+    """Sum up, for every cloud of a frame, what agrees with its neighbours, less what contradicts."""
+    partners = _partners(k, maps, sequence, rng)
+    pairs = [(own, maps[j]) for own in maps[k] for j in partners]
+    search = NEIGHBOURS if sequence else ANYWHERE
+    tasks = [
+        partial(_best_agreement, *pair, search, own) for pair, own in zip(pairs, rng.spawn(len(pairs)), strict=True)
+    ]
+    return np.reshape(results(tasks), (len(maps[k]), -1)).sum(1).tolist()
 
 
-def _angle_deg(a: FrameCloud, b: FrameCloud) -> float:
-    R = a.pose.T_camera_projector[:3, :3] @ b.pose.T_camera_projector[:3, :3].T
-    return angle_deg(R)
+def _partners(k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator) -> list[int]:
+    """Frames taken shortly before and after; of an unordered set those that look most alike."""
+    n = len(maps)
+    if sequence:
+        return [j for j in range(max(0, k - REACH), min(n, k + REACH + 1)) if j != k]
+    others = [j for j in range(n) if j != k]
+    tasks = [
+        partial(search_score, (maps[k][0], maps[j][0]), ANYWHERE, own)
+        for j, own in zip(others, rng.spawn(len(others)), strict=True)
+    ]
+    return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * REACH]]
 
 
-@one_library_thread()
-def register(
-    clouds: Sequence[FrameCloud],
-    sequence: bool = True,
-    seed: int = 0,
-    start: Float64[ndarray, "n 4 4"] | None = None,
-    progress: Callable[[str], None] | None = None,
-) -> Registration:
-    """Camera poses of all frames in one world; alternatives of the clouds are not considered.
-
-    Args:
-        clouds: the frames, in the order of capture if `sequence`.
-        sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
-        seed: of the choice of points.
-        start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
-        progress: called with a few words at the beginning of each stage.
-    """
-    report = progress or (lambda _: None)
-    n = len(clouds)
-    maps = tracked([partial(build_surface_map, c) for c in clouds], "averaging surfaces")
-    rough: list[Similarity | None] = [None] * n
-    if start is not None:
-        rough = starting_similarities(start, maps)
-    centred = with_common_centre(rough, maps)
-    graph = ViewGraph(maps, centred, np.random.default_rng(seed))
-    report("registering pairs")
-    if start is not None:
-        graph.try_overlapping(rough)
-        graph.try_overlapping(centred)
-    ordered = sequence
-    if start is None and sequence:
-        for gap in SEQUENCE_GAPS:
-            graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
-        ordered = _in_order(graph.assemble(), n)
-    if start is None and not ordered:
-        report("comparing all frames")
-        graph = ViewGraph(maps, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
-        graph.try_all()
-    for _ in range(ROUNDS):
-        report("closing loops")
-        components = graph.assemble()
-        for component in (c for c in components if len(c) > 1):
-            graph.try_overlapping(graph.solve(component).S_world_camera)
-        graph.bridge(components)
-    turn_blocks_back(graph)
-    names = tuple(c.name for c in clouds)
-    found = accept_frames(names, graph, ordered)
-    most_are_lost = found.registered.sum() <= n / 2
-    if start is None and sequence and (found.turns_deg or most_are_lost):
-        return _by_order(names, graph) or found
-    return found
-
-
-def _by_order(names: tuple[str, ...], graph: ViewGraph) -> Registration | None:
-    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
-
-    `graph` is without it: frames are at other sides than they show, or most could not be placed.
-    """
-    step_deg = typical_step_deg(graph.matches)
-    if step_deg is None or not sides_are_open(graph.said):
-        return None
-    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng)
-    near = ViewGraph(graph.maps, [None] * len(names), graph.rng)
-    near.try_overlapping(chain, DIFFERENT_SIDES_DEG)
-    for _ in range(ROUNDS):
-        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, DIFFERENT_SIDES_DEG)
-    placed = accept_frames(names, near, True, graph.said)
-    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
-
-
-def _in_order(components: Sequence[Component], n: int) -> bool:
-    """Whether successive frames mostly are in the same component."""
-    number = {k: c for c, frames in enumerate(components) for k in frames}
-    joined = sum(number[k] == number[k + 1] for k in range(n - 1))
-    return joined >= LEAST_JOINED * (n - 1)
+def _best_agreement(own: SurfaceMap, partner: Sequence[SurfaceMap], search: Search, rng: np.random.Generator) -> float:
+    best = 0.0
+    for other in partner:
+        match = register_pair((own, other), (0, 1), search, rng)
+        if match is not None and is_accepted(match):
+            contradicting = match.overlap * (1 / match.fitness - 1)
+            best = max(best, match.overlap - PENALTY * contradicting)
+    return best

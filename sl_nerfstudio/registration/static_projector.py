@@ -80,11 +80,6 @@ class PatternCells:
     uv_projector: Float64[ndarray, "cells 2"]
     uv_camera: Float64[ndarray, "frames cells 2"]  # NaN where a camera does not see it
 
-    @property
-    def seen(self) -> Bool[ndarray, "frames cells"]:
-        """Which camera sees which square."""
-        return np.isfinite(self.uv_camera[..., 0])
-
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "cells"]) -> "PatternCells":
         """Some of the squares."""
         return PatternCells(self.uv_projector[index], self.uv_camera[:, index])
@@ -158,14 +153,9 @@ def _sums(cell: Int64[ndarray, "n"], values: Float64[ndarray, "n *k"], cells: in
 
 
 # Cameras placed by the codes alone: two views first, then one camera after the other against the known points.
-#
-# Normalised coordinates are OpenCV's here (y down, looking along +z); poses are those of the devices (looking along
-# -z).
+# Normalised coordinates are OpenCV's here (y down, looking along +z); poses are those of the devices (along -z).
 
-
-def rays_of(cells: PatternCells, cameras: Sequence[Device]) -> Float64[ndarray, "frames cells 3"]:
-    """Unit rays in each camera's axes; NaN where it does not see the square."""
-    return np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
+FLIP = np.diag([1.0, -1.0, -1.0])  # between the axes of OpenCV and those of the devices
 
 
 def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
@@ -176,13 +166,8 @@ def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
 def pose_from_opencv(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
     """T_world_device from OpenCV's R, t, which map points of the world to the device."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R.T @ _flip(), -R.T @ t
+    T[:3, :3], T[:3, 3] = R.T @ FLIP, -R.T @ t
     return T
-
-
-def _flip() -> Float64[ndarray, "3 3"]:
-    """Between the axes of OpenCV and those of the devices."""
-    return np.diag([1.0, -1.0, -1.0])
 
 
 def first_pair(
@@ -223,12 +208,12 @@ def _two_views(
         return None
     T = pose_from_opencv(R, t[:, 0])
     # the first camera's own axes are the world's: from OpenCV's to the device's
-    T[:3, :3], T[:3, 3] = _flip() @ T[:3, :3], _flip() @ T[:3, 3]
+    T[:3] = FLIP @ T[:3]
     return T, mask[:, 0] > 0
 
 
 def triangulated(
-    rays: Float64[ndarray, "frames cells 3"], T_world_camera: Float64[ndarray, "frames 4 4"], least_angle_deg: float
+    rays: Float64[ndarray, "frames cells 3"], T_world_camera: Float64[ndarray, "frames 4 4"]
 ) -> Float64[ndarray, "cells 3"]:
     """Points nearest to the rays of all placed cameras; NaN where their angle is too small, or they lie behind."""
     placed = np.isfinite(T_world_camera[:, 0, 0])
@@ -240,7 +225,7 @@ def triangulated(
     A, b = P.sum(0), np.einsum("fcij,fj->ci", P, o)
     # the smallest eigenvalue of the sum is the sum of squared sines of half the angles, to first order
     small = np.linalg.eigvalsh(A)[:, 0]
-    good = (seen.sum(0) > 1) & (small > 0.5 * np.sin(np.radians(least_angle_deg)) ** 2)
+    good = (seen.sum(0) > 1) & (small > 0.5 * np.sin(np.radians(LEAST_ANGLE_DEG)) ** 2)
     points = np.full((rays.shape[1], 3), np.nan)
     points[good] = np.linalg.solve(A[good], b[good][..., None])[..., 0]
     along = np.einsum("fci,fci->fc", d, points[None] - o[:, None])
@@ -294,7 +279,8 @@ def resect(
         if keep.sum() < FEWEST_POINTS:
             return None
         P = _linear(points[keep], uv[keep])
-        error = np.linalg.norm(_seen(P, points) - uv, axis=1)
+        x = points @ P[:, :3].T + P[:, 3]
+        error = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
         limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * float(np.median(error))
         again: Bool[ndarray, n] = error <= max(limit, 1e-9)
         if (again == keep).all():
@@ -325,11 +311,6 @@ def _normalising(points: Float64[ndarray, "n d"]) -> Float64[ndarray, "e e"]:
     return T
 
 
-def _seen(P: Float64[ndarray, "3 4"], points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
-    x = points @ P[:, :3].T + P[:, 3]
-    return x[:, :2] / x[:, 2:]
-
-
 def _device_of(
     P: Float64[ndarray, "3 4"], points: Float64[ndarray, "n 3"], projector: Device
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
@@ -356,7 +337,7 @@ def place_known(
     """Pose of a projector with known intrinsics; None where no pose fits most of the points."""
     d = directions(projector, uv)
     usable = np.isfinite(d[:, 0]) & (d[:, 2] < -1e-3)
-    if usable.sum() < 20:
+    if usable.sum() < FEWEST_POINTS:
         return None
     return posed(points[usable], d[usable], 6.0 / projector.fl_x, 0.3)
 
@@ -514,7 +495,7 @@ class _Adjustment:
         return BlockEquations(H, g, H_point, g_point, coupling)
 
     def _linearised(self, scene: StaticScene, width: float) -> Iterator[tuple[ndarray, ...]]:
-        """For each device: columns of its unknowns, points, residuals, derivatives, also weighted, and by the points."""
+        """For each device: columns of its unknowns, points, residuals, derivatives, these weighted, and by points."""
         s, last = self.sightings, len(scene.devices) - 1
         p, r, by_p = _in_devices(scene, s), residuals(scene, s), np.zeros((len(s.device), 2, 3))
         for intrinsics, rows in _intrinsics(scene, s):
@@ -616,7 +597,7 @@ def place_under_static_projector(
     `stated`: the projector is at least a start for them.
     """
     cells = find_cells(coords, projector)
-    rays = rays_of(cells, cameras)
+    rays = np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
     common = np.isfinite(rays[..., 0]).astype(np.float64)
     most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
     start = first_pair(rays, cameras)
@@ -626,8 +607,8 @@ def place_under_static_projector(
     T = np.full((len(cameras), 4, 4), np.nan)
     T[a], T[b] = np.eye(4), T_a_b
     T = _grown(T, rays, cells, cameras)
-    points = triangulated(rays, T, LEAST_ANGLE_DEG)
-    firm = _spread(np.isfinite(points[:, 0]), MOST_POINTS)
+    points = triangulated(rays, T)
+    firm = _spread(np.isfinite(points[:, 0]))
     found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
     if found is None:
         return NoPlacement("no projector", most)
@@ -664,7 +645,7 @@ def _grown(
         if placed.sum() >= 2 * adjusted_with or placed.all():
             T = _adjusted_cameras(T, rays, cells, cameras)
             adjusted_with = int(placed.sum())
-        points = triangulated(rays, T, LEAST_ANGLE_DEG)
+        points = triangulated(rays, T)
         seen = (np.isfinite(rays[..., 0]) & np.isfinite(points[:, 0])).sum(1)
         left = sorted((int(k) for k in np.flatnonzero(~placed) if k not in failed), key=lambda k: -seen[k])
         if not left:
@@ -685,8 +666,8 @@ def _adjusted_cameras(
 ) -> Float64[ndarray, "frames 4 4"]:
     """The placed cameras adjusted with the points that they see, without a projector."""
     placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    points = triangulated(rays, T, LEAST_ANGLE_DEG)
-    firm = _spread(np.isfinite(points[:, 0]), MOST_POINTS)
+    points = triangulated(rays, T)
+    firm = _spread(np.isfinite(points[:, 0]))
     scene = StaticScene(tuple(cameras[k] for k in placed), T[placed], points[firm])
     found = adjust_scene(scene, _sightings(cells.chosen(firm), placed, with_projector=False), ()).scene
     T = T.copy()
@@ -694,14 +675,14 @@ def _adjusted_cameras(
     return T
 
 
-def _spread(good: Bool[ndarray, "cells"], most: int) -> Int64[ndarray, "m"]:
-    """At most `most` of the good cells, evenly among them."""
+def _spread(good: Bool[ndarray, "cells"]) -> Int64[ndarray, "m"]:
+    """At most MOST_POINTS of the good cells, evenly among them."""
     index = np.flatnonzero(good)
-    return index if len(index) <= most else index[np.linspace(0, len(index) - 1, most).astype(np.int64)]
+    return index if len(index) <= MOST_POINTS else index[np.linspace(0, len(index) - 1, MOST_POINTS).astype(np.int64)]
 
 
 def _sightings(cells: PatternCells, placed: Int64[ndarray, "m"], *, with_projector: bool) -> CellSightings:
-    frame, cell = np.nonzero(cells.seen[placed])
+    frame, cell = np.nonzero(np.isfinite(cells.uv_camera[placed, :, 0]))
     uv = cells.uv_camera[placed][frame, cell]
     if with_projector:
         every = np.arange(len(cells.uv_projector))
@@ -714,11 +695,9 @@ def _projector(
     points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device, known: bool, stated: bool
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Intrinsics and pose to start from."""
-    if known or projector.model == "DOE":
-        T = place_known(points, uv, projector)
-        return None if T is None else (projector, T)
-    found = resect(points, uv, projector)
-    if found is None and stated:
+    fixed = known or projector.model == "DOE"
+    found = None if fixed else resect(points, uv, projector)
+    if found is None and (fixed or stated):
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
     return found
@@ -736,7 +715,7 @@ def _best_model(
     for model in models[1:]:
         larger = adjust_scene(_restarted(best.scene, scene, model), sightings, model)
         extra = [k for k in model if k not in models[0]]
-        away = np.abs(_further(larger.scene.devices[-1], extra) - _further(scene.devices[-1], extra))
+        away = np.abs(values_of(larger.scene.devices[-1]) - values_of(scene.devices[-1]))[extra]
         sigma = np.sqrt(np.diag(larger.covariance))[[model.index(k) for k in extra]]
         if (away < STANDARD_ERRORS * DEPENDENCE * sigma).any():
             continue  # what does not differ from its usual value by more than chance cannot help
@@ -753,11 +732,6 @@ def _restarted(found: StaticScene, start: StaticScene, free: tuple[int, ...]) ->
     values = values_of(start.devices[-1])
     values[list(free)] = values_of(found.devices[-1])[list(free)]
     return replace(found, devices=(*found.devices[:-1], device_with(start.devices[-1], values)))
-
-
-def _further(device: Device, names: Sequence[int]) -> Float64[ndarray, "m"]:
-    values = {LOG_ASPECT: np.log(device.fl_y / device.fl_x), K1: device.k1}
-    return np.array([values[k] for k in names])
 
 
 def _left_out(scene: StaticScene, sightings: CellSightings, free: tuple[int, ...]) -> Float64[ndarray, "points"]:

@@ -184,10 +184,8 @@ def reliable_points(cloud: FrameCloud) -> Bool[ndarray, "n"]:
     return sigma < LARGEST_SIGMA_RATIO * np.median(sigma)
 
 
-# How much darker or brighter a surface is than around it: prints, grain and dirt, which stay where they are on it.
-#
-# A vase may be turned about its axis without its shape telling. Its tone tells, because hardly any real surface is
-# equally bright everywhere.
+# How much darker or brighter a surface is than around it: prints, grain and dirt, which stay where they are on it. A
+# vase may be turned about its axis without its shape telling; its tone tells.
 
 
 def surface_tone(
@@ -275,11 +273,9 @@ def _against_surroundings(tone: Float64[ndarray, "h w"]) -> Float64[ndarray, "h 
     return out
 
 
-# Where a frame saw nothing of the pattern, although it would have fallen on a surface there.
-#
-# A camera that looks into empty space says as much of an object as one that sees its surface. Two faces of a box
-# agree
-# wherever one lies on the other; but where the larger one ends, the frame of the smaller one saw nothing.
+# Where a frame saw nothing of the pattern, although it would have fallen on a surface there: a camera that looks into
+# empty space says as much of an object as one that sees its surface. Two faces of a box agree wherever one lies on the
+# other; but where the larger one ends, the frame of the smaller one saw nothing.
 
 
 @dataclass(frozen=True)

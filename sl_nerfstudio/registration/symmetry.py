@@ -19,9 +19,7 @@ from sl_nerfstudio.registration.assembly import (
     MISFIT_FACTOR,
     SAME_SIDE_DEG,
     Component,
-    Nodes,
     PoseGraphSolution,
-    node_at,
 )
 from sl_nerfstudio.registration.pairs import (
     AMBIGUOUS_RATIO,
@@ -72,12 +70,9 @@ LEAST_IMPROVEMENT = 0.8  # share that contradicts among all frames after the tur
 MOST_TRIED = 2  # turned blocks of a component, those that contradict most
 MOST_TURNED = 4  # blocks one after the other
 
-# Objects that look the same after a turn, placed by the order of capture: surfaces do not tell their sides apart.
-#
-# Each frame of a sequence is turned little against the one before. So every pair of successive frames is searched
-# for
-# among small rotations only, and the chain of them says which side each frame shows. All other pairs then start
-# there.
+# The order of capture tells sides apart that surfaces do not: each frame of a sequence is turned little against the one
+# before. So every pair of successive frames is searched for among small rotations only, and the chain of them says
+# which side each frame shows. All other pairs then start there.
 
 
 def typical_step_deg(matches: Sequence[PairMatch]) -> float | None:
@@ -103,29 +98,27 @@ def _holds(match: PairMatch) -> bool:
     return is_accepted(match) and match.shape_slip_deg <= BOUNDED_SLIP_DEG
 
 
-def chain_of_small_steps(maps: Sequence[SurfaceMap], step_deg: float, rng: np.random.Generator) -> Nodes:
-    """`S_world_camera` of the longest run of successive frames that small steps connect; None for all others."""
+def chain_of_small_steps(maps: Sequence[SurfaceMap], step_deg: float, rng: np.random.Generator) -> Component:
+    """`S_world_camera` of the longest run of successive frames that small steps connect."""
     largest = LARGEST_STEP * step_deg
     search = Search(largest, SPACING * step_deg)
     tasks = [
         partial(register_pair, (maps[k], maps[k + 1]), (k, k + 1), search, own, None)
         for k, own in enumerate(rng.spawn(len(maps) - 1))
     ]
-    steps = [_small(match, largest) for match in tracked(tasks, "following the order of capture")]
-    return _longest_run(steps)
+    return _longest_run([_small(match, largest) for match in tracked(tasks, "following the order of capture")])
 
 
-def _longest_run(steps: Sequence[Similarity | None]) -> Nodes:
+def _longest_run(steps: Sequence[Similarity | None]) -> Component:
     """Frames one after the other from the first of them; `steps[k]` maps frame k to the next, None where unknown."""
-    nodes = [Similarity.identity()]
-    runs = [[0]]
+    nodes, runs = [Similarity.identity()], [[0]]
     for k, S_next_this in enumerate(steps, start=1):
         if S_next_this is None:
             runs.append([])
         nodes.append(Similarity.identity() if S_next_this is None else nodes[-1] @ S_next_this.inverse())
         runs[-1].append(k)
     longest = max(runs, key=len)
-    return [S if k in longest and len(longest) > 1 else None for k, S in enumerate(nodes)]
+    return {k: nodes[k] for k in longest} if len(longest) > 1 else {}
 
 
 def _small(match: PairMatch | None, largest_deg: float) -> Similarity | None:
@@ -145,38 +138,35 @@ def _small(match: PairMatch | None, largest_deg: float) -> Similarity | None:
 
 @dataclass(frozen=True)
 class Judged:
-    """Points of pairs of frames, in frames: 1 is all points of one. Row i is moved, column j stays.
-
-    Only frames that have a pose have a row.
-    """
+    """Points of pairs of frames that have poses, in frames: 1 is all points of one. Row i is moved, column j stays."""
 
     agreeing: Float64[ndarray, "n n"]
     contradicting: Float64[ndarray, "n n"]
 
     def across(self, block: Bool[ndarray, "n"]) -> tuple[float, float]:
-        """Those that agree and those that contradict, of the pairs of a frame of the block and another."""
+        """Points that agree and points that contradict, of the pairs of a frame of the block and another."""
         pairs = np.ix_(block, ~block)
         return float(self.agreeing[pairs].sum()), float(self.contradicting[pairs].sum())
 
     @property
     def total(self) -> float:
-        """All points that agree."""
+        """Sum of all points that agree."""
         return float(self.agreeing.sum())
 
     @property
     def share(self) -> float:
-        """Of all points that could be judged, those that contradict."""
+        """Share of the points that could be judged which contradict."""
         return share(self.total, float(self.contradicting.sum()))
 
 
 def share(agreeing: float, contradicting: float) -> float:
-    """Of points that contradict; 1 if there are none at all."""
+    """Share of points that contradict; 1 if there are none at all."""
     return contradicting / (agreeing + contradicting) if agreeing + contradicting else 1.0
 
 
-def judged(sides: Sequence[Side], nodes: Nodes, turn: Similarity, neighbours: int) -> Judged:
-    """Every frame that has a pose, moved, against `neighbours` others that then look most nearly its way."""
-    row = {k: n for n, k in enumerate(k for k, S in enumerate(nodes) if S is not None)}
+def judged(sides: Sequence[Side], nodes: Component, turn: Similarity, neighbours: int) -> Judged:
+    """Compare every frame, moved, with `neighbours` others that then look most nearly its way."""
+    row = {k: n for n, k in enumerate(nodes)}
     agreeing, contradicting = np.zeros((2, len(row), len(row)))
     for i, j, S in facing(nodes, turn, neighbours):
         found = agreement(sides[i], sides[j], Hypotheses.of(S), Tolerance(0.0, CROSS_SIGMAS))
@@ -185,48 +175,39 @@ def judged(sides: Sequence[Side], nodes: Nodes, turn: Similarity, neighbours: in
     return Judged(agreeing, contradicting)
 
 
-def facing(nodes: Nodes, turn: Similarity, neighbours: int) -> Iterator[tuple[int, int, Similarity]]:
+def facing(nodes: Component, turn: Similarity, neighbours: int) -> Iterator[tuple[int, int, Similarity]]:
     """A moved frame, another that looks nearly its way, and the first in the second's axes."""
-    frames = [k for k, S in enumerate(nodes) if S is not None]
-    sight = np.array([node_at(nodes, k).R[:, 2] for k in frames])
+    frames = list(nodes)
+    sight = np.array([S.R[:, 2] for S in nodes.values()])
     for n, i in enumerate(frames):
-        moved = turn @ node_at(nodes, i)
+        moved = turn @ nodes[i]
         cosine = np.asarray(sight @ moved.R[:, 2], dtype=np.float64)
         cosine[n] = -np.inf
         for k in np.argsort(-cosine, kind="stable")[:neighbours].tolist():
             if cosine[k] > LEAST_SIGHT_COSINE:
-                yield i, frames[k], node_at(nodes, frames[k]).inverse() @ moved
+                yield i, frames[k], nodes[frames[k]].inverse() @ moved
 
 
-# A turn that a pair of frames says, made as exact as all frames together know it.
-#
-# A pair is off by degrees and by per cents of scale, which moves edges of the object past each other. A turn that
-# leaves
-# an object as it is has no scale, and every frame says something of it.
+# A turn that a pair of frames says is off by degrees and by per cents of scale, which moves edges of the object past
+# each other. A turn that leaves an object as it is has no scale, and every frame says something of it.
 
 
-def exact_turn(sides: Sequence[Side], nodes: Nodes, turn: Similarity) -> Similarity:
+def exact_turn(sides: Sequence[Side], nodes: Component, turn: Similarity) -> Similarity:
     """Gauss-Newton from `turn`: rigid, by the point-to-plane distances of every frame, moved, from those it faces."""
-    centre = _centre(sides, nodes)
+    centre = np.mean([S.points(sides[k].map.centroid[None])[0] for k, S in nodes.items()], axis=0)
     turn = Similarity(1.0, turn.R, turn.points(centre[None])[0] - turn.R @ centre)
     for radii in EXACT_WIDTHS:
         width = Tolerance(radii, KERNEL_SIGMAS)
         H, g = np.zeros((6, 6)), np.zeros(6)
         for i, j, S in facing(nodes, turn, TURN_NEIGHBOURS):
             sums = agreement(sides[i], sides[j], Hypotheses.of(S), width)
-            M = _motion_in_camera(node_at(nodes, j), sides[j].map.centroid, centre)
+            M = _motion_in_camera(nodes[j], sides[j].map.centroid, centre)
             H += M.T @ sums.H[0] @ M
-            g += M.T @ sums.g[0] * node_at(nodes, j).scale
+            g += M.T @ sums.g[0] * nodes[j].scale
         step = -np.linalg.lstsq(H, g, rcond=EXACT_RCOND)[0]
         R = Rotation.from_rotvec(step[3:]).as_matrix()
         turn = Similarity(1.0, R, centre - R @ centre + step[:3]) @ turn
     return turn
-
-
-def _centre(sides: Sequence[Side], nodes: Nodes) -> Float64[ndarray, "3"]:
-    """Of what the frames see."""
-    seen = [S.points(sides[k].map.centroid[None])[0] for k, S in enumerate(nodes) if S is not None]
-    return np.mean(seen, axis=0)
 
 
 def _motion_in_camera(
@@ -243,9 +224,6 @@ def _motion_in_camera(
     M[:3, 3:] = to_camera @ np.cross(np.eye(3), arm).T / S_world_camera.scale
     M[3:6, 3:] = to_camera
     return M * S_world_camera.scale
-
-
-# By which motions of the world pairs of frames differ from the poses that were found.
 
 
 def distinct_turns(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> list[Similarity]:
@@ -265,31 +243,20 @@ def is_known(turn: Similarity, found: Sequence[Similarity]) -> bool:
 
 def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> Iterator[Similarity]:
     """By which motions of the world pairs, or their rivals, differ from the solution."""
-    nodes = solution.S_world_camera
-    placed = [
-        (e, used)
-        for e, used in zip(edges, solution.consistent, strict=True)
-        if nodes[e.source] is not None and nodes[e.target] is not None
-    ]
+    nodes, pairs = solution.S_world_camera, zip(edges, solution.consistent, strict=True)
+    placed = [(e, used) for e, used in pairs if e.source in nodes and e.target in nodes]
     for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0]))):
-        target, source = node_at(nodes, e.target), node_at(nodes, e.source).inverse()
+        target, source = nodes[e.target], nodes[e.source].inverse()
         results = [*([] if used else [e.S_target_source]), *(rival.S_target_source for rival in e.rivals)]
         yield from (target @ S @ source for S in results)
 
 
-# Turns after which the surface looks the same, so that pairs of frames contradict each other (a nut, a gear, a
-# box).
-#
-# Each side of such an object fits wherever another one is. Pairs of frames then agree perfectly and still say
-# different
-# things, and which of them is right, surfaces do not tell. A pair that fits by accident moves the rest of the
-# surface to
-# where it contradicts; a symmetry does not. Nor does any turn about the axis of something round, a vase or a medal:
-# but
-# parts of that turn contradict no more, so it is no other side. Nor does half a turn of a leaf on a table, which
-# covers
-# most of its place: parts of it contradict only twice as much. Half the turn of a nut contradicts forty times as
-# much.
+# Turns after which the surface looks the same (a nut, a gear, a box): each side of such an object fits wherever another
+# one is. Pairs of frames then agree perfectly and still say different things, and which of them is right, surfaces do
+# not tell. A pair that fits by accident moves the rest of the surface to where it contradicts; a symmetry does not. Nor
+# does any turn about the axis of something round, a vase or a medal: but parts of that turn contradict no more, so it
+# is no other side. Nor does half a turn of a leaf on a table, which covers most of its place: parts of it contradict
+# only twice as much. Half the turn of a nut contradicts forty times as much.
 
 
 def symmetric_turns_deg(
@@ -339,16 +306,11 @@ def _half(turn: Similarity) -> Similarity:
     return Similarity(scale, R, np.linalg.solve(np.eye(3) + scale * R, turn.t))
 
 
-# Blocks of frames at the wrong one of several sides from which an object looks nearly the same.
-#
-# Components grow pair by pair. Half a bearing block fits on its other half but for an oil cup: two blocks of frames
-# that
-# were joined like this agree over most of their surface. But all pairs across the two contradict each other more
-# than
-# those inside, and there is a turn of the world after which one block contradicts the other no more. Which frames
-# belong
-# to it is the cut of a graph: weights of its edges are what pairs contradict before the turn, less what they do
-# after it.
+# Blocks of frames at the wrong one of several sides: half a bearing block fits on its other half but for an oil cup,
+# and two blocks of frames that were joined like this agree over most of their surface. But all pairs across the two
+# contradict each other more than those inside, and there is a turn of the world after which one block contradicts the
+# other no more. Which frames belong to it is the cut of a graph: weights of its edges are what pairs contradict before
+# the turn, less what they do after it.
 
 
 @dataclass(frozen=True)
@@ -367,13 +329,9 @@ def turned_blocks(
 
     `before`: the frames of the solution as they are.
     """
-    nodes = solution.S_world_camera
-    frames = [k for k, S in enumerate(nodes) if S is not None]
-    if len(frames) < FEWEST_FRAMES:
-        return []
-    usual = _usual(before)
-    contradicting, found = _excess(before, usual), list[TurnedBlock]()
-    if contradicting.sum() < LEAST_CONTRADICTING:
+    nodes, usual, found = solution.S_world_camera, _usual(before), list[TurnedBlock]()
+    contradicting = _excess(before, usual)
+    if len(nodes) < FEWEST_FRAMES or contradicting.sum() < LEAST_CONTRADICTING:
         return []
     for turn in distinct_turns(edges, solution)[:MOST_TURNS]:
         after = judged(sides, nodes, turn, BLOCK_NEIGHBOURS)
@@ -385,7 +343,7 @@ def turned_blocks(
         if agrees < max(BLOCK_AGREEING, BLOCK_OVERLAP * agreed):
             continue
         if share(agrees, contradicts) < LARGEST_REMAINDER * share(agreed, contradicted):
-            inside = tuple(np.array(frames)[block].tolist())
+            inside = tuple(np.array(list(nodes))[block].tolist())
             found.append(TurnedBlock(inside, turn, contradicted - contradicts))
     return sorted(found, key=lambda one: -one.relief)
 
@@ -436,20 +394,15 @@ def turned_back(graph: ViewGraph, component: Component) -> bool:
     before = _as_they_are(graph, solution)
     blocks = turned_blocks(graph.sides, graph.holding(component), solution, before)
     for block in blocks[:MOST_TRIED]:
-        moved = {k: node_at(solution.S_world_camera, k) for k in component}
+        moved = {k: solution.S_world_camera[k] for k in component}
         moved |= {k: block.turn @ moved[k] for k in block.frames}
         known = graph.snapshot()
-        _register_across(graph, moved, block)
+        graph.set_aside(moved, [(i, j) for i in block.frames for j in moved if j not in block.frames])
+        graph.try_overlapping(moved)
         if _confirmed(graph, moved, before.share):
             return True
         graph.restore(known)
     return False
-
-
-def _register_across(graph: ViewGraph, moved: Component, block: TurnedBlock) -> None:
-    """Set pairs aside that put the block where it was, and register those that now overlap."""
-    graph.set_aside(moved, [(i, j) for i in block.frames for j in moved if j not in block.frames])
-    graph.try_overlapping([moved.get(k) for k in range(len(graph.maps))])
 
 
 def _confirmed(graph: ViewGraph, moved: Component, before: float) -> bool:

@@ -17,7 +17,6 @@ from sl_nerfstudio.registration.assembly import (
     SAME_SIDE_DEG,
     Assembly,
     Component,
-    Nodes,
     Pivots,
     PoseGraphSolution,
     optimise_pose_graph,
@@ -88,17 +87,15 @@ def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int) -> bool:
 # Camera poses that a user knows roughly, as a start of registration: the baselines that fit them are found here.
 
 
-def starting_similarities(
-    T_world_camera: Float64[ndarray, "n 4 4"], maps: Sequence[SurfaceMap]
-) -> list[Similarity | None]:
-    """`S_world_camera` of frames with known camera poses; None where a pose holds NaN.
+def starting_similarities(T_world_camera: Float64[ndarray, "n 4 4"], maps: Sequence[SurfaceMap]) -> Component:
+    """`S_world_camera` of the frames with known camera poses; a pose that holds NaN is unknown.
 
     The clouds of all frames must lie at about the same place. The baselines are therefore those for which all
     centroids, each on its own ray, come nearest to one point (linear least squares).
     """
     known = [k for k in range(len(maps)) if np.isfinite(T_world_camera[k]).all()]
     if not known:
-        return [None] * len(maps)
+        return {}
     A, b = np.zeros((3 * len(known), len(known) + 3)), np.zeros(3 * len(known))
     for row, k in enumerate(known):
         T, rows = T_world_camera[k], slice(3 * row, 3 * row + 3)
@@ -110,7 +107,7 @@ def starting_similarities(
     distances = np.linalg.lstsq(A, b, rcond=None)[0][: len(known)]
     positive = distances[distances > 0]
     typical = float(np.median(positive)) if len(positive) else 1.0
-    out: list[Similarity | None] = [None] * len(maps)
+    out: Component = {}
     for k, found in zip(known, distances, strict=True):
         distance = found if found > LEAST_DISTANCE * typical else typical
         T = T_world_camera[k]
@@ -118,22 +115,15 @@ def starting_similarities(
     return out
 
 
-def with_common_centre(
-    S_world_camera: Sequence[Similarity | None], maps: Sequence[SurfaceMap]
-) -> list[Similarity | None]:
+def with_common_centre(S_world_camera: Component, maps: Sequence[SurfaceMap]) -> Component:
     """The same, each moved so that the centres of what the frames see lie in one place.
 
     A camera that is rotated wrongly by a few degrees looks past the object by more than the object's size. Its rotation
     is still a good start.
     """
-    pairs = zip(S_world_camera, maps, strict=True)
-    centres = [None if S is None else S.points(m.views[0].centre[None])[0] for S, m in pairs]
-    known = [p for p in centres if p is not None]
-    common = np.median(known, axis=0) if known else np.zeros(3)
-    return [
-        None if S is None or p is None else Similarity(S.scale, S.R, S.t + common - p)
-        for S, p in zip(S_world_camera, centres, strict=True)
-    ]
+    centres = {k: S.points(maps[k].views[0].centre[None])[0] for k, S in S_world_camera.items()}
+    common = np.median(list(centres.values()), axis=0) if centres else np.zeros(3)
+    return {k: Similarity(S.scale, S.R, S.t + common - centres[k]) for k, S in S_world_camera.items()}
 
 
 Pair = tuple[int, int]
@@ -143,7 +133,7 @@ Snapshot = tuple[dict[Pair, PairMatch | None], list[PairMatch]]  # what pairs sa
 class ViewGraph:
     """Pairs that were tried, with the best result of each."""
 
-    def __init__(self, maps: list[SurfaceMap], start: Nodes, rng: np.random.Generator) -> None:
+    def __init__(self, maps: list[SurfaceMap], start: Component, rng: np.random.Generator) -> None:
         self.maps = maps
         self.rng = rng
         self._start = start  # S_world_camera of frames where it is known roughly
@@ -151,7 +141,7 @@ class ViewGraph:
         self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in maps]
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
-        self._aside: list[PairMatch] = []
+        self.put_aside: list[PairMatch] = []  # what put blocks of frames where most of the surface contradicts it
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -165,14 +155,9 @@ class ViewGraph:
         return with_confirmed_tones(accepted, self.pivots)
 
     @property
-    def put_aside(self) -> list[PairMatch]:
-        """Pairs that put blocks of frames where most of the surface contradicts it."""
-        return list(self._aside)
-
-    @property
     def said(self) -> list[PairMatch]:
         """All that pairs say or said, right or not: at which sides of the object frames fit."""
-        return [*self.matches, *self._aside]
+        return [*self.matches, *self.put_aside]
 
     def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
         """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
@@ -182,16 +167,16 @@ class ViewGraph:
                 continue
             placed = S_world_camera[match.target].inverse() @ S_world_camera[match.source]
             if _turned_deg(match, placed) > SAME_SIDE_DEG:
-                self._aside.append(match)
+                self.put_aside.append(match)
                 del self._tried[pair]
 
     def snapshot(self) -> Snapshot:
         """What pairs say now, to come back to."""
-        return dict(self._tried), list(self._aside)
+        return dict(self._tried), list(self.put_aside)
 
     def restore(self, known: Snapshot) -> None:
         """Make pairs say what they said."""
-        self._tried, self._aside = dict(known[0]), list(known[1])
+        self._tried, self.put_aside = dict(known[0]), list(known[1])
 
     def connected(self, component: Component, used: Bool[ndarray, "edges"]) -> bool:
         """Whether those of the pairs that hold a component which are `used` lead to every frame of it."""
@@ -206,7 +191,7 @@ class ViewGraph:
         trials = [(p, ROUGH if g else search, g) for p, g in zip(new, guesses, strict=True)]
         self._register(trials, "registering pairs")
 
-    def try_overlapping(self, S_world_camera: Nodes, within_deg: float = 180.0) -> None:
+    def try_overlapping(self, S_world_camera: Component, within_deg: float = 180.0) -> None:
         """Register pairs that should overlap by the given poses, starting from there.
 
         What ends turned against its start by more than `within_deg` degrees counts for nothing.
@@ -295,14 +280,16 @@ class ViewGraph:
     def _maps(self, pair: Pair) -> tuple[SurfaceMap, SurfaceMap]:
         return self.maps[pair[0]], self.maps[pair[1]]
 
-    def _overlapping(self, S_world_camera: Nodes) -> list[Pair]:
+    def _overlapping(self, S_world_camera: Component) -> list[Pair]:
         """For every frame the pairs with the largest expected overlap, without those that are edges already."""
-        n = len(S_world_camera)
+        n = len(self.maps)
         tolerance = Tolerance(OVERLAP_TOLERANCE, AGREEING_SIGMAS)
         shares = np.zeros((n, n))
-        sight = np.array([np.full(3, np.nan) if S is None else S.R[:, 2] for S in S_world_camera])
+        sight = np.full((n, 3), np.nan)
+        for k, S in S_world_camera.items():
+            sight[k] = S.R[:, 2]
         for i, j in compared_pairs(-sight @ sight.T, COMPARED_FRAMES):
-            a, b = S_world_camera[i], S_world_camera[j]
+            a, b = S_world_camera.get(i), S_world_camera.get(j)
             if a is not None and b is not None and see_same_side(a, b):
                 maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
                 found = agreement_at(maps, S, self.rng, tolerance)
@@ -312,11 +299,8 @@ class ViewGraph:
             for j in np.argsort(-shares[i], kind="stable")[:PARTNERS].tolist():
                 if shares[i, j] > EXPECTED_OVERLAP:
                     pairs.add((min(i, j), max(i, j)))
-        return sorted(p for p in pairs if not self._is_edge(p))
-
-    def _is_edge(self, pair: Pair) -> bool:
-        match = self._tried.get(pair)
-        return match is not None and is_accepted(match)
+        edges = {pair for pair, match in self._tried.items() if match is not None and is_accepted(match)}
+        return sorted(pairs - edges)
 
 
 def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
@@ -355,7 +339,7 @@ def _turned_deg(match: PairMatch, guess: Similarity) -> float:
     return angle_deg(match.S_target_source.R @ guess.R.T)
 
 
-def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:
+def _relative(nodes: Component, pair: Pair) -> Similarity | None:
     """The second frame of a pair from the first, where both are known."""
-    a, b = nodes[pair[0]], nodes[pair[1]]
+    a, b = nodes.get(pair[0]), nodes.get(pair[1])
     return None if a is None or b is None else b.inverse() @ a

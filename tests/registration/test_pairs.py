@@ -85,11 +85,6 @@ def test_neighbours_find_each_other(maps, i, j):
     assert not is_ambiguous(found)
 
 
-def test_both_directions_of_a_pair_agree(maps):
-    there, back = (registered((maps[i], maps[j])).S_target_source for i, j in ((2, 3), (3, 2)))
-    assert_near(there, back.inverse(), maps[3], 0.5)
-
-
 def test_a_rolled_camera_is_found_without_a_guess():
     """Frame 1 rotated about its line of sight by 130 degrees, as if held that way."""
     rig, roll = part_of(RIG, [0, 1]), torch.eye(4, dtype=torch.float64)
@@ -264,19 +259,6 @@ def test_a_screw_motion_is_the_integral_of_its_velocity(x):
     assert errors[1].max() <= errors[0].max() / 80 + 1e-12  # of second order: a hundredth
 
 
-@settings(max_examples=20)
-@given(st.floats(0.1, 2.0), st.integers(0, 10**6))
-def test_a_turn_about_an_axis_elsewhere_keeps_points_at_their_distance_from_it(angle, seed):
-    """Increments would leave a surface of revolution after a few degrees; a motion stays on it however far it goes."""
-    rng = np.random.default_rng(seed)
-    axis, foot = rng.normal(size=3), SURFACE.centroid + rng.normal(size=3)
-    w = angle * axis / np.linalg.norm(axis)
-    found = screw_motion(np.concatenate([np.cross(w, SURFACE.centroid - foot) / SURFACE.radius, w, [0.0]]), SURFACE)
-    p = rng.normal(size=(20, 3))
-    expected = foot + (p - foot) @ Rotation.from_rotvec(w).as_matrix().T
-    np.testing.assert_allclose(found.points(p), expected, atol=1e-9)
-
-
 @settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_the_least_known_rotation_is_the_unobservable_one(seed):
@@ -370,7 +352,7 @@ def blotches(surface: SurfaceMap, seed: int) -> np.ndarray:
     return gaussian_filter(np.random.default_rng(seed).standard_normal(surface.valid.shape), 4)
 
 
-@pytest.mark.parametrize("pair", [(4, 6), (9, 12), (15, 17)])
+@pytest.mark.parametrize("pair", [(4, 6), pytest.param((15, 17), marks=pytest.mark.slow)])
 def test_the_blotches_of_a_vase_hold_it(pair):
     """Surfaces alone leave the frames turned by more; with tones, the turn is right to within what is stated."""
     maps, true = vase(*pair)
@@ -398,14 +380,14 @@ def test_a_motion_that_leaves_both_surfaces_ends_without_a_word():
     sides = Side.sampled(maps[0], 400, rng), Side.sampled(maps[1], 400, rng)
     away = np.array([5.0, -3.0, 4.0, 0.6, 0.0, 0.8, 1.1])
     with np.errstate(all="raise", under="ignore"):
-        assert turn_by_tone(sides, true, (away, 12.0), Tolerance(0.0, 2.0)) is None
+        assert turn_by_tone(sides, true, away, Tolerance(0.0, 2.0)) is None
 
 
 def test_likeness_is_the_correlation_of_the_tones_that_meet():
     """Of a frame with itself it is one; with the opposite tones minus one; turned away it is not known."""
     (surface, _), _ = vase(4, 6)
     far = Similarity(1.0, Rotation.from_rotvec([0, 2.5, 0]).as_matrix(), np.zeros(3))
-    both = Hypotheses.joined([Hypotheses.of(Similarity.identity()), Hypotheses.of(far)])
+    both = Hypotheses.of(Similarity.identity(), far)
     one, opposite = (
         Side.sampled(m, 400, np.random.default_rng(0)) for m in (surface, replace(surface, tone=-surface.tone))
     )

@@ -173,6 +173,7 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(few):
     assert off < 0.03 * np.linalg.norm(T[0, :3, 3]) / unit
 
 
+@pytest.mark.slow
 def test_a_frame_of_another_object_is_named_and_left_out(clouds):
     frames = [*clouds[:5], on_a_ball(clouds[5], 0.7, "stranger")]
     found = register(frames)

@@ -89,20 +89,8 @@ def test_an_error_of_the_pose_that_scales_the_surface_is_found_as_that_similarit
     assert growth == pytest.approx(0.1)
 
 
-def test_what_contradicts_the_pose_is_left_out_of_points_and_coordinates():
-    coords = _image(0)
-    decoded = np.argwhere(np.isfinite(coords).all(-1))
-    wrong = decoded[::10]
-    coords[wrong[:, 0], wrong[:, 1]] += np.float32([30, -25])
-    uv = correspondences_of(coords)
-    cloud = frame_cloud("a", coords, *DEVICES, known_pose(RIG.T_camera_projector[0].numpy(), *uv, *DEVICES))
-    assert np.isnan(cloud.coords[wrong[:, 0], wrong[:, 1]]).all()
-    assert len(cloud.points) == np.isfinite(cloud.coords).all(-1).sum() == len(decoded) - len(wrong)
-
-
-@pytest.mark.parametrize("step", [2, 3])
-def test_of_large_images_points_are_on_a_lattice_and_coordinates_are_judged_everywhere(monkeypatch, step):
-    rng = np.random.default_rng(0)
+def test_of_large_images_points_are_on_a_lattice_and_coordinates_are_judged_everywhere(monkeypatch):
+    step, rng = 3, np.random.default_rng(0)
     coords = _image(0) + rng.normal(0, 0.1, (SIZE, SIZE, 2)).astype(np.float32)
     decoded = np.argwhere(np.isfinite(coords).all(-1))
     wrong = decoded[rng.random(len(decoded)) < 0.1]
@@ -142,19 +130,6 @@ def test_unreliable_points_are_left_out_of_surfaces():
     sigma[:25] *= 100
     good = reliable_points(replace(cloud, sigma_noise=sigma))
     assert not good[:25].any() and good.mean() > 0.9
-
-
-def test_normals_of_the_map_are_those_of_the_surface():
-    """On the disk they are its axis; everywhere they look at the camera, whatever its lens."""
-    cloud = clouds_of(RIG, SIZE)[0]
-    found = build_surface_map(cloud)
-    R, t = RIG.T_world_camera[0, :3, :3].numpy(), RIG.T_world_camera[0, :3, 3].numpy()
-    p = LENGTH[0] * found.point @ R.T + t
-    on_disk = found.valid & (np.abs(p[..., 2] + 0.3) < 2e-3)
-    assert on_disk.sum() > 300
-    np.testing.assert_allclose((found.normal @ R.T)[on_disk].mean(0), [0, 0, 1], atol=5e-3)
-    assert ((found.normal * found.point).sum(-1)[found.valid] < 0).all()
-    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=-1)[found.valid], 1)
 
 
 def _image(k: int) -> np.ndarray:
@@ -241,24 +216,11 @@ def test_steep_surfaces_are_left_out(monkeypatch):
     assert (cosine[found.valid] > 0.99).all()
 
 
-def test_size_and_place_of_what_is_seen():
-    found = build_surface_map(plane_cloud(CAMERAS["pinhole"]))
-    p = found.point[found.valid]
-    np.testing.assert_allclose(found.centroid, p.mean(0))
-    assert found.radius == pytest.approx(np.sqrt(p.var(0).sum()))
-    whole = found.views[0]
-    behind = np.linalg.norm(whole.centre) - np.linalg.norm(found.centroid)
-    assert behind == pytest.approx(0.4 * found.radius)
-    np.testing.assert_allclose(np.cross(whole.centre, found.centroid), 0, atol=1e-9)
-    assert whole.size == found.radius
-
-
 def test_samples_are_places_of_the_map_spread_over_it():
     found = build_surface_map(plane_cloud(CAMERAS["pinhole"]))
     points, normals, sigma = found.sample(200, np.random.default_rng(0))
     assert len(points) == len(normals) == len(sigma) == 200
-    known = {tuple(p) for p in found.point[found.valid]}
-    assert all(tuple(p) in known for p in points)
+    assert {tuple(p) for p in points} <= {tuple(p) for p in found.point[found.valid]}
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=3)
     assert counts.min() > 8
     count = int(found.valid.sum())
@@ -266,14 +228,9 @@ def test_samples_are_places_of_the_map_spread_over_it():
     assert len({tuple(p) for p in everything}) == count
 
 
-def folded(x, y):
-    """A plane square to the line of sight, and a narrow strip that is steep."""
-    return 3 + np.where(x > 0.3, 2.0 * (x - 0.3), 0.0)
-
-
 def test_orientations_that_are_rare_get_their_share_of_the_samples():
-    """One over the square root of their number each: a strip of a tenth counts as a quarter, not as a tenth."""
-    found = build_surface_map(cloud_of_depth(folded, 120))
+    """One over the square root of their number each: a steep strip of a tenth counts as a quarter, not as a tenth."""
+    found = build_surface_map(cloud_of_depth(lambda x, y: 3 + np.where(x > 0.3, 2.0 * (x - 0.3), 0.0), 120))
     steep = found.normal[found.valid][:, 2] < np.cos(np.radians(25))
     share = steep.mean()
     assert 0.05 < share < 0.15
@@ -288,14 +245,11 @@ def test_the_uncertainty_of_a_surface_is_that_of_its_points_along_the_normal():
     """With a part that no averaging removes: a share of a map pixel."""
     cloud = cloud_of_depth(lambda x, y: 3 + 0.5 * x, 100, sigma=0.02)
     found = build_surface_map(replace(cloud, pose_errors=np.zeros_like(cloud.pose_errors)))
-    np.testing.assert_allclose(found.sigma[found.valid], _sigma_along_normal(found, cloud.sigma_noise[0]), rtol=1e-6)
-
-
-def _sigma_along_normal(found, sigma_ray):
     p, n = found.point[found.valid], found.normal[found.valid]
     distance = np.linalg.norm(p, axis=1)
     lattice = surfaces.LATTICE_ERROR * distance / found.camera.fl_x
-    return np.hypot(sigma_ray * -(n * p).sum(1) / distance, lattice)
+    expected = np.hypot(cloud.sigma_noise[0] * -(n * p).sum(1) / distance, lattice)
+    np.testing.assert_allclose(found.sigma[found.valid], expected, rtol=1e-6)
 
 
 def test_errors_that_move_turn_or_scale_the_whole_surface_do_not_make_it_uncertain():
@@ -318,12 +272,6 @@ def test_a_wall_behind_the_object_moves_all_that_is_seen_but_not_its_middle():
     assert np.linalg.norm(walled.views[0].centre - alone.views[0].centre) > alone.radius
     assert np.linalg.norm(walled.views[1].centre - alone.views[1].centre) < 0.3 * alone.radius
     assert walled.views[1].size == pytest.approx(alone.views[1].size, rel=0.05)
-
-
-def test_a_map_without_surface_has_no_samples():
-    found = build_surface_map(plane_cloud(CAMERAS["pinhole"]))
-    empty = replace(found, valid=np.zeros_like(found.valid), weight=np.zeros(0))
-    assert [len(part) for part in empty.sample(10, np.random.default_rng(0))] == [0, 0, 0]
 
 
 # Tone.

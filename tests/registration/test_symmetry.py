@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.agreement import Side
-from sl_nerfstudio.registration.assembly import PoseGraphSolution, node_at
+from sl_nerfstudio.registration.assembly import PoseGraphSolution
 from sl_nerfstudio.registration.pairs import PairMatch, Rival
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.surfaces import build_surface_map
@@ -54,7 +54,7 @@ class Scan:
     def __init__(self, scene: str) -> None:
         made = rendered(scene, tuple(range(FRAMES)), FRAMES, 90)
         rng = np.random.default_rng(0)
-        self.nodes = made.S_world_camera
+        self.nodes = dict(enumerate(made.S_world_camera))
         self.axis = np.zeros(3)
         self.sides = [Side.sampled(build_surface_map(c), 400, rng) for c in made.clouds]
         self.pairs = [self.pair(k, (k + 1) % FRAMES) for k in range(FRAMES)]
@@ -62,7 +62,8 @@ class Scan:
     def aside(self, x: float) -> "Scan":
         """The same scan with the world's origin beside the object's axis."""
         other = copy(self)
-        other.nodes = [Similarity(1.0, np.eye(3), np.array([x, 0.0, 0.0])) @ node for node in self.nodes]
+        shift = Similarity(1.0, np.eye(3), np.array([x, 0.0, 0.0]))
+        other.nodes = {k: shift @ S for k, S in self.nodes.items()}
         other.axis = np.array([x, 0.0, 0.0])
         return other
 
@@ -73,12 +74,12 @@ class Scan:
         return self.nodes[j].inverse() @ turn @ self.nodes[i]
 
     def pair(self, i: int, j: int, rivals: tuple[Rival, ...] = ()) -> PairMatch:
-        return edge(self.nodes, i, j, rivals=rivals)
+        return edge(list(self.nodes.values()), i, j, rivals=rivals)
 
     def turns(self, *others: PairMatch, used: bool = False) -> tuple[float, ...]:
         edges = [*self.pairs, *others]
         consistent = np.array([True] * len(self.pairs) + [used] * len(others))
-        return symmetric_turns_deg(self.sides, edges, PoseGraphSolution(list(self.nodes), consistent))
+        return symmetric_turns_deg(self.sides, edges, PoseGraphSolution(self.nodes, consistent))
 
 
 # Symmetric turns.
@@ -92,11 +93,6 @@ def contradicting(scan: Scan, degrees: float, scale: float = 1.0) -> PairMatch:
 @pytest.fixture(scope="module")
 def nut(nut_file: str) -> Scan:
     return Scan(nut_file)
-
-
-@pytest.fixture(scope="module")
-def frog() -> Scan:
-    return Scan("frog")
 
 
 def test_a_nut_looks_the_same_after_a_sixth_of_a_turn(nut: Scan) -> None:
@@ -121,9 +117,9 @@ def test_a_pair_that_fits_by_accident_is_no_symmetry(nut: Scan, degrees: float) 
     assert nut.turns(contradicting(nut, 60.0, 1.2)) == ()  # nor is one that changes the size
 
 
-@pytest.mark.parametrize("degrees", [60.0, 180.0])
-def test_a_frog_has_no_symmetry(frog: Scan, degrees: float) -> None:
-    assert frog.turns(contradicting(frog, degrees)) == ()
+def test_a_frog_has_no_symmetry() -> None:
+    frog = Scan("frog")
+    assert frog.turns(contradicting(frog, 60.0), contradicting(frog, 180.0)) == ()
 
 
 def test_half_a_turn_made_twice_is_the_turn_and_three_eighths_made_eight_times_three() -> None:
@@ -142,14 +138,16 @@ def test_half_a_turn_made_twice_is_the_turn_and_three_eighths_made_eight_times_t
             assert angle_deg(part.R) == pytest.approx(degrees * share)
 
 
+@pytest.mark.slow
 def test_what_is_round_has_no_sides() -> None:
     """A vase contradicts as little after any turn: which of two turns contradicts less is chance, and says nothing."""
     vase = Scan("vase")
-    for degrees in (29.0, 60.0, 90.0):
+    for degrees in (29.0, 60.0):
         assert vase.turns(contradicting(vase, degrees)) == ()
         assert vase.aside(25.0).turns(contradicting(vase.aside(25.0), degrees)) == ()
 
 
+@pytest.mark.slow
 def test_a_medal_that_slides_a_little_is_not_symmetric() -> None:
     medal = Scan("medal")
     for degrees in (10.0, 16.0):
@@ -200,13 +198,13 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 def misplaced(scan: Scan, degrees: float = 180.0) -> tuple[list[PairMatch], PoseGraphSolution]:
     """The frames of the block turned; all pairs hold them there, but one across the two that says the truth."""
     half = scan.nodes[0] @ scan.turned(0, 0, degrees) @ scan.nodes[0].inverse()
-    nodes = [half @ S if k in BLOCK else S for k, S in enumerate(scan.nodes)]
-    sight = np.array([S.R[:, 2] for S in nodes])
+    nodes = {k: half @ S if k in BLOCK else S for k, S in scan.nodes.items()}
+    sight = np.array([S.R[:, 2] for S in nodes.values()])
     near = [(i, j) for j in range(FRAMES) for i in range(j) if sight[i] @ sight[j] > 0.5]
     edges = [replace(scan.pair(i, j), S_target_source=nodes[j].inverse() @ nodes[i]) for i, j in near]
     truth = scan.pair(2, 3)
     edges = [e for e in edges if (e.source, e.target) != (2, 3)]
-    return [*edges, truth], PoseGraphSolution(list(nodes), np.array([True] * len(edges) + [False]))
+    return [*edges, truth], PoseGraphSolution(nodes, np.array([True] * len(edges) + [False]))
 
 
 def found_in(scan: Scan, edges: list[PairMatch], solution: PoseGraphSolution) -> list[TurnedBlock]:
@@ -226,7 +224,7 @@ def test_the_turned_block_is_found_with_its_turn(bar: Scan) -> None:
 def test_where_all_frames_are_right_none_is_turned(bar: Scan) -> None:
     wrong = replace(bar.pair(0, 1), S_target_source=bar.turned(0, 1, 180.0))
     edges = [*bar.pairs, wrong]
-    solution = PoseGraphSolution(list(bar.nodes), np.array([True] * len(bar.pairs) + [False]))
+    solution = PoseGraphSolution(bar.nodes, np.array([True] * len(bar.pairs) + [False]))
     assert found_in(bar, edges, solution) == []
 
 
@@ -239,9 +237,9 @@ def test_of_what_is_the_same_from_both_sides_no_block_is_turned(tmp_path: Path) 
 def test_pairs_across_are_registered_anew_where_the_block_belongs(bar: Scan) -> None:
     edges, solution = misplaced(bar)
     maps = [side.map for side in bar.sides]
-    graph = ViewGraph(maps, [None] * FRAMES, np.random.default_rng(0))
+    graph = ViewGraph(maps, {}, np.random.default_rng(0))
     graph.restore(({(e.source, e.target): e for e in edges}, []))
-    component = {k: node_at(solution.S_world_camera, k) for k in range(FRAMES)}
+    component = solution.S_world_camera
     assert max(off_deg(bar, e) for e in graph.matches) == pytest.approx(180, abs=1)
     assert turned_back(graph, component)
     assert max(off_deg(bar, e) for e in graph.matches) < 3
@@ -254,11 +252,11 @@ def test_pairs_across_are_registered_anew_where_the_block_belongs(bar: Scan) -> 
 def test_nothing_changes_where_pairs_do_not_confirm_a_turn(bar: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if nothing could be registered across the two."""
     edges, solution = misplaced(bar)
-    graph = ViewGraph([s.map for s in bar.sides], [None] * FRAMES, np.random.default_rng(0))
+    graph = ViewGraph([s.map for s in bar.sides], {}, np.random.default_rng(0))
     before = {(e.source, e.target): e for e in edges}
     graph.restore((before, []))
     monkeypatch.setattr(ViewGraph, "try_overlapping", lambda *_: None)
-    component = {k: node_at(solution.S_world_camera, k) for k in range(FRAMES)}
+    component = solution.S_world_camera
     graph.set_aside(component, [(2, 3)])  # the pair that says the truth, and would hold the block alone
     truth = graph.put_aside
     assert [(e.source, e.target) for e in truth] == [(2, 3)]
@@ -310,9 +308,8 @@ def steps(deg: float) -> list[Similarity]:
 def test_the_chain_of_small_steps_shows_every_side_of_a_nut(nut_walk: RenderedClouds) -> None:
     maps = [build_surface_map(c) for c in nut_walk.clouds]
     chain = chain_of_small_steps(maps, 12.0, np.random.default_rng(0))
-    known = [S for S in chain if S is not None]
-    assert len(known) == STEPS
-    assert max(turned_from_truth(known, nut_walk.S_world_camera)) < 3
+    assert list(chain) == list(range(STEPS))
+    assert max(turned_from_truth(list(chain.values()), nut_walk.S_world_camera)) < 3
 
 
 @pytest.mark.slow
@@ -333,16 +330,14 @@ def test_a_run_goes_from_frame_to_frame_and_ends_where_a_step_is_unknown() -> No
     true = steps(15.0)
     exact = [b.inverse() @ a for a, b in pairwise(true)]
     chain = _longest_run(exact)
-    for found, wanted in zip(chain, true, strict=True):
-        assert found is not None
+    for found, wanted in zip(chain.values(), true, strict=True):
         np.testing.assert_allclose(found.matrix(), (true[0].inverse() @ wanted).matrix(), atol=1e-12)
     broken = _longest_run([exact[0], None, *exact[2:]])
-    assert [S is None for S in broken] == [True, True, False, False, False, False]
-    assert broken[2] is not None and broken[5] is not None
+    assert list(broken) == [2, 3, 4, 5]
     np.testing.assert_allclose(
         (broken[2].inverse() @ broken[5]).matrix(), (true[2].inverse() @ true[5]).matrix(), atol=1e-12
     )
-    assert _longest_run([None, None]) == [None, None, None]
+    assert _longest_run([None, None]) == {}
 
 
 def test_the_usual_step_is_that_of_pairs_that_hold() -> None:
