@@ -1,4 +1,4 @@
-"""How well the surfaces of two frames agree under a similarity, and how to improve it: sums over looked-up points.
+"""Agreement of the surfaces of two frames under a similarity, and normal equations to improve it.
 
 Points of one frame are projected into the other's camera and compared with the tangent plane of the surface seen
 there, both ways. Unlike nearest neighbours this also finds contradictions: a point in front of a surface that the other
@@ -113,7 +113,7 @@ def _on_surface(place, valid, some):
 
 @compiled
 def _absent(mapped, place, empty, light, least_cosine):
-    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
+    """Count the points that would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
     code, projector, T, reach = light
     h, w = reach.shape
     count = 0
@@ -235,7 +235,7 @@ class Hypotheses:
         return len(self.scale)
 
     def __getitem__(self, index: list[int]) -> "Hypotheses":
-        """Some of them."""
+        """Select by index."""
         return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
 
     def incremented(
@@ -275,11 +275,11 @@ class Side:
 
     @staticmethod
     def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
-        """With about `count` points spread evenly over the image."""
+        """Draw about `count` points spread evenly over the image."""
         return Side(surface, *surface.sample(count, rng))
 
     def thinned(self, most: int) -> "Side":
-        """With every n-th of its points, at most about `most`."""
+        """Keep every n-th point, about `most` at most."""
         some = slice(None, None, max(1, len(self.points) // most))
         return Side(self.map, *(np.ascontiguousarray(part[some]) for part in (self.points, self.normals, self.sigma)))
 
@@ -310,7 +310,7 @@ class Agreement:
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
-        """Of the points that could be judged, or should be seen and are not, the fraction that agree."""
+        """Fraction that agrees, of the points that could be judged, or should be seen and are not."""
         return self.agreeing / self.expected.clip(1e-9)
 
     @property

@@ -69,7 +69,7 @@ Component = dict[int, Similarity]  # S_world_camera of some frames, in a world o
 
 @dataclass(frozen=True)
 class Pivots:
-    """Of every frame, the point about which increments rotate and scale, and the length that a radian counts as."""
+    """The point of every frame about which increments rotate and scale, and the length that a radian counts as."""
 
     centre: Float64[ndarray, "n 3"]  # camera axes, units of the frame's baseline
     radius: Float64[ndarray, "n"]
@@ -228,7 +228,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Joint:
-    """How well two components agree under one similarity: sums over pairs of frames across them."""
+    """Agreement of two components under one similarity: sums over pairs of frames across them."""
 
     S_first_second: Similarity
     votes: float  # of registered pairs: their quality, where it is their best result, or a share of it
@@ -238,7 +238,7 @@ class Joint:
 
     @property
     def fitness(self) -> float:
-        """Of the points that could be judged, the share that agrees."""
+        """Share of the points that could be judged which agrees."""
         return self.agreeing / max(self.agreeing + self.contradicting, 1e-9)
 
 
@@ -305,7 +305,7 @@ class Assembly:
         return next(c for c in self.components if frame in c)
 
     def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
-        """Both in the world of the first, with all pairs inside optimised together."""
+        """Merge both in the world of the first, with all pairs inside optimised together."""
         both = {**first, **{k: S @ S_second for k, S_second in second.items()}}
         found = optimise_pose_graph(self._edges, self._pivots, both, self._weight).S_world_camera
         return {k: found[k] for k in both}
@@ -424,7 +424,7 @@ class Assembly:
         return agreeing, contradicting
 
     def _held_by_tone(self, joint: Joint, first: Component, second: Component) -> bool:
-        """Whether tones tell what surfaces do not notice: a pair across that they hold says the same."""
+        """Whether brightness constrains what geometry leaves free: a pair across that tones hold says the same."""
         return any(
             self._same(self._links(e, first, second)[0], joint.S_first_second, first, second)
             for e in self._between(self._edges, first, second)
@@ -450,7 +450,7 @@ class Assembly:
         return min(rises) < SLIP_RISE
 
     def _rise(self, first: Component, second: Component, still: Similarity, moved: Similarity, sigmas: float) -> float:
-        """How much a motion of one component against the other costs, all pairs of frames across together."""
+        """Rise of the cost by a motion of one component against the other, all pairs of frames across together."""
         costs = np.zeros((2, 4))
         for i, j in self._facing(first, second, still):
             before, after = (first[i].inverse() @ S @ second[j] for S in (still, moved))

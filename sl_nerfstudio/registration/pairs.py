@@ -147,7 +147,7 @@ class PairMatch:
         return self.shape_slip_deg > self.slip_deg
 
     def without_tone(self) -> "PairMatch":
-        """The same pair as one that slips."""
+        """The pair as one that slips."""
         d, slip = self.slip_direction, np.radians(self.shape_slip_deg)
         covariance = np.linalg.inv(self.information) + slip**2 * np.outer(d, d)
         sigma_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
@@ -171,17 +171,17 @@ def is_accepted(match: PairMatch) -> bool:
 
 
 def support(match: PairMatch) -> float:
-    """Between 0 and 1: how much two surfaces agree, and how little contradicts."""
+    """Score between 0 and 1: how much two surfaces agree, and how little contradicts."""
     return support_of(match.overlap, match.fitness)
 
 
 def support_of(overlap: float, fitness: float) -> float:
-    """The same from the share of points that agree, and the share of those that could be judged."""
+    """Support by the share of points that agree, and the share of those that could be judged."""
     return overlap * fitness**2
 
 
 def quality(match: PairMatch) -> float:
-    """Between 0 and 1: which of two results for a pair is better, and which pair of a frame."""
+    """Score between 0 and 1 that ranks results of a pair, and pairs of a frame."""
     clear = match.second_best_ratio < AMBIGUOUS_RATIO
     return support(match) * (1.0 if clear else AMBIGUOUS_WEIGHT)
 
@@ -246,7 +246,7 @@ def register_pair(
 
 
 def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator) -> float:
-    """How well the best of all starts agrees, before any refinement: which pairs are worth registering."""
+    """Score of the best of all starts, before any refinement: which pairs are worth registering."""
     source, target = maps
     if not (source.valid.any() and target.valid.any()):
         return -1.0
@@ -280,7 +280,7 @@ def _differ(found: Hypotheses, a: int, b: int, target: SurfaceMap) -> bool:
 
 
 def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
-    """After one damped Gauss-Newton step of each."""
+    """Take one damped Gauss-Newton step of each."""
     sums = agreement(*sides, found, kernel)
     target = sides[1].map
     radius, c, log_scale = target.radius, target.centroid, np.log(found.scale)
@@ -508,7 +508,7 @@ def slip_deg(sides: Sides, S_target_source: Similarity, direction: Float64[ndarr
 
 
 def followed(sides: Sides, moved: Hypotheses, held: Float64[ndarray, "3"], kernel: Tolerance) -> Hypotheses:
-    """After a Gauss-Newton step of each that does not rotate about the axis `held`."""
+    """Take a Gauss-Newton step of each that does not rotate about the axis `held`."""
     target = sides[1].map
     sums = agreement(*sides, moved, kernel)
     D = np.array([1.0] * 3 + [target.radius] * 4)
@@ -607,7 +607,7 @@ def _around(sides: Sides, S: Similarity, direction: Float64[ndarray, "7"], commo
 
 @dataclass(frozen=True)
 class _Peak:
-    """Where tones agree clearly better than anywhere else along the way."""
+    """A place along the way where tones agree clearly better than anywhere else."""
 
     index: int
     offset_deg: float  # from there to the top
@@ -616,7 +616,7 @@ class _Peak:
 
 
 def _peak(correlation: Float64[ndarray, "k"]) -> _Peak | None:
-    """None where no similarity has tones that agree clearly better than those of all that are apart from it."""
+    """Find where tones agree clearly better than at all similarities apart from it; None if there is no such place."""
     c = correlation.clip(-TONE_LARGEST_CORRELATION, TONE_LARGEST_CORRELATION)
     if not np.isfinite(c[1:-1]).any():
         return None

@@ -1,7 +1,7 @@
-"""Registration of all frames: pairs, cycles, a robust pose graph.
+"""Registration of all frames: pairs, cycles, a robust pose graph; frames that are placed later; undecided projectors.
 
 The result is a camera pose and the length of the baseline of every frame. Lengths are relative: the geometric mean of
-the registered frames' baselines is 1 until `known_length` says how long one of them really is.
+the registered frames' baselines is 1 until a known length says how long one of them really is.
 """
 
 import math
@@ -240,7 +240,7 @@ def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
 def _fitness_of(
     k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
 ) -> float:
-    """Of a frame's points that other frames can judge, the share that agrees."""
+    """Share of a frame's points that agrees, of those that other frames can judge."""
     if not connected[k]:
         return 0.0
     S, agreeing, expected = solution.S_world_camera[k], 0.0, 0.0
@@ -413,14 +413,14 @@ def with_edges_at_poses(registration: Registration, frames: Collection[str]) -> 
 
 @dataclass(frozen=True)
 class ProjectorChoice:
-    """Which cloud of every frame, and the frames where the choice is not certain."""
+    """The chosen cloud of every frame, and the frames where the choice is not certain."""
 
     chosen: tuple[int, ...]  # for every frame 0, its own cloud, or the number of an alternative from 1
     undecided: tuple[UndecidedProjector, ...]
 
 
 def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[FrameCloud]:
-    """Of every frame the cloud that was chosen, without alternatives."""
+    """The chosen cloud of every frame, without alternatives."""
     return [replace((cloud, *cloud.alternatives)[k], alternatives=()) for cloud, k in zip(clouds, chosen, strict=True)]
 
 

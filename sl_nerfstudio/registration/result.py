@@ -185,7 +185,7 @@ class KnownLength:
 
     @property
     def source(self) -> str:
-        """Where the scale of a scan comes from, in words."""
+        """Words for where the scale of a scan comes from."""
         if self.pixels:
             return "scale bar between frame {} and frame {}".format(*self.frames)
         return f"baseline of frame {self.frames[0]}"

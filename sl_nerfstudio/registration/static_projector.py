@@ -1,4 +1,4 @@
-"""All frames under a projector that stands still: cameras, then the projector, then everything together."""
+"""Placement of frames under a projector that stands still: cameras, then the projector, then everything together."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -81,7 +81,7 @@ class PatternCells:
     uv_camera: Float64[ndarray, "frames cells 2"]  # NaN where a camera does not see it
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "cells"]) -> "PatternCells":
-        """Some of the squares."""
+        """Select squares."""
         return PatternCells(self.uv_projector[index], self.uv_camera[:, index])
 
 
@@ -359,7 +359,7 @@ class StaticScene:
 
 @dataclass(frozen=True)
 class CellSightings:
-    """Where devices see points."""
+    """Pixels at which devices see points."""
 
     device: Int64[ndarray, "n"]
     point: Int64[ndarray, "n"]
@@ -367,7 +367,7 @@ class CellSightings:
     cameras: int  # devices from this number on are projectors
 
     def chosen(self, rows: Bool[ndarray, "n"]) -> "CellSightings":
-        """Some of the sightings."""
+        """Select sightings."""
         return CellSightings(self.device[rows], self.point[rows], self.uv[rows], self.cameras)
 
 

@@ -70,7 +70,7 @@ class FrameCloud:
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     def with_pose(self, projector: Device, pose: RelativePose) -> "FrameCloud":
-        """The same coordinates with another projector, or another pose of it. Raises as `frame_cloud` does."""
+        """Triangulate with another projector, or another pose of it. Raises as `frame_cloud` does."""
         return frame_cloud(self.name, self.coords, self.camera, projector, pose, light=self.light, seen=self.seen)
 
     @property
@@ -219,7 +219,7 @@ def surface_tone(
 
 
 def _inside(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Without a strip along the border, where the light was measured beside something else."""
+    """Erode by a strip along the border, where the light was measured beside something else."""
     square = np.ones((2 * TONE_BORDER + 1,) * 2, dtype=np.uint8)
     return cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
 
@@ -280,7 +280,7 @@ def _against_surroundings(tone: Float64[ndarray, "h w"]) -> Float64[ndarray, "h 
 
 @dataclass(frozen=True)
 class EmptyPlaces:
-    """Of one frame; lengths in units of its baseline."""
+    """Where one frame saw nothing; lengths in units of its baseline."""
 
     empty: Bool[ndarray, "h w"]  # places of the surface map around which the camera saw nothing of the pattern
     projector: Device  # of the lattice of `reach`: the frame's projector, scaled
@@ -294,7 +294,7 @@ class EmptyPlaces:
 
 
 def find_empty_places(cloud: FrameCloud, camera: Device) -> EmptyPlaces:
-    """Of a frame on the lattice of `camera`; none if it is not known where the frame saw the pattern.
+    """Find them on the lattice of `camera`; none if it is not known where the frame saw the pattern.
 
     `reach` is infinite where the camera saw nothing of what the projector lit, and 0 beside the pattern: there, and
     behind what was seen, a surface may be dark.

@@ -1,4 +1,4 @@
-"""Blocks of frames that contradict the others are turned to where they do not, if the pairs there confirm it."""
+"""Objects that look the same, or nearly, from several sides: symmetric turns, turned blocks, the order of capture."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -76,7 +76,7 @@ MOST_TURNED = 4  # blocks one after the other
 
 
 def typical_step_deg(matches: Sequence[PairMatch]) -> float | None:
-    """By how much successive frames are turned, in degrees (median); None if few of them hold each other in place."""
+    """Median turn of successive frames, in degrees; None if too few pairs are fully constrained."""
     steps = [m for m in matches if m.target - m.source == 1]
     said = [angle_deg(m.S_target_source.R) for m in steps if _holds(m)]
     return float(np.median(said)) if len(said) > LEAST_STEPS * len(steps) else None
@@ -213,7 +213,7 @@ def exact_turn(sides: Sequence[Side], nodes: Component, turn: Similarity) -> Sim
 def _motion_in_camera(
     S_world_camera: Similarity, c_camera: Float64[ndarray, "3"], centre: Float64[ndarray, "3"]
 ) -> Float64[ndarray, "7 6"]:
-    """How a motion (v, w) of the world about `centre` moves a camera's points, (v, w, l) about its own centre.
+    """Matrix by which a motion (v, w) of the world about `centre` moves a camera's points, (v, w, l) about its centre.
 
     Weighted by the camera's unit, so that distances of all cameras count alike.
     """
@@ -236,13 +236,13 @@ def distinct_turns(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> l
 
 
 def is_known(turn: Similarity, found: Sequence[Similarity]) -> bool:
-    """Whether a turn is none, or about one of those found, forwards or backwards."""
+    """Whether a turn is the identity, or a duplicate of one of those found, forwards or backwards."""
     known = (Similarity.identity(), *found, *(T.inverse() for T in found))
     return any(angle_deg((turn @ T.inverse()).R) <= SAME_SIDE_DEG for T in known)
 
 
 def _said(edges: Sequence[PairMatch], solution: PoseGraphSolution) -> Iterator[Similarity]:
-    """By which motions of the world pairs, or their rivals, differ from the solution."""
+    """Motions of the world by which pairs, or their rivals, differ from the solution."""
     nodes, pairs = solution.S_world_camera, zip(edges, solution.consistent, strict=True)
     placed = [(e, used) for e, used in pairs if e.source in nodes and e.target in nodes]
     for e, used in sorted(placed, key=lambda one: (one[1], -quality(one[0]))):
@@ -325,7 +325,7 @@ class TurnedBlock:
 def turned_blocks(
     sides: Sequence[Side], edges: Sequence[PairMatch], solution: PoseGraphSolution, before: Judged
 ) -> list[TurnedBlock]:
-    """Of each turn that pairs of frames say, the block whose contradictions end by it; the greatest relief first.
+    """The block whose contradictions end by each turn that pairs of frames say; the greatest relief first.
 
     `before`: the frames of the solution as they are.
     """
@@ -414,5 +414,5 @@ def _confirmed(graph: ViewGraph, moved: Component, before: float) -> bool:
 
 
 def _as_they_are(graph: ViewGraph, solution: PoseGraphSolution) -> Judged:
-    """How the frames of a solution agree and contradict each other."""
+    """Judge the frames of a solution where they are."""
     return judged(graph.sides, solution.S_world_camera, Similarity.identity(), BLOCK_NEIGHBOURS)

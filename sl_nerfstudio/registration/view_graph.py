@@ -116,7 +116,7 @@ def starting_similarities(T_world_camera: Float64[ndarray, "n 4 4"], maps: Seque
 
 
 def with_common_centre(S_world_camera: Component, maps: Sequence[SurfaceMap]) -> Component:
-    """The same, each moved so that the centres of what the frames see lie in one place.
+    """Move each so that the centres of what the frames see lie in one place.
 
     A camera that is rotated wrongly by a few degrees looks past the object by more than the object's size. Its rotation
     is still a good start.
@@ -156,7 +156,7 @@ class ViewGraph:
 
     @property
     def said(self) -> list[PairMatch]:
-        """All that pairs say or said, right or not: at which sides of the object frames fit."""
+        """All results of pairs, right or not: at which sides of the object frames fit."""
         return [*self.matches, *self.put_aside]
 
     def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
@@ -272,7 +272,7 @@ class ViewGraph:
                 self._tried[pair] = match
 
     def _likeness(self, pairs: Sequence[Pair]) -> list[float]:
-        """How well the best of all starts agrees, of each pair."""
+        """Score of the best of all starts of each pair."""
         rngs = self.rng.spawn(len(pairs))
         tasks = [partial(search_score, self._maps(pair), ANYWHERE, rng) for pair, rng in zip(pairs, rngs, strict=True)]
         return tracked(tasks, "comparing frames")
