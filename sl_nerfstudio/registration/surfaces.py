@@ -208,7 +208,9 @@ def surface_tone(
     cosine = (to_light * normal).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         known = (light > 0) & (cosine > TONE_COSINE) & ((to_camera * normal).sum(-1) > TONE_COSINE)
-        known = _inside(known)
+        # Along the border the light was measured beside something else.
+        square = np.ones((2 * TONE_BORDER + 1,) * 2, dtype=np.uint8)
+        known = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
         tone = np.where(known, np.log(light * distance**2 / cosine), np.nan)
     if known.sum() < TONE_FEWEST_PIXELS:
         return np.full(light.shape, np.nan, dtype=np.float32)
@@ -216,12 +218,6 @@ def surface_tone(
     tone[known] -= _explained(tone[known], normal[known], to_light[known], to_camera[known])
     tone = _against_surroundings(tone)
     return _cut(tone).astype(np.float32)
-
-
-def _inside(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Erode by a strip along the border, where the light was measured beside something else."""
-    square = np.ones((2 * TONE_BORDER + 1,) * 2, dtype=np.uint8)
-    return cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
 
 
 def _cut(tone: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:

@@ -55,24 +55,18 @@ LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for
 
 def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots) -> list[PairMatch]:
     """The pairs in their order; those that tones hold and no cycle of three confirms are taken to slip."""
-    if not any(e.by_tone for e in edges):
-        return list(edges)
     held: defaultdict[int, dict[int, PairMatch]] = defaultdict(dict)
     for e in edges:
         if e.holds:
             held[e.source][e.target] = held[e.target][e.source] = e
-    return [
-        e.without_tone() if e.by_tone and not _confirmed(e, held[e.source], held[e.target], pivots) else e
-        for e in edges
-    ]
 
+    def confirmed(e: PairMatch) -> bool:
+        """Whether the way over a third frame leads to the same similarity."""
+        here, there = held[e.source], held[e.target]
+        around = (there[k].between(k, e.target) @ here[k].between(e.source, k) for k in here.keys() & there.keys())
+        return any(_same(e.S_target_source, S, pivots, e.source) for S in around)
 
-def _confirmed(e: PairMatch, of_source: dict[int, PairMatch], of_target: dict[int, PairMatch], pivots: Pivots) -> bool:
-    """Whether the way over a third frame leads to the same similarity."""
-    around = (
-        of_target[k].between(k, e.target) @ of_source[k].between(e.source, k) for k in of_source if k in of_target
-    )
-    return any(_same(e.S_target_source, S, pivots, e.source) for S in around)
+    return [e.without_tone() if e.by_tone and not confirmed(e) else e for e in edges]
 
 
 def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int) -> bool:
