@@ -70,6 +70,73 @@ DOUBTFUL_SIGMA = 0.02  # the same beyond which the result is doubtful
 LARGEST_NOISE_SHARE = 0.005  # of the pattern's width, beyond which no single projector explains what the cameras see
 DIFFERENCE_STEP = 1e-6  # change of the intrinsics for derivatives
 
+Fault = Literal["no pair", "no projector", "uncertain"]
+
+
+@dataclass(frozen=True)
+class StaticPlacement:
+    """Poses in one world; the baseline of the first two cameras' pair is about one."""
+
+    T_world_camera: Float64[ndarray, "frames 4 4"]  # NaN where a camera could not be placed
+    projector: Device
+    T_world_projector: Float64[ndarray, "4 4"]
+    covariance: Float64[ndarray, "5 5"]  # of its intrinsics, see `values_of`; zero where not free
+    noise_px: float  # robust standard deviation of one coordinate, pixels of all devices
+
+
+@dataclass(frozen=True)
+class NoPlacement:
+    """What could not be found."""
+
+    fault: Fault
+    common: int  # squares that the best two cameras have in common
+    sigma_focal: float = np.inf  # share of the focal length
+
+
+@one_library_thread()
+def place_under_static_projector(
+    coords: Sequence[Float32[ndarray, "_ _ 2"]], cameras: Sequence[Device], projector: Device, known: bool, stated: bool
+) -> StaticPlacement | NoPlacement:
+    """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
+
+    `stated`: the projector is at least a start for them.
+    """
+    cells = find_cells(coords, projector)
+    rays = np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
+    common = np.isfinite(rays[..., 0]).astype(np.float64)
+    most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
+    start = first_pair(rays, cameras)
+    if start is None:
+        return NoPlacement("no pair", most)
+    a, b, T_a_b = start
+    T = np.full((len(cameras), 4, 4), np.nan)
+    T[a], T[b] = np.eye(4), T_a_b
+    T = _grown(T, rays, cells, cameras)
+    points = triangulated(rays, T)
+    firm = _spread(np.isfinite(points[:, 0]))
+    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
+    if found is None:
+        return NoPlacement("no projector", most)
+    device, T_projector = found
+    placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+    scene = StaticScene(
+        (*(cameras[k] for k in placed), device), np.concatenate([T[placed], T_projector[None]]), points[firm]
+    )
+    sightings = _sightings(cells.chosen(firm), placed, with_projector=True)
+    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE")
+    if adjusted.noise_px > LARGEST_NOISE_SHARE * projector.w:
+        return NoPlacement("no projector", most)
+    T[placed] = adjusted.scene.T_world_device[:-1]
+    covariance = np.zeros((5, 5))
+    covariance[np.ix_(free, free)] = DEPENDENCE**2 * adjusted.covariance
+    sigma = float(np.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]))
+    if sigma > LARGEST_SIGMA:
+        return NoPlacement("uncertain", most, sigma)
+    return StaticPlacement(
+        T, adjusted.scene.devices[-1], adjusted.scene.T_world_device[-1], covariance, adjusted.noise_px
+    )
+
+
 # Where every camera sees the centres of small squares of the pattern: matches between all cameras at once.
 
 
@@ -559,77 +626,7 @@ def _by_intrinsic(projector: Device, p: Float64[ndarray, "n 3"], k: int) -> Floa
     return (ahead - behind).numpy() / (2 * DIFFERENCE_STEP)
 
 
-Fault = Literal["no pair", "no projector", "uncertain"]
-_MODELS = (
-    (LOG_FOCAL, CX, CY),
-    (LOG_FOCAL, CX, CY, K1),
-    (LOG_FOCAL, LOG_ASPECT, CX, CY),
-    (LOG_FOCAL, LOG_ASPECT, CX, CY, K1),
-)
-
-
-@dataclass(frozen=True)
-class StaticPlacement:
-    """Poses in one world; the baseline of the first two cameras' pair is about one."""
-
-    T_world_camera: Float64[ndarray, "frames 4 4"]  # NaN where a camera could not be placed
-    projector: Device
-    T_world_projector: Float64[ndarray, "4 4"]
-    covariance: Float64[ndarray, "5 5"]  # of the projector's `parameters.NAMES`; zero where not free
-    noise_px: float  # robust standard deviation of one coordinate, pixels of all devices
-
-
-@dataclass(frozen=True)
-class NoPlacement:
-    """What could not be found."""
-
-    fault: Fault
-    common: int  # squares that the best two cameras have in common
-    sigma_focal: float = np.inf  # share of the focal length
-
-
-@one_library_thread()
-def place_under_static_projector(
-    coords: Sequence[Float32[ndarray, "_ _ 2"]], cameras: Sequence[Device], projector: Device, known: bool, stated: bool
-) -> StaticPlacement | NoPlacement:
-    """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
-
-    `stated`: the projector is at least a start for them.
-    """
-    cells = find_cells(coords, projector)
-    rays = np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
-    common = np.isfinite(rays[..., 0]).astype(np.float64)
-    most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
-    start = first_pair(rays, cameras)
-    if start is None:
-        return NoPlacement("no pair", most)
-    a, b, T_a_b = start
-    T = np.full((len(cameras), 4, 4), np.nan)
-    T[a], T[b] = np.eye(4), T_a_b
-    T = _grown(T, rays, cells, cameras)
-    points = triangulated(rays, T)
-    firm = _spread(np.isfinite(points[:, 0]))
-    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
-    if found is None:
-        return NoPlacement("no projector", most)
-    device, T_projector = found
-    placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    scene = StaticScene(
-        (*(cameras[k] for k in placed), device), np.concatenate([T[placed], T_projector[None]]), points[firm]
-    )
-    sightings = _sightings(cells.chosen(firm), placed, with_projector=True)
-    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE")
-    if adjusted.noise_px > LARGEST_NOISE_SHARE * projector.w:
-        return NoPlacement("no projector", most)
-    T[placed] = adjusted.scene.T_world_device[:-1]
-    covariance = np.zeros((5, 5))
-    covariance[np.ix_(free, free)] = DEPENDENCE**2 * adjusted.covariance
-    sigma = float(np.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]))
-    if sigma > LARGEST_SIGMA:
-        return NoPlacement("uncertain", most, sigma)
-    return StaticPlacement(
-        T, adjusted.scene.devices[-1], adjusted.scene.T_world_device[-1], covariance, adjusted.noise_px
-    )
+# The steps of the placement.
 
 
 def _grown(
@@ -701,6 +698,14 @@ def _projector(
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
     return found
+
+
+_MODELS = (
+    (LOG_FOCAL, CX, CY),
+    (LOG_FOCAL, CX, CY, K1),
+    (LOG_FOCAL, LOG_ASPECT, CX, CY),
+    (LOG_FOCAL, LOG_ASPECT, CX, CY, K1),
+)
 
 
 def _best_model(
