@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
@@ -127,8 +127,12 @@ def frame_cloud(
         T,
         torch.from_numpy(uv_projector[keep]),
     )
-    # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
-    points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
+    d_camera, d_projector = directions(camera, uv_camera[keep]), directions(projector, uv_projector[keep])
+    # Changes of depth by one sigma of the pose along each principal axis of its covariance.
+    slopes = camera_depth_by_pose(
+        pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3], d_camera, d_projector
+    )
+    variance, axes = np.linalg.eigh(pose.covariance)
     return FrameCloud(
         name,
         camera,
@@ -136,9 +140,10 @@ def frame_cloud(
         pose,
         agreeing_coords(coords, camera, projector, pose),
         uv_camera[keep],
-        points,
+        # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
+        points=d_camera * found.depth_camera.numpy()[:, None],
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
-        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+        pose_errors=slopes @ (axes * np.sqrt(variance.clip(0))),
         light=light,
         seen=seen,
         alternatives=tuple(
@@ -147,20 +152,6 @@ def frame_cloud(
             if other.inliers.sum() >= FEWEST_POINTS
         ),
     )
-
-
-def _pose_errors(
-    uv_camera: Float[ndarray, "n 2"],
-    uv_projector: Float[ndarray, "n 2"],
-    camera: Device,
-    projector: Device,
-    pose: RelativePose,
-) -> Float64[ndarray, "n 5"]:
-    """Changes of depth by one sigma of the pose along each principal axis of its covariance."""
-    R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
-    slopes = camera_depth_by_pose(R, t, directions(camera, uv_camera), directions(projector, uv_projector))
-    variance, axes = np.linalg.eigh(pose.covariance)
-    return slopes @ (axes * np.sqrt(variance.clip(0)))
 
 
 def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
