@@ -1,13 +1,15 @@
 """A projector that stands still: cameras from its codes, its intrinsics by resection."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import torch
 
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.triangulation import pixel_centres
+from sl_nerfstudio.registration import static_projector
 from sl_nerfstudio.registration.static_projector import (
-    STATIC_DEFAULTS,
     NoPlacement,
     StaticPlacement,
     find_cells,
@@ -15,14 +17,62 @@ from sl_nerfstudio.registration.static_projector import (
     resect,
 )
 from sl_nerfstudio.relative_pose.unknown_projector import values_of
-from tests.registration.static_projector.still_beam import BEAM, CAMERA, still_beam
+from tests.relative_pose.two_views import pose_of
+from tests.relative_pose.unknown_views import aimed
+
+CAMERA = Device(160, 120, 200.0, 197.0, 81.0, 59.0, k1=-0.05)
+BEAM = Device(640, 400, 1000.0, 1000.0, 310.0, 680.0)
+PLACES = ((0.0, 0.0, 0.0), (1.1, 0.2, 0.1), (-0.9, 0.6, -0.2), (0.3, -1.0, 0.2))
+
+
+@dataclass(frozen=True)
+class StillBeam:
+    """Coordinates of all cameras, and what is true."""
+
+    coords: list[np.ndarray]
+    T_world_camera: np.ndarray
+    T_world_projector: np.ndarray
+
+
+def still_beam(count: int, noise: float = 0.0) -> StillBeam:
+    """The surface is z = -4.5 + bumps(x, y); rays meet it by Newton's iterations."""
+    T_projector = aimed((0.5, 0.9, 0.0), BEAM, 5.0)
+    cameras = [pose_of(place, (0.05, 0.0, -4.5), 8.0 * k) if k else np.eye(4) for k, place in enumerate(PLACES[:count])]
+    coords = []
+    for k, T in enumerate(cameras):
+        uv = pixel_centres(CAMERA, torch.float64)
+        d = unproject(Intrinsics.of(CAMERA, torch.float64), uv).numpy().reshape(-1, 3) @ T[:3, :3].T
+        o, along = T[:3, 3], np.full(len(d), 4.5)
+        for _ in range(60):
+            p = o + along[:, None] * d
+            along = along + (_height(p) - p[:, 2]) / d[:, 2] * 0.8
+        p = o + along[:, None] * d
+        seen, front = project(
+            Intrinsics.of(BEAM, torch.float64), torch.from_numpy((p - T_projector[:3, 3]) @ T_projector[:3, :3])
+        )
+        seen = seen.numpy()
+        inside = front.numpy() & (seen > 0).all(1) & (seen < (BEAM.w, BEAM.h)).all(1) & (np.abs(p[:, 2] + 4.5) < 1)
+        seen = seen + noise * np.random.default_rng(k).standard_normal(seen.shape)
+        seen[~inside] = np.nan
+        coords.append(seen.reshape(CAMERA.h, CAMERA.w, 2).astype(np.float32))
+    return StillBeam(coords, np.stack(cameras), T_projector)
+
+
+def _height(p: np.ndarray) -> np.ndarray:
+    x, y = p[:, 0], p[:, 1]
+    return -4.5 + 0.2 * x + 0.25 * (np.sin(2.1 * x + 0.4) * np.cos(1.7 * y) + 0.5 * np.sin(1.3 * x * y + y))
+
 
 BLANK = Device(BEAM.w, BEAM.h, 1.5 * BEAM.w, 1.5 * BEAM.w, BEAM.w / 2, BEAM.h / 2)
-QUICK = replace(STATIC_DEFAULTS, most_points=500)
+
+
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch):
+    monkeypatch.setattr(static_projector, "MOST_POINTS", 500)
 
 
 def placed(beam, projector=BLANK, known=False) -> StaticPlacement:
-    found = place_under_static_projector(beam.coords, [CAMERA] * len(beam.coords), projector, known, known, QUICK)
+    found = place_under_static_projector(beam.coords, [CAMERA] * len(beam.coords), projector, known, known)
     assert isinstance(found, StaticPlacement)
     return found
 
@@ -75,7 +125,7 @@ def test_known_intrinsics_stay_and_only_poses_are_found():
 def test_codes_that_are_mirrored_in_one_frame_are_refused():
     beam = still_beam(2)
     mirrored = [beam.coords[0], np.float32([BEAM.w, 0]) + np.float32([-1, 1]) * beam.coords[1]]
-    assert isinstance(place_under_static_projector(mirrored, [CAMERA] * 2, BLANK, False, False, QUICK), NoPlacement)
+    assert isinstance(place_under_static_projector(mirrored, [CAMERA] * 2, BLANK, False, False), NoPlacement)
 
 
 def test_cameras_without_common_codes_are_refused():
@@ -83,7 +133,7 @@ def test_cameras_without_common_codes_are_refused():
     left, right = beam.coords[0].copy(), beam.coords[1].copy()
     left[left[..., 0] > BEAM.w / 2] = np.nan
     right[right[..., 0] < BEAM.w / 2] = np.nan
-    found = place_under_static_projector([left, right], [CAMERA] * 2, BLANK, False, False, QUICK)
+    found = place_under_static_projector([left, right], [CAMERA] * 2, BLANK, False, False)
     assert isinstance(found, NoPlacement) and found.fault == "no pair" and found.common < 60
 
 
@@ -93,7 +143,7 @@ def test_centres_of_squares_are_seen_where_a_linear_map_puts_them(factor):
     row, column = np.mgrid[:90, :120] + 0.5
     uv = np.stack([factor * (2 * column + 0.3 * row + 20), factor * (1.5 * row - 0.2 * column + 40)], -1)
     size = Device(int(400 * factor), int(300 * factor), 1.0, 1.0, 0.0, 0.0)
-    cells = find_cells([uv.astype(np.float32)] * 2, size, STATIC_DEFAULTS.cells)
+    cells = find_cells([uv.astype(np.float32)] * 2, size)
     assert len(cells.uv_projector) > 50
     x, y = cells.uv_camera[0].T
     back = np.stack([factor * (2 * x + 0.3 * y + 20), factor * (1.5 * y - 0.2 * x + 40)], -1)

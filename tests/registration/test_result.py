@@ -1,8 +1,19 @@
+"""What registration found, and the known length that sets its scale."""
+
 import numpy as np
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.registration.result import KnownLength, parse_known_length, scale_to
+from sl_nerfstudio.registration.result import (
+    KnownLength,
+    NoCommonSurface,
+    Registration,
+    UncertainRotation,
+    UndecidedProjector,
+    parse_known_length,
+    scale_to,
+    without_undecided,
+)
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
 
@@ -94,3 +105,19 @@ def test_frames_and_pixels_that_are_not_there_are_named(clouds):
     camera[1] = np.nan
     with pytest.raises(UserError, match="frame_00001 was not registered"):
         scale_to(parse_known_length("baseline of frame 1 = 1 m"), "m", clouds, camera, projector)
+
+
+def test_frames_whose_projector_is_undecided_are_left_out():
+    T, baseline, lost = np.tile(np.eye(4), (4, 1, 1)), np.ones(4), (NoCommonSurface("d"),)
+    doubtful = tuple(UncertainRotation(name, 5.0) for name in "ab")
+    found = Registration(
+        tuple("abcd"), T, baseline, np.arange(4) < 3, np.array([0, 0, 0, -1]), np.ones(4), (), lost, doubtful
+    )
+    doubts = UndecidedProjector("b", 12.0), UndecidedProjector("d", 12.0)  # d is out already
+    one = without_undecided(found, doubts)
+    assert one.exclusions == (*lost, doubts[0]) and one.uncertainties == doubtful[:1]
+    assert one.registered.tolist() == [True, False, True, False] and one.component.tolist() == [0, -1, 0, -1]
+    for values in (one.T_world_camera[:, 0, 0], one.baseline, one.fitness):
+        assert np.isnan(values).tolist() == [False, True, False, False]
+    same = without_undecided(found, ())
+    assert same.exclusions == lost and same.registered.tolist() == found.registered.tolist()

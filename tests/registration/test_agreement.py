@@ -1,46 +1,44 @@
 """The compiled sums of points against surfaces, against a plain formula and against differences."""
 
 from dataclasses import replace
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
-from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.geometry.triangulation import pixel_centres
+from sl_nerfstudio.registration import agreement as module
 from sl_nerfstudio.registration.agreement import (
+    AGREEING_SIGMAS,
+    BEHIND_WEIGHT,
+    HIDDEN_DEPTH,
+    KERNEL_CUTOFF,
+    LEAST_LIT_COSINE,
+    PENALTY,
     Hypotheses,
     Side,
     Tolerance,
     agreement,
     agreement_at,
 )
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS
-from sl_nerfstudio.registration.surfaces import (
-    EmptyPlaces,
-    FrameView,
-    SurfaceMap,
-    build_surface_map,
-    tangent_planes,
-)
+from sl_nerfstudio.registration.pairs import ANYWHERE, register_pair
+from sl_nerfstudio.registration.surfaces import EmptyPlaces, FrameView, SurfaceMap, build_surface_map, tangent_planes
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
+from tests.registration.shaped_clouds import rendered
 from tests.relative_pose.two_views import pose_of
 
 SIZE = 100
 RIG = rig_of(18, SIZE)
 TRUE = similarities_of(RIG.T_world_camera.numpy(), RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy())
-LIMITS = REGISTRATION_DEFAULTS.pair.agreement
 NEAR = Tolerance(0.04, 0.0)
 PROJECTOR = Device(30, 24, 26.0, 27.0, 15.5, 11.0, k1=0.05)
 CAMERAS = {
@@ -60,10 +58,10 @@ def between(i: int, j: int) -> Similarity:
 
 
 def stacked(*similarities: Similarity) -> Hypotheses:
-    return Hypotheses.joined([Hypotheses.of(S) for S in similarities])
+    return Hypotheses.of(*similarities)
 
 
-# ------------------------------------------------------------------ against a plain formula
+# Against a plain formula.
 
 
 def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
@@ -87,7 +85,7 @@ def bumpy_map(camera: Device, seed: int) -> SurfaceMap:
     )
 
 
-def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, width: Tolerance, facing_least: float):
+def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, facing_least: float):
     """H, g and the shares and mean square of one similarity, point by point as the module's text says."""
     radius = target.map.radius
     H, g, shares, squares, costs, absent = np.zeros((7, 7)), np.zeros(7), [], [], [], []
@@ -105,17 +103,17 @@ def plain_sums(source: Side, target: Side, S: Similarity, tolerance: Tolerance, 
         r = (N * (p[inside] - P)).sum(-1) * (S.scale if reverse else 1)
         sigma_seen = seen.map.sigma[row[inside], column[inside]] * (S.scale if reverse else 1)
         spread = np.hypot(mover.sigma[inside] * (1 if reverse else S.scale), sigma_seen)
-        tau, kernel = (np.maximum(x.radii * radius, x.sigmas * spread) for x in (tolerance, width))
+        tau = np.maximum(tolerance.radii * radius, tolerance.sigmas * spread)
         facing = (N * n[inside]).sum(-1)
         on = (np.abs(r) < tau) & (facing > facing_least)
         before = ~on & (r > tau)
-        behind = ~on & ~before & (r > -LIMITS.hidden_depth * radius)
+        behind = ~on & ~before & (r > -HIDDEN_DEPTH * radius)
         shares.append([x.sum() / len(mover.points) for x in (on, before, behind)])
         squares += ((r / spread)[on] ** 2).tolist()
-        x2 = ((r / kernel)[on | before | behind]) ** 2
+        x2 = ((r / tau)[on | before | behind]) ** 2
         costs += (x2 / (1 + x2)).tolist()
-        used = (facing >= facing_least) & (np.abs(r) <= LIMITS.kernel_cutoff * kernel)
-        w = facing[used] / (1 + (r / kernel)[used] ** 2) ** 2
+        used = (facing >= facing_least) & (np.abs(r) <= KERNEL_CUTOFF * tau)
+        w = facing[used] / (1 + (r / tau)[used] ** 2) ** 2
         m = -N[used] @ S.R.T if reverse else N[used]
         x = (mover.points if reverse else p)[inside][used] - target.map.centroid
         J = np.concatenate([m, np.cross(x, m), (x * m).sum(-1, keepdims=True)], 1)
@@ -134,12 +132,13 @@ def plain_absent(nothing: EmptyPlaces, p: ndarray, n: ndarray, row: ndarray, col
     h, w = nothing.reach.shape
     lit = front.numpy() & (x >= 0) & (y >= 0) & (x < w) & (y < h)
     lit[lit] &= np.linalg.norm(q[lit], axis=1) < nothing.reach[y[lit], x[lit]]
-    return int((nothing.empty[row, column] & lit & (np.min(towards, 0) >= LIMITS.least_lit_cosine)).sum())
+    return int((nothing.empty[row, column] & lit & (np.min(towards, 0) >= LEAST_LIT_COSINE)).sum())
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
 @pytest.mark.parametrize("seed", range(3))
-def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
+def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed, monkeypatch):
+    monkeypatch.setattr(module, "LEAST_FACING_COSINE", 0.5)
     rng = np.random.default_rng(seed)
     sides = [Side.sampled(bumpy_map(camera, seed + 10 * k), 600, rng)
              for k, camera in enumerate((CAMERAS[name], CAMERAS["lens"]))]  # fmt: skip
@@ -151,11 +150,10 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
         )
         for _ in range(4)
     ]
-    limits = replace(LIMITS, least_facing_cosine=0.5)
-    tolerance, width = Tolerance(0.03, 3.0), Tolerance(0.05, 4.0)  # each decides at some points
-    found = agreement(*sides, stacked(*similarities), tolerance, width, limits)
+    tolerance = Tolerance(0.03, 3.0)  # each decides at some points
+    found = agreement(*sides, stacked(*similarities), tolerance)
     for k, S in enumerate(similarities):
-        H, g, shares, squares, cost, absent = plain_sums(*sides, S, tolerance, width, 0.5)
+        H, g, shares, squares, cost, absent = plain_sums(*sides, S, tolerance, 0.5)
         assert shares.min() > 0.02 and absent > 0.01  # every case is present
         np.testing.assert_allclose(found.H[k], H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
         np.testing.assert_allclose(found.g[k], g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
@@ -165,10 +163,11 @@ def test_the_compiled_sums_are_those_of_the_plain_formula(name, seed):
         assert found.judged[k] == pytest.approx(shares.sum())
         assert found.absent[k] == pytest.approx(absent)
         assert found.fitness[k] == pytest.approx(shares[0] / (shares.sum() + absent))
-        assert found.score(3.0, 0.25)[k] == pytest.approx(shares[0] - 3 * (shares[1] + absent + 0.25 * shares[2]))
+        against = shares[1] + absent + BEHIND_WEIGHT * shares[2]
+        assert found.score(PENALTY)[k] == pytest.approx(shares[0] - PENALTY * against)
 
 
-# ------------------------------------------------------------------ on surfaces
+# On surfaces.
 
 
 def test_derivatives_of_the_agreement_are_those_of_differences(maps):
@@ -176,71 +175,24 @@ def test_derivatives_of_the_agreement_are_those_of_differences(maps):
     rng = np.random.default_rng(0)
     sides = [Side.sampled(m, 300, rng) for m in maps]
     S = between(0, 1)
-    c, near, wide = maps[1].centroid, Tolerance(0.5, 0.0), Tolerance(1e3, 0.0)
+    c, wide = maps[1].centroid, Tolerance(1e3, 0.0)
 
     def moved(x: ndarray) -> Similarity:
         turn = Rotation.from_rotvec(x[3:6]).as_matrix()
         return Similarity(float(np.exp(x[6])), turn, c - np.exp(x[6]) * turn @ c + x[:3]) @ S
 
     # sums of r itself along each unknown: H[:, k] = sum w J J_k is the change of g with a step along k
-    at_S = agreement(*sides, Hypotheses.of(S), near, wide)
+    at_S = agreement(*sides, Hypotheses.of(S), wide)
     H, h = at_S.H[0], 1e-5
     for k in range(7):
         ahead, behind = (moved(s * h * np.eye(7)[k]) for s in (1, -1))
-        g_a, g_b = agreement(*sides, stacked(ahead, behind), near, wide).g
+        g_a, g_b = agreement(*sides, stacked(ahead, behind), wide).g
         # points that change their pixel make single jumps, so only the whole vectors are compared
         assert (g_a - g_b) @ H[:, k] / (2 * h) == pytest.approx(H[:, k] @ H[:, k], rel=0.25)
     assert np.isfinite(at_S.g).all()
 
 
-def test_the_truth_agrees_and_a_displaced_surface_is_seen_in_front(maps):
-    rng = np.random.default_rng(0)
-    sides = [Side.sampled(m, 500, rng) for m in maps]
-    S = between(0, 1)
-    nearer = Similarity(S.scale, S.R, S.t + np.array([0.0, 0.0, 0.6 * maps[1].radius]))
-    found = agreement(*sides, stacked(S, nearer), NEAR, NEAR)
-    assert found.fitness[0] > 0.9
-    assert found.agreeing[0] > 0.4
-    score = found.score(LIMITS.search_penalty, LIMITS.behind)
-    assert score[0] > 3 * max(score[1], 0.1)
-    assert found.in_front[1] > 0.2
-
-
-def test_a_surface_moved_back_is_behind_until_it_is_hidden(maps):
-    """A little behind it contradicts; farther than the hidden depth it says nothing."""
-    rng = np.random.default_rng(0)
-    sides = [Side.sampled(m, 500, rng) for m in maps]
-    S, radius = between(0, 1), maps[1].radius
-    a_little, far = (Similarity(S.scale, S.R, S.t - np.array([0, 0, d * radius])) for d in (0.15, 3.0))
-    found = agreement(*sides, stacked(S, a_little, far), NEAR, NEAR)
-    assert found.behind[1] > found.behind[0] + 0.1
-    assert found.agreeing[2] < 0.02
-
-
-def test_agreement_of_one_similarity(maps):
-    pair = maps[0], maps[1]
-    found = agreement_at(pair, between(0, 1), np.random.default_rng(0), NEAR, REGISTRATION_DEFAULTS.pair)
-    assert len(found.agreeing) == 1
-    assert found.fitness[0] > 0.9
-
-
-# ------------------------------------------------------------------ the tolerance
-
-
-def test_the_tolerance_does_not_grow_with_what_else_is_in_view(maps):
-    """A wall behind the object makes everything in view ten times as large; the noise is the same."""
-    rng = np.random.default_rng(0)
-    sides = [Side.sampled(m, 500, rng) for m in maps]
-    by_noise = Tolerance(0.0, 4.0)
-    off = Similarity(1.0, np.eye(3), 0.2 * maps[1].radius * maps[1].centroid / np.linalg.norm(maps[1].centroid))
-    both = stacked(between(0, 1), off @ between(0, 1))
-    found = agreement(*sides, both, by_noise, by_noise)
-    large = replace(sides[1], map=replace(maps[1], radius=10 * maps[1].radius))
-    again = agreement(sides[0], large, both, by_noise, by_noise)
-    np.testing.assert_array_equal(again.agreeing, found.agreeing)
-    np.testing.assert_array_equal(again.in_front, found.in_front)
-    np.testing.assert_array_equal(again.H, found.H)
-    assert found.agreeing[1] < 0.2 < 0.4 < found.agreeing[0]
+# The tolerance.
 
 
 @settings(max_examples=15)
@@ -252,9 +204,7 @@ def test_agreement_does_not_depend_on_the_unit_of_either_frame(maps, a, b, by_le
     sides = [Side.sampled(m, 300, np.random.default_rng(0)) for m in maps]
     scaled = [Side.sampled(in_unit(m, f), 300, np.random.default_rng(0)) for m, f in zip(maps, factors, strict=True)]
     S = Similarity.scaling(factors[1]) @ between(0, 1) @ Similarity.scaling(1 / factors[0])
-    found, again = (
-        agreement(*pair, Hypotheses.of(T), tolerance, tolerance) for pair, T in ((sides, between(0, 1)), (scaled, S))
-    )
+    found, again = (agreement(*pair, Hypotheses.of(T), tolerance) for pair, T in ((sides, between(0, 1)), (scaled, S)))
     for key in ("agreeing", "in_front", "behind", "squares"):
         np.testing.assert_allclose(getattr(again, key), getattr(found, key), rtol=1e-9)
     D = np.array([1.0] * 3 + [factors[1]] * 4)
@@ -264,3 +214,61 @@ def test_agreement_does_not_depend_on_the_unit_of_either_frame(maps, a, b, by_le
 def in_unit(m: SurfaceMap, factor: float) -> SurfaceMap:
     lengths = {key: getattr(m, key) * factor for key in ("point", "centroid", "radius")}
     return replace(m, plane=tangent_planes(m.point * factor, m.normal, m.sigma * factor), **lengths)
+
+
+# Empty places: a frame that looks into empty space contradicts what would fill it.
+
+EMPTY_FRAMES = (0, 2, 6, 8)
+
+
+def maps_with_empty_places(clouds) -> list[SurfaceMap]:
+    """The frames with what they saw of the pattern: here, all that has coordinates."""
+    return [build_surface_map(replace(cloud, seen=np.isfinite(cloud.coords).all(-1))) for cloud in clouds]
+
+
+def absent_in_pairs(maps, poses, change: Similarity | None = None) -> list[float]:
+    """Shares of points that are missed, of all pairs of frames; `change` of the world is done to the first of each."""
+    out = []
+    for i, j in permutations(range(len(maps)), 2):
+        S = poses[j].inverse() @ (poses[i] if change is None else change @ poses[i])
+        found = agreement_at((maps[i], maps[j]), S, np.random.default_rng(0), Tolerance(0.0, AGREEING_SIGMAS))
+        out.append(float(found.absent[0]))
+    return out
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    """A box whose three sides differ; the longest is along x."""
+    file = tmp_path_factory.mktemp("box") / "box.ply"
+    trimesh.creation.box((110, 70, 50)).subdivide_to_size(8.0).export(file)
+    return rendered(str(file), EMPTY_FRAMES)
+
+
+@pytest.mark.parametrize("scene", ["chair", "vase"])
+def test_right_frames_miss_nothing_of_each_other(scene):
+    found = rendered(scene, EMPTY_FRAMES)
+    assert max(absent_in_pairs(maps_with_empty_places(found.clouds), found.S_world_camera)) < 0.005
+
+
+def test_what_is_larger_than_it_was_seen_is_missed_where_it_is_known_what_was_seen(box):
+    larger = Similarity(1.3, np.eye(3), np.zeros(3))
+    assert min(absent_in_pairs(maps_with_empty_places(box.clouds), box.S_world_camera, larger)) > 0.02
+    assert max(absent_in_pairs([build_surface_map(c) for c in box.clouds], box.S_world_camera, larger)) == 0
+
+
+def test_a_side_of_a_box_does_not_pass_for_another(box):
+    """Wherever faces overlap they agree, at several sides; only where one ends do frames contradict each other."""
+    true = box.S_world_camera
+    blind, seeing = [build_surface_map(c) for c in box.clouds], maps_with_empty_places(box.clouds)
+    right, wrong = [], []
+    for i, j in combinations(range(len(EMPTY_FRAMES)), 2):
+        match = register_pair((blind[i], blind[j]), (i, j), ANYWHERE, np.random.default_rng(0))
+        S = match.S_target_source
+        known = agreement_at((seeing[i], seeing[j]), S, np.random.default_rng(0), Tolerance(0.0, AGREEING_SIGMAS))
+        off_deg = angle_deg(S.R @ (true[j].inverse() @ true[i]).R.T)
+        same = min(off_deg, abs(180 - off_deg)) < 3  # half a turn leaves the box as it is
+        (right if same else wrong).append((match.fitness, known.absent[0]))
+    assert min(len(right), len(wrong)) > 0
+    assert min(fitness for fitness, _ in (*right, *wrong)) > 0.99  # nothing that both saw contradicts
+    assert max(absent for _, absent in right) < 0.01
+    assert min(absent for _, absent in wrong) > 0.02
