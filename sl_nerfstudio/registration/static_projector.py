@@ -18,15 +18,14 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
-from sl_nerfstudio.relative_pose.unknown_projector import (
+from sl_nerfstudio.relative_pose.joint_fit import (
     CX,
     CY,
     K1,
     LOG_ASPECT,
     LOG_FOCAL,
-    IntrinsicsPrior,
+    PRIOR_SIGMA,
     device_with,
-    prior_sigma,
     values_of,
 )
 
@@ -109,8 +108,6 @@ class StaticSettings:
     """noise, as a share of the pattern's width, beyond which no single projector explains what the cameras see"""
     doubtful_sigma: float = 0.02
     """the same beyond which the result is doubtful"""
-    prior: IntrinsicsPrior = field(default_factory=IntrinsicsPrior)
-    """what is known of any projector"""
     cells: CellSettings = field(default_factory=CellSettings)
     """squares"""
     chain: ChainSettings = field(default_factory=ChainSettings)
@@ -501,7 +498,7 @@ class _Prior:
 
     @staticmethod
     def of(projector: Device, free: tuple[int, ...], settings: StaticSettings) -> "_Prior":
-        return _Prior(values_of(projector), prior_sigma(settings.prior), free, settings.difference_step)
+        return _Prior(values_of(projector), PRIOR_SIGMA, free, settings.difference_step)
 
     def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
         index = list(self.free)
@@ -705,7 +702,7 @@ class StaticPlacement:
     T_world_camera: Float64[ndarray, "frames 4 4"]  # NaN where a camera could not be placed
     projector: Device
     T_world_projector: Float64[ndarray, "4 4"]
-    covariance: Float64[ndarray, "5 5"]  # of the projector's `parameters.NAMES`; zero where not free
+    covariance: Float64[ndarray, "5 5"]  # of the projector's `joint_fit.NAMES`; zero where not free
     noise_px: float  # robust standard deviation of one coordinate, pixels of all devices
 
 
