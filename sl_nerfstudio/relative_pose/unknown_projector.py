@@ -59,7 +59,7 @@ START_MATCHES, START_ITERATIONS = 200, 20  # of each frame; of the fit from each
 
 # Choice of the model.
 CHOICE_MATCHES = 12_000  # correspondences of all frames
-FOLDS, FOLD_ITERATIONS = 4, 6  # parts of the pattern's squares that are left out in turn; of the fits to the others
+FOLDS = 4  # parts of the pattern's squares that are left out in turn
 STANDARD_ERRORS = 2.0  # by which left-out squares must agree better for another free parameter
 
 Cause = Literal["few frames", "similar frames", "flat", "unknown"]
@@ -368,7 +368,7 @@ def _significant(matches: PointMatches, first: JointFit, usual: Float64[ndarray,
     The others cannot improve left-out correspondences by more than chance.
     """
     problem = JointProblem(matches, first.device, (*first.free, *_FURTHER), usual)
-    found = problem.fit(first.poses, FOLD_ITERATIONS)
+    found = problem.fit(first.poses)
     away = np.abs(values_of(found.device) - values_of(first.device))[list(_FURTHER)]
     sigma = np.sqrt(np.diag(found.covariance))[len(first.free) :]
     return tuple(k for k, far in zip(_FURTHER, away > STANDARD_ERRORS * sigma, strict=True) if far)
@@ -382,7 +382,7 @@ def _left_out(
     out = np.zeros(len(matches.frame))
     for k in range(FOLDS):
         problem = JointProblem(matches.chosen(fold != k), first.device, free, usual)
-        found = problem.fit(first.poses, FOLD_ITERATIONS)
+        found = problem.fit(first.poses)
         out[fold == k] = _losses(matches.chosen(fold == k), found, first.noise_px)
     return out
 
