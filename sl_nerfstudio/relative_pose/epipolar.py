@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
+from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled
 
@@ -25,9 +26,6 @@ BLOCK_NUMBERS = (5 * BLOCKS_ALONG) ** 2  # all numbers that `blocks_of` gives ar
 MOST_PIXELS = 600_000  # of larger images every second, third, .. row and column is used
 NOISE_FLOOR_PX = 1e-3  # noise that is assumed at least, projector pixels
 KERNEL_SIGMAS = 3.0  # width of the robust kernel, standard deviations of the residuals
-CONVERGED_RAD = 1e-10  # size of a step, radian
-FIRST_DAMPING, LEAST_DAMPING, DAMPING_FACTOR = 1e-4, 1e-12, 10.0  # relative to the diagonal of the normal equations
-MOST_TRIES = 8  # dampings that are tried before the fit ends
 
 UnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
 
@@ -301,32 +299,24 @@ def fit_epipolar(
 
     The kernel follows the noise as it falls, and never widens again (graduated non-convexity).
     """
-    damping, step_size = FIRST_DAMPING, np.inf
     width = np.inf
-    for _ in range(iterations):
-        r, J = sampson_jacobian(R, t, rays)
-        width = min(width, KERNEL_SIGMAS * noise_of(r))
-        w = geman_mcclure_weight((r / width) ** 2)
-        H, g = (J * w[:, None]).T @ J, J.T @ (w * r)
-        cost = _cost(r, width)
-        for _ in range(MOST_TRIES):
-            step = -np.linalg.lstsq(H + damping * np.diag(np.diag(H)), g, rcond=1e-14)[0]
-            R_new, t_new = moved(R, t, step)
-            if _cost(sampson(R_new, t_new, rays), width) <= cost:
-                R, t, step_size = R_new, t_new, float(np.abs(step).max())
-                damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
-                break
-            damping *= DAMPING_FACTOR
-        else:
-            break
-        if step_size < CONVERGED_RAD:
-            break
+
+    def narrow(pose: UnitPose) -> None:
+        nonlocal width
+        width = min(width, KERNEL_SIGMAS * noise_of(sampson(*pose, rays)))
+
+    def equations(pose: UnitPose) -> NormalEquations:
+        r, J = sampson_jacobian(*pose, rays)
+        return NormalEquations.of(J, r, geman_mcclure_weight((r / width) ** 2))
+
+    def cost(pose: UnitPose) -> float:
+        return width**2 * float(geman_mcclure_cost((sampson(*pose, rays) / width) ** 2).sum()) / 2
+
+    R, t = minimise(
+        (R, t), equations, lambda pose, step: moved(*pose, step), cost, narrow=narrow, iterations=iterations
+    ).state
     r = sampson(R, t, rays)
     return EpipolarFit(R, t, r, noise_of(r))
-
-
-def _cost(r: Float64[ndarray, "n"], width: float) -> float:
-    return width**2 * float(geman_mcclure_cost((r / width) ** 2).sum())
 
 
 def covariance(found: EpipolarFit, rays: RayPairs) -> Float64[ndarray, "5 5"]:

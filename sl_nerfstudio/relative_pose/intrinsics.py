@@ -272,9 +272,7 @@ def check_intrinsics(
     )
 
 
-def _evidence(
-    frames: Sequence[FrameMatches], poses: Sequence[UnitPose], device: Device, seed: int
-) -> DeviceEvidence:
+def _evidence(frames: Sequence[FrameMatches], poses: Sequence[UnitPose], device: Device, seed: int) -> DeviceEvidence:
     most = max(min(MOST_PER_FRAME, MOST_CHECKED // len(frames)), 1)
     matches, usual = PointMatches.of(frames, device, most, np.random.default_rng(seed)), values_of(device)
     held = JointProblem(matches, device, (), usual).fit(poses)
