@@ -21,7 +21,7 @@ State = TypeVar("State")
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e8
 _DAMPING_FACTOR = 10.0
 _RCOND = 1e-14  # directions of the scaled normal equations below this share of the largest are not moved along
-_LEAST_DIAGONAL = 1e-12  # of its mean, added to each block so that an undetermined one can be inverted
+_LEAST_DAMPING_OF_BLOCKS = 1e-14  # so that an undetermined block can be inverted, and hardly anything else changes
 
 
 class Equations(Protocol):
@@ -111,8 +111,8 @@ class BlockEquations:
 
     def _damped(self, damping: float) -> Float64[ndarray, "b k k"]:
         diagonal = np.einsum("bkk->bk", self.H_block)
-        least = _LEAST_DIAGONAL * diagonal.mean(1, keepdims=True) + np.finfo(float).tiny
-        return self.H_block + (damping * diagonal + least)[..., None] * np.eye(self.H_block.shape[-1])
+        added = (damping + _LEAST_DAMPING_OF_BLOCKS) * diagonal + np.finfo(float).tiny
+        return self.H_block + added[..., None] * np.eye(self.H_block.shape[-1])
 
 
 @dataclass(frozen=True)

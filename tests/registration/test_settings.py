@@ -10,20 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_nerfstudio import registration, relative_pose
+from sl_nerfstudio import registration
 from sl_nerfstudio.registration import settings as registration_settings
 from sl_nerfstudio.registration import settings as symmetry_settings
 from sl_nerfstudio.registration import settings as tone_settings
 from sl_nerfstudio.registration.settings import FrameCloudSettings
 from sl_nerfstudio.registration.surfaces import frame_cloud
-from sl_nerfstudio.relative_pose import epipolar as relative_pose_settings
-from sl_nerfstudio.relative_pose.epipolar import RELATIVE_POSE_DEFAULTS, EpipolarFitSettings
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
+from sl_nerfstudio.relative_pose.estimation import RelativePoseError
 from tests.relative_pose.known_pose import known_pose
 from tests.relative_pose.two_views import view
 
 MODULES = {
-    relative_pose_settings: relative_pose,
     registration_settings: registration,
     symmetry_settings: registration,
     tone_settings: registration,
@@ -54,7 +51,7 @@ def test_every_setting_is_frozen_documented_and_used(module, cls):
         assert re.search(rf"\.{field.name}\b", code), f"{cls.__name__}.{field.name} is not used"
 
 
-@pytest.mark.parametrize("package", [relative_pose, registration], ids=["relative_pose", "registration"])
+@pytest.mark.parametrize("package", [registration], ids=["registration"])
 def test_no_other_file_has_numbers_of_its_own(package):
     """Numbers that decide something are settings; a private constant elsewhere would hide one."""
     for path in Path(package.__file__).parent.rglob("*.py"):
@@ -66,18 +63,6 @@ def test_no_other_file_has_numbers_of_its_own(package):
                 numbers = [v for v in held if isinstance(v, int | float) and not isinstance(v, bool)]
                 name = ast.unparse(node.targets[0])
                 assert not numbers or name == "_METRES", f"{path.name}: {name}"
-
-
-def test_the_limits_of_a_relative_pose_are_obeyed():
-    frame = view(count=300).noisy(0.3, seed=0)
-    with pytest.raises(RelativePoseError, match=r"300 decoded pixels are too few .* \(at least 301\)"):
-        estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, fewest=301))
-    with pytest.raises(RelativePoseError, match="best relative pose fits"):
-        estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, least_inlier_share=1.1))
-    narrow = estimate_relative_pose(*frame.arguments, settings=replace(RELATIVE_POSE_DEFAULTS, inlier_sigmas=1.0))
-    assert 0.5 < narrow.inliers.mean() < 0.8  # of a normal distribution: 0.68
-    floor = replace(RELATIVE_POSE_DEFAULTS, fit=EpipolarFitSettings(noise_floor_px=0.5))
-    assert estimate_relative_pose(*view(count=300).arguments, settings=floor).residual_px == 0.5
 
 
 def test_the_limit_of_a_cloud_is_obeyed():
