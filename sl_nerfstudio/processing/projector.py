@@ -52,18 +52,8 @@ from sl_nerfstudio.relative_pose.estimation import (
     relative_pose_near,
 )
 from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEvidence, Role, check_intrinsics
-from sl_nerfstudio.relative_pose.unknown_projector import (
-    CX,
-    CY,
-    K1,
-    LOG_ASPECT,
-    LOG_FOCAL,
-    Cause,
-    FrameMatches,
-    NoProjector,
-    ProjectorEstimate,
-    estimate_projector,
-)
+from sl_nerfstudio.relative_pose.joint_fit import CX, CY, K1, LOG_ASPECT, LOG_FOCAL, FrameMatches
+from sl_nerfstudio.relative_pose.unknown_projector import Cause, NoProjector, ProjectorEstimate, estimate_projector
 
 # Sentences on a projector that was, or could not be, found.
 
@@ -292,7 +282,7 @@ def find_projector(job: FrameJob, results: Sequence[FrameStageResult], stated: b
 
 
 def sigma_of_fields(device: Device, C: Float64[ndarray, "5 5"]) -> tuple[float, float, float, float, float]:
-    """1 sigma of fl_x, fl_y, cx, cy, k1, from the covariance of `parameters.NAMES`."""
+    """1 sigma of fl_x, fl_y, cx, cy, k1, from the covariance of `joint_fit.NAMES`."""
     log_fl_y = C[LOG_FOCAL, LOG_FOCAL] + 2 * C[LOG_FOCAL, LOG_ASPECT] + C[LOG_ASPECT, LOG_ASPECT]
     s = np.sqrt([C[LOG_FOCAL, LOG_FOCAL], max(log_fl_y, 0.0), C[CX, CX], C[CY, CY], C[K1, K1]])
     unit = np.array([device.fl_x, device.fl_y, device.w, device.w, 1.0])

@@ -12,7 +12,7 @@ from sl_nerfstudio.review.verdict import (
     shortcomings,
     undetermined,
 )
-from tests.calibration.board.scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
+from tests.calibration.board_scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
 
 pytestmark = pytest.mark.slow
 
