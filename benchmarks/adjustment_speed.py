@@ -27,7 +27,7 @@ from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust, cross_validate
 from sl_nerfstudio.bundle_adjustment.parameters import baseline_scale, gauge_projection, restore
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
 from sl_nerfstudio.geometry.lie import inverse, log_se3
@@ -87,10 +87,10 @@ def profiled(function: Callable[[], T]) -> tuple[T, dict[str, float]]:
 def adjusted(loaded: LoadedScan) -> Adjustment:
     """As for a training run, with the cross-validation that decides about the result."""
     settings, S = AdjustmentSettings(), loaded.S_scene_world
-    maps, held_out = maps_and_held_out(loaded.scan, loaded.samples, settings)
+    maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
     start = scene_rig(loaded.scan, S)
     found = adjust(start, maps, pose_prior(loaded.scan, S, PriorConfig()), "free", settings)
-    cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
+    cross_validate(start, found.rig, held_out, maps, found.noise_px)
     return found
 
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import load_scan
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan

@@ -23,7 +23,7 @@ from benchmarks.coverage.cases import NOISES, ExactScan, exact_scan, make_case
 from benchmarks.coverage.errors import errors_of
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, adjust
 from sl_nerfstudio.bundle_adjustment.parameters import gauge_projection, restore
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.lie import inverse, log_se3
 from sl_nerfstudio.synthesis.scenes import BUILT_IN
 

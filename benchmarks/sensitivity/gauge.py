@@ -19,7 +19,7 @@ from benchmarks.common.scans import made_once
 from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.parameters import agreeing_scale, baseline_scale, restore
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
 from sl_nerfstudio.geometry.lie import DevicePoses
@@ -49,7 +49,7 @@ def rules(loaded: LoadedScan) -> dict[str, Rig]:
     """The starting rig, and the adjusted one under each rule."""
     scan, S = loaded.scan, loaded.S_scene_world
     start, prior = scene_rig(scan, S), pose_prior(scan, S, PriorConfig())
-    maps, _ = maps_and_held_out(scan, loaded.samples, AdjustmentSettings())
+    maps, _ = maps_and_held_out(scan, loaded.samples)
     rig = adjust(start, maps, prior, "free", AdjustmentSettings()).rig
     frame = None if scan.scale.baseline_of is None else scan.index_of(scan.scale.baseline_of)
     return {

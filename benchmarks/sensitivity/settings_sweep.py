@@ -65,9 +65,6 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "registration.pose_graph.kernel_chi2": (20.0, 40.0, 80.0),
     "bundle_adjustment.adjustment.anchors_per_frame": (150, 300, 600, 1200),
     "bundle_adjustment.adjustment.frames_per_anchor": (2, 4, 8, 13),
-    "bundle_adjustment.adjustment.look_up.half_window": (2, 3, 4),
-    "bundle_adjustment.adjustment.kernel.medians": (1.0, 2.0, 3.0, 4.0),
-    "bundle_adjustment.adjustment.kernel.noises": (2.0, 3.0, 5.0),
 }
 """Path of each setting, and its values; the default is among them."""
 

@@ -7,7 +7,7 @@ rendering.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -30,7 +30,13 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
 )
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import frame_medians, observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import (
+    NOISE_FLOOR_PX,
+    frame_medians,
+    observe,
+    partners,
+    place_anchors,
+)
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
     FreeParameters,
@@ -47,6 +53,10 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.search import (
     FRAMES_MOVE,
+    LEAST_COSINE,
+    LEAST_GAIN,
+    PARTNERS,
+    AdjustmentSettings,
     SearchProblem,
     SearchProgress,
     SearchStage,
@@ -58,7 +68,6 @@ from sl_nerfstudio.bundle_adjustment.search import (
     search,
     unplaced_frames,
 )
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, unproject
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
@@ -271,6 +280,24 @@ def _lost(problem: SearchProblem, found: SearchProgress) -> tuple[int, ...]:
     return unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
 
 
+# The adjustment, and whether its result is one of several minima.
+
+_SHAKE_SIGMAS = 2.0  # distance from the result, in its sigma, from which further steps should lead back
+_SHAKE_STEPS = 6  # most of those steps
+_MOST_LEFT = 0.35  # share of that distance that may be left in any frame
+_MOST_FRAMES = 100  # beyond which the question is not asked: it takes time, and many frames hold each other
+_WORSE = 1.4  # median residual of any frame, relative to the result's, beyond which a search has lost that frame
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search began with and where it ended, for the question whether there are other minima."""
+
+    problem: SearchProblem
+    refine: RefinePoses
+    ends: Hopped
+
+
 @dataclass(frozen=True)
 class Adjustment:
     """What the bundle adjustment found."""
@@ -284,10 +311,11 @@ class Adjustment:
     median_after_px: float
     unplaced: tuple[int, ...]  # frames that do not agree with the others: neither their poses nor their sigma hold
     start: Rig  # to which the prior belongs: the given one, but for frames whose starting pose proved to be wrong
+    searched: Searched | None = field(default=None, repr=False)  # None: the covariance includes other minima
 
     @property
     def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
-        """That of (delta, rho) alone."""
+        """Covariance of (delta, rho) alone."""
         return self.factor[:-UNKNOWNS] @ self.factor[:-UNKNOWNS].T
 
     @property
@@ -297,73 +325,54 @@ class Adjustment:
         return sigma.reshape(2, self.rig.frames, 6).transpose(0, 1).flatten(1)
 
 
-@dataclass(frozen=True)
-class Minimum:
-    """Where a search has ended; whether it is one of several such places has not been asked yet."""
-
-    adjustment: Adjustment  # with the covariance of this minimum alone
-    problem: SearchProblem
-    refine: RefinePoses
-    ends: Hopped | None  # of all searches; None: there was nothing to search
-
-    @one_library_thread()
-    def with_other_minima(self) -> Adjustment:
-        """The same poses; where they are one of several minima, their covariance covers those of other searches."""
-        found = self.adjustment
-        if self.ends is None:
-            return found
-        return replace(found, factor=widened(found.factor, _departures(self, self.ends)))
-
-
 def adjust(
-    start: Rig,
-    maps: CoordinateMaps,
-    prior: PosePrior,
-    refine: RefinePoses,
-    settings: AdjustmentSettings,
+    start: Rig, maps: CoordinateMaps, prior: PosePrior, refine: RefinePoses, settings: AdjustmentSettings
 ) -> Adjustment:
     """Adjust all poses together. The scene must be normalised: origin at the object's centre, radius about one.
 
-    The gauge stays where the prior puts it; `gauge.restore` sets the scale afterwards. Frames that share nothing with
-    others do not move.
+    The gauge stays where the prior puts it; `restore` sets the scale afterwards. Frames that share nothing with others
+    do not move.
     """
-    return find_minimum(start, maps, prior, refine, settings).with_other_minima()
+    return with_other_minima(find_minimum(start, maps, prior, refine, settings))
 
 
 @one_library_thread()
 def find_minimum(
-    start: Rig,
-    maps: CoordinateMaps,
-    prior: PosePrior,
-    refine: RefinePoses,
-    settings: AdjustmentSettings,
-) -> Minimum:
+    start: Rig, maps: CoordinateMaps, prior: PosePrior, refine: RefinePoses, settings: AdjustmentSettings
+) -> Adjustment:
     """Adjust all poses together without asking for other minima, for results that may be replaced by later ones."""
     problem = problem_of(start, maps, prior, settings)
     first = search(problem, refine)
     if first is None:
-        return Minimum(_unmoved(start, prior, free_parameters(refine, start), settings), problem, refine, None)
+        return _unmoved(start, prior, free_parameters(refine, start))
     found, before = hopped(problem, refine, first[0]), first[1]
     again = with_lost_frames(problem, refine, found.best)
     if again is not None:
         problem, found = again[0], Hopped(again[1], (), found.settled)
-    return Minimum(_result(problem, refine, found.best, before), problem, refine, found)
+    return replace(_result(problem, refine, found.best, before), searched=Searched(problem, refine, found))
 
 
-def _departures(minimum: Minimum, found: Hopped) -> list[Float[Tensor, "unknowns"]]:
+@one_library_thread()
+def with_other_minima(found: Adjustment) -> Adjustment:
+    """The same poses; where they are one of several minima, their covariance covers those of other searches."""
+    if found.searched is None:
+        return found
+    return replace(found, factor=widened(found.factor, _departures(found, found.searched)), searched=None)
+
+
+def _departures(result: Adjustment, searched: Searched) -> list[Float[Tensor, "unknowns"]]:
     """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
-    result, refine = minimum.adjustment, minimum.refine
-    problem = minimum.problem
-    s, generator = problem.settings.other_minima, torch.Generator().manual_seed(problem.settings.seed)
-    if s.searches < 1 or refine not in FRAMES_MOVE or result.rig.frames > s.most_frames:
+    problem, refine, found = searched.problem, searched.refine, searched.ends
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    if problem.settings.other_minima < 1 or refine not in FRAMES_MOVE or result.rig.frames > _MOST_FRAMES:
         return []
     ends = list(found.others)
-    if not found.settled or not _adjust_leads_back(problem, refine, found.best, result, generator):
+    if not found.settled or not _shaken_leads_back(problem, refine, found.best, result, generator):
         ends += _other_ends(problem, refine, result, generator)
-    limits = s.worse * _misfits(problem.maps, found.best)
+    limits = _WORSE * _misfits(problem.maps, found.best)
     limits[list(result.unplaced)] = float("inf")
     near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
-    return [_departure(end, result) for end in near]
+    return [departure_of(_placed_frames(end, result), result.rig) for end in near]
 
 
 def _other_ends(
@@ -374,17 +383,17 @@ def _other_ends(
     No frame has to agree better with the others than it does there; those that are not placed are not searched for.
     """
     support = frame_support(result.rig, problem.maps, result.noise_px, problem.settings)
-    expected = support.nan_to_num() - problem.settings.relocalisation.least_gain
+    expected = support.nan_to_num() - LEAST_GAIN
     expected[list(result.unplaced)] = float("-inf")
-    searches = problem.settings.other_minima.searches
-    starts = [drawn_start(result.rig, problem.prior, refine == "free", generator) for _ in range(searches)]
+    searches = range(problem.settings.other_minima)
+    starts = [drawn_start(result.rig, problem.prior, refine == "free", generator) for _ in searches]
     ends = results([partial(search, problem.again(start, start, expected), refine) for start in starts])
     return [end[0] for end in ends if end]
 
 
-def _departure(other: SearchProgress, result: Adjustment) -> Float[Tensor, "unknowns"]:
-    """From the result to another one, of the frames that are placed."""
-    return departure_of(with_frames_of(other.state.rig, result.rig, result.unplaced), result.rig)
+def _placed_frames(other: SearchProgress, result: Adjustment) -> Rig:
+    """Where another search ended, with frames that are not placed where the result has them."""
+    return with_frames_of(other.state.rig, result.rig, result.unplaced)
 
 
 def _misfits(maps: CoordinateMaps, found: SearchProgress) -> Float[Tensor, "frames"]:
@@ -394,21 +403,21 @@ def _misfits(maps: CoordinateMaps, found: SearchProgress) -> Float[Tensor, "fram
     return frame_medians(r, found.pairs, state.rig.frames)
 
 
-def _adjust_leads_back(
+def _shaken_leads_back(
     problem: SearchProblem, refine: RefinePoses, found: SearchProgress, result: Adjustment, generator: torch.Generator
 ) -> bool:
     """Whether some steps lead back to the result from poses beside it."""
-    s, state = problem.settings.other_minima, found.state
-    delta, rho = shake(result.factor, s.shake_sigmas, generator).reshape(2, -1, 6)
+    state = found.state
+    delta, rho = shake(result.factor, _SHAKE_SIGMAS, generator).reshape(2, -1, 6)
     linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
-    kernel = kernel_of(state, found.rows, found.widths, linear.residuals, problem)
+    kernel = kernel_of(state, found.rows, found.widths, linear.residuals)
     equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
     step = torch.cat([delta, rho], 1)
-    rig, anchors = moved_together(state.rig, state.anchors, equations, step, problem.settings.steps)
+    rig, anchors = moved_together(state.rig, state.anchors, equations, step)
     beside = replace(state, rig=rig, anchors=anchors)
-    back = run_stage(problem, SearchStage(refine, False, s.shake_steps), replace(found, state=beside))
-    left = farthest_frame(result.factor, _departure(back, result))
-    return left <= s.most_left * s.shake_sigmas
+    back = run_stage(problem, SearchStage(refine, False, _SHAKE_STEPS), replace(found, state=beside))
+    left = farthest_frame(result.factor, departure_of(_placed_frames(back, result), result.rig))
+    return left <= _MOST_LEFT * _SHAKE_SIGMAS
 
 
 def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, before: float) -> Adjustment:
@@ -416,45 +425,45 @@ def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, 
     state, maps = found.state, problem.maps
     linear = linearise(state.rig, state.anchors, found.rows, maps)
     r = linear.residuals
-    kernel = kernel_of(state, found.rows, found.widths, r, problem)
+    kernel = kernel_of(state, found.rows, found.widths, r)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)
-    s = problem.settings
-    evidence = CovarianceEvidence(
-        state.rig, state.anchors, found.rows, extended, smooth, kernel, s.image_blocks, s.kernel.least_curvature
-    )
+    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, extended, smooth, kernel)
     free = free_parameters(refine, state.rig)
-    known = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
+    factor, intrinsics = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(
         rig=state.rig,
-        factor=known.factor,
-        intrinsics=known.intrinsics,
+        factor=factor,
+        intrinsics=intrinsics,
         noise_px=found.noise,
         iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
-        unplaced=unplaced_frames(state.rig, maps, found.noise, s),
+        unplaced=unplaced_frames(state.rig, maps, found.noise, problem.settings),
         start=problem.start,
     )
 
 
-def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters, settings: AdjustmentSettings) -> Adjustment:
+def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters) -> Adjustment:
     """The starting poses with the prior's uncertainty, if no step is allowed or no frame sees what another decoded."""
     H, _ = prior_equations(prior, start, start)
     nan = float("nan")
-    noise = settings.kernel.noise_floor_px
     factor = torch.block_diag(gauge_free(start, free, H), prior.intrinsics_sigma.diag())
-    return Adjustment(start, factor, None, noise, 0, nan, nan, (), start)
+    return Adjustment(start, factor, None, NOISE_FLOOR_PX, 0, nan, nan, (), start)
 
 
-# Are adjusted poses better? Pixels that took no part in the adjustment decide, by a paired comparison.
-#
-# Each held-out pixel has the same residuals under both sets of poses. So the mean of their differences is compared
-# with
-# zero, rather than two means with each other. Residuals within a small block of an image depend on each other:
-# blocks are
-# the independent samples from which the standard error follows.
+# Cross-validation: pixels that took no part in the adjustment decide whether its poses are kept, by a paired
+# comparison. Each held-out pixel has the same residuals under both sets of poses. So the mean of their differences is
+# compared with zero, rather than two means with each other. Residuals within a small block of an image depend on each
+# other: blocks are the independent samples from which the standard error follows.
+
+HELD_OUT_PER_FRAME = 300  # held-out pixels of each frame, at most
+_FRAMES_PER_PIXEL = 8  # other frames in which each of them is looked up, at most
+_WIDTH_NOISES, _LEAST_WIDTH_PX = 4.0, 0.25  # width of the robust kernel; looking up between pixels is never perfect
+_STANDARD_ERRORS = 2.0  # by which the mean paired difference must be below zero for a change to be kept
+LEAST_VALIDATED_GAIN = 0.01  # share of the mean robust square by which it must be below zero as well if poses are to be
+# kept: held-out pixels share systematic errors of decoding with the others, which standard errors do not show
 
 
 @dataclass(frozen=True)
@@ -475,7 +484,6 @@ class CrossValidation:
     after_px: float
     difference: float  # mean of the paired differences of squared robust residuals, after minus before, px^2
     standard_error: float  # of that mean; infinite for fewer than two blocks
-    standard_errors: float  # by which the difference must be below zero
     least_gain: float  # share of the old poses' mean square by which it must be below zero as well
 
     @property
@@ -485,12 +493,12 @@ class CrossValidation:
 
     @property
     def worse(self) -> bool:
-        """The same the other way round."""
+        """Whether the new poses are worse by as much."""
         return self.difference > self._margin
 
     @property
     def _margin(self) -> float:
-        return max(self.standard_errors * self.standard_error, self.least_gain * self.before_px**2)
+        return max(_STANDARD_ERRORS * self.standard_error, self.least_gain * self.before_px**2)
 
 
 @one_library_thread()
@@ -500,22 +508,19 @@ def cross_validate(
     held_out: HeldOutPixels,
     maps: CoordinateMaps,
     noise_px: float,
-    settings: AdjustmentSettings | None = None,
+    least_gain: float = LEAST_VALIDATED_GAIN,
 ) -> CrossValidation:
     """Compare two sets of poses on the same pixels and the same pairs of frames.
 
     A residual counts as r^2 / (1 + r^2 / width^2): a wrong decoding costs width^2 with any poses. `noise_px` is the
     decoding noise of one look-up.
     """
-    settings = settings or AdjustmentSettings()
-    s = settings.cross_validation
-    width = max(s.width_noises * noise_px, s.least_width_px)
-    generator = torch.Generator().manual_seed(settings.seed)
+    width, generator = max(_WIDTH_NOISES * noise_px, _LEAST_WIDTH_PX), torch.Generator().manual_seed(0)
     sides = [(rig, _anchors(rig, held_out)) for rig in (before, after)]
-    together = partners(after, sides[1][1], maps, settings.partners, settings.least_cosine, generator)
+    together = partners(after, sides[1][1], maps, PARTNERS, LEAST_COSINE, generator)
     keys = []
     for rig, anchors in sides:
-        seen = observe(rig, anchors, maps, s.frames_per_pixel, 2 * width, settings.least_cosine, generator, together)
+        seen = observe(rig, anchors, maps, _FRAMES_PER_PIXEL, 2 * width, LEAST_COSINE, generator, together)
         keys.append(seen.anchor * rig.frames + seen.frame)
     key = torch.unique(torch.cat(keys))
     rows = Observations(key // before.frames, key % before.frames)
@@ -523,7 +528,7 @@ def cross_validate(
     losses = [_robust_squares(rig, anchors, rows, maps, width) for rig, anchors in sides]
     difference, error = mean_and_error(losses[1] - losses[0], block)
     first, second = (float(loss.mean().sqrt()) for loss in losses)
-    return CrossValidation(first, second, difference, error, s.standard_errors, s.least_gain)
+    return CrossValidation(first, second, difference, error, least_gain)
 
 
 def _robust_squares(

@@ -15,11 +15,19 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt64
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 from sl_nerfstudio.parallel import compiled, compiled_range
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
-# Which entries of an array belong to the same frame or the same anchor.
+HALF_WINDOW = 3  # camera pixels to each side of the window in which a paraboloid is fitted
+WIDE_HALF_WINDOW = 12  # for derivatives that say how much residuals know: about a period of the pattern, within which
+# errors of coordinates are shared; derivatives of smaller windows are noisy, which looks like information
+_LEAST_PIXELS = 24  # decoded pixels that a window of HALF_WINDOW must hold
+_LEAST_PIVOT = 1e-3  # share of a pivot that elimination must leave; below it the window's pixels lie on a conic
+_ROUGHNESS_PX = 2.0  # RMS distance of a window from its paraboloid, pattern pixels: beyond, the map is discontinuous
+_ROUGHNESS_MEDIANS = 3.0  # the same limit in roughnesses of the median window; the larger limit applies
+_SAMPLED_WINDOWS = 200  # windows of each frame from which that median is taken
+
+# Groups of the entries of an array, such as the rows of each frame or each anchor.
 
 
 @dataclass(frozen=True)
@@ -50,7 +58,7 @@ def _group(key, first, entries):
         place[key[n]] += 1
 
 
-# Random bits from a number, the same in any order and on any number of threads.
+# Random bits that depend on a number alone: the same in any order and on any number of threads.
 
 
 @compiled
@@ -68,8 +76,6 @@ def uniform(bits):
     return np.float64(bits >> np.uint64(11)) / 9007199254740992.0
 
 
-# Which pixels of many images have a coordinate, and where it is among all that there are.
-#
 # Only decoded pixels are stored: most of an image shows something else. A bit for each pixel says whether it has a
 # coordinate; with the number of those before each word of 64 bits, its place follows from a count of bits (rank:
 # Jacobson, "Space-efficient static trees and graphs", 1989).
@@ -102,7 +108,7 @@ class PixelIndex:
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """For compiled loops."""
+        """The parts for compiled loops."""
         return self.words, self.first, self.widths, self.heights
 
     def image(self, values: Float32[ndarray, "decoded 2"], frame: int) -> Float32[ndarray, "h w 2"]:
@@ -176,9 +182,7 @@ def _count_before(words):
         total += _bits_of(words[k, 0])
 
 
-# How far pixels are from the border of what was decoded, in compiled loops.
-
-FARTHEST = 255
+FARTHEST = 255  # pixels from the border of what was decoded: larger distances are not told apart
 
 
 @compiled_range
@@ -200,7 +204,7 @@ def border_distances(first, last, index, starts, entries, pixel, found):
 
 @compiled
 def _steps(words, first_word, w, h, out):
-    """Of one frame, by two passes over it (Rosenfeld and Pfaltz, Pattern Recognition, 1968)."""
+    """Distances in one frame, by two passes over it (Rosenfeld and Pfaltz, Pattern Recognition, 1968)."""
     for y in range(h):
         row_word = first_word + y * words_of(w)
         for x in range(w):
@@ -222,9 +226,6 @@ def _steps(words, first_word, w, h, out):
                 below = pixel + w
                 least = min(out[below - 1], out[below], out[below + 1], out[pixel + 1])
             out[pixel] = min(out[pixel], least + 1)
-
-
-# Random decoded pixels, spread over the decoded part of each frame.
 
 
 @compiled_range
@@ -289,13 +290,9 @@ def _sort_together(keys, values, count):
             parent = child
 
 
-# Paraboloids fitted to small windows of a coordinate image, in compiled loops.
-#
-# A fit belongs to the pixel at the window's centre and serves every position within that pixel. Positions that stay
-# in
-# their pixel need no new fit: a `WindowMemory` keeps the last one of each position. Windows are fitted frame by
-# frame: if
-# the images are in a file, each of them is read once.
+# A paraboloid belongs to the pixel at its window's centre and serves every position within that pixel. Positions that
+# stay in their pixel need no new fit: a `WindowMemory` keeps the last one of each position. Windows are fitted frame by
+# frame: if the images are in a file, each of them is read once.
 
 
 @dataclass(frozen=True)
@@ -309,7 +306,7 @@ class WindowMemory:
 
     @staticmethod
     def empty(frame: Int64[ndarray, "n"]) -> "WindowMemory":
-        """Without any fit, for positions in these frames."""
+        """A memory without any fit, for positions in these frames."""
         count, frames = len(frame), int(frame.max(initial=-1)) + 1
         order = Groups.of(frame, frames).entries
         return WindowMemory(order, np.full(count, -2), np.zeros((count, 6, 2)), np.full(count, np.inf))
@@ -478,26 +475,18 @@ class MapSample:
 
 
 @dataclass(frozen=True)
-class DrawnPixels:
-    """Centres of some pixels of some frames."""
-
-    frame: Int[Tensor, "n"]
-    uv_camera: Float[Tensor, "n 2"]
-
-
-@dataclass(frozen=True)
 class CoordinateMaps:
     """Coordinate images of all frames; sizes may differ."""
 
     values: Float[Tensor, "decoded 2"]  # those that are known: all frames one after the other, rows first
     index: PixelIndex
-    settings: LookUpSettings
+    half_window: int  # camera pixels
+    least_pixels: int  # decoded pixels that a window must hold
     max_roughness: float  # projector pixels; rougher windows are discontinuous
 
     @staticmethod
-    def of(images: Iterable[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
-        """From one image per frame; sizes may differ. What is too large for memory is kept in a file."""
-        settings = settings or LookUpSettings()
+    def of(images: Iterable[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
+        """Maps of one image per frame; sizes may differ. What is too large for memory is kept in a file."""
         values, known, widths = GrowingArray(largest_in_memory()), [], []
         for image in images:
             coords = image.float().numpy()
@@ -505,40 +494,41 @@ class CoordinateMaps:
             values.append(coords[finite])
             known.append(packed(finite))
             widths.append(image.shape[1])
-        maps = CoordinateMaps(
-            values=torch.from_numpy(values.whole()),
-            index=PixelIndex.of(known, widths),
-            settings=settings,
-            max_roughness=settings.roughness_px,
-        )
-        return maps._with_usual_roughness(settings)
-
-    def _with_usual_roughness(self, settings: LookUpSettings) -> "CoordinateMaps":
-        """With other settings; windows count as discontinuous that are much rougher than the median one."""
-        maps = replace(self, settings=settings)
-        return replace(
-            maps, max_roughness=max(settings.roughness_px, settings.roughness_medians * maps._median_roughness())
-        )
+        index = PixelIndex.of(known, widths)
+        maps = CoordinateMaps(torch.from_numpy(values.whole()), index, HALF_WINDOW, _LEAST_PIXELS, _ROUGHNESS_PX)
+        return maps.with_windows(HALF_WINDOW)
 
     def with_windows(self, half_window: int) -> "CoordinateMaps":
-        """The same images, looked up in windows of another size, as full of decoded pixels as before."""
-        growth = (2 * half_window + 1) / (2 * self.settings.half_window + 1)
-        least = round(self.settings.least_pixels * growth**2)
-        return self._with_usual_roughness(replace(self.settings, half_window=half_window, least_pixels=least))
+        """The same images, looked up in windows of another size, as full of decoded pixels as before.
+
+        Windows that are much rougher than the median one count as discontinuous.
+        """
+        growth = (2 * half_window + 1) / (2 * self.half_window + 1)
+        maps = replace(self, half_window=half_window, least_pixels=round(self.least_pixels * growth**2))
+        drawn = maps.draw(torch.arange(self.frames), _SAMPLED_WINDOWS, torch.Generator().manual_seed(0))
+        _, roughness = maps._fit(*drawn, WindowMemory.empty(drawn[0].numpy()))
+        found = roughness[torch.isfinite(roughness)]
+        usual = float(found.median()) if len(found) else 0.0
+        return replace(maps, max_roughness=max(_ROUGHNESS_PX, _ROUGHNESS_MEDIANS * usual))
 
     @property
     def frames(self) -> int:
         """Number of frames."""
         return len(self.index.first)
 
-    def draw(self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator) -> "DrawnPixels":
-        """Up to `count` random decoded pixel centres of some frames each, at most one in each square of a lattice."""
+    def draw(
+        self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
+        """Up to `count` random decoded pixels of each frame, at most one in each square of a lattice.
+
+        Returns their frames and their centres.
+        """
         pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
         draw_pixels(len(frames), frames.numpy(), self.index.arrays, seed_from(generator), pixels, counts)
         frame = torch.repeat_interleave(frames, torch.from_numpy(counts))
         pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
         w = self._sizes[0][frame]
-        return DrawnPixels(frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double())
+        return frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double()
 
     def image(self, frame: int) -> Float[Tensor, "h w 2"]:
         """The coordinate image of a frame, NaN where not decoded."""
@@ -546,7 +536,7 @@ class CoordinateMaps:
 
     @property
     def arrays(self) -> tuple[ndarray, tuple[ndarray, ...]]:
-        """For compiled loops: values, index."""
+        """Values and index for compiled loops."""
         return self.values.numpy(), self.index.arrays
 
     @property
@@ -578,23 +568,15 @@ class CoordinateMaps:
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory
     ) -> tuple[Float[Tensor, "n 3 2"], Float[Tensor, "n"]]:
         """Value, derivatives by x and y, and the window's RMS distance from the paraboloid (infinite without a fit)."""
-        s, at, uv = self.settings, frame.numpy(), uv_camera.detach().double().numpy()
+        at, uv = frame.numpy(), uv_camera.detach().double().numpy()
         values, index = self.arrays
         n, moved, found = len(at), np.empty(len(at), dtype=np.bool_), np.zeros((len(at), 3, 2))
         mark_moved(n, index, at, uv, memory.pixel, moved)
         chosen = memory.order[moved[memory.order]]
-        limits = s.half_window, s.least_pixels, s.least_pivot
+        limits = self.half_window, self.least_pixels, _LEAST_PIVOT
         fit_windows(len(chosen), chosen, values, index, at, memory.pixel, limits, memory.fit, memory.roughness)
         evaluate_windows(n, self.index.widths, at, uv, memory.pixel, memory.fit, memory.roughness, found)
         return torch.from_numpy(found), torch.from_numpy(memory.roughness.copy())
-
-    def _median_roughness(self) -> float:
-        """Median roughness of windows all over the frames; 0 if nothing is decoded."""
-        generator = torch.Generator().manual_seed(0)
-        drawn = self.draw(torch.arange(self.frames), self.settings.sampled_windows, generator)
-        _, roughness = self._fit(drawn.frame, drawn.uv_camera, WindowMemory.empty(drawn.frame.numpy()))
-        found = roughness[torch.isfinite(roughness)]
-        return float(found.median()) if len(found) else 0.0
 
 
 def seed_from(generator: torch.Generator) -> int:

@@ -19,7 +19,6 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
     words_of,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array
-from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 from sl_nerfstudio.geometry.devices import unproject, view_of
 from sl_nerfstudio.geometry.lie import moved, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
@@ -30,6 +29,18 @@ from sl_nerfstudio.geometry.numerics import (
 )
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.parallel import compiled, compiled_range
+
+_ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
+_TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
+_LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
+
+NOISE_FLOOR_PX = 0.01  # smallest plausible noise of one look-up, pattern pixels
+_FASTEST = 1.4  # largest factor by which a kernel narrows in one step
+_OBLIQUENESS_CLASSES = 8  # of look-ups, by the cosine at which the camera sees the surface; each has its own noise
+_LEAST_NOISE_RATIO = 0.5  # of such a class, relative to all look-ups
+_BORDER_CLASSES = 8  # of look-ups, by the distance from the border of what was decoded
+_MOST_BORDER_NOISE = 1.25  # of such a class, relative to all look-ups; beyond, it and those nearer to the border are
+# left out: a decoder continues coordinates up to there, and errs alike in many frames
 
 # Which frames decoded something near an anchor, and which of them look it up.
 
@@ -117,15 +128,9 @@ def choose_frames(first, last, visible, starts, seed, number, frames):
                 left -= 1
 
 
-_ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
-_TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
-_LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
-
-
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
     """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
-    drawn = maps.draw(torch.arange(rig.frames), per_frame, generator)
-    frame, uv = drawn.frame, drawn.uv_camera
+    frame, uv = maps.draw(torch.arange(rig.frames), per_frame, generator)
     seen = maps.look_up(frame, uv)
     p, good = _meet(rig, frame, uv, seen.uv_projector)
     edges = []
@@ -281,9 +286,6 @@ def _visible(
     return visible
 
 
-# Medians of the residuals that involve each frame.
-
-
 @compiled_range
 def medians_by_frame(first, last, source_first, source_entries, viewer_first, viewer_entries, values, valid, out):
     """Lower median over the valid entries of two groupings of the same values; infinite where there are none."""
@@ -326,11 +328,8 @@ def _smallest(values, count, k):
     return values[k]
 
 
-# The robust kernel of the bundle adjustment: wrong decodings lose their influence, slow frames keep theirs.
-#
-# Its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately for every
-# frame: when
-# most frames already fit, a frame that does not yet fit keeps a kernel wide enough to be pulled in.
+# The robust kernel: its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately
+# for every frame. When most frames already fit, a frame that does not yet fit keeps a kernel wide enough to pull it in.
 
 
 @dataclass(frozen=True)
@@ -389,31 +388,29 @@ def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Flo
     return torch.from_numpy(out)
 
 
-def narrowed(
-    width: Float[Tensor, "frames"], target: Float[Tensor, "frames"], settings: KernelSettings
-) -> Float[Tensor, "frames"]:
+def narrowed(width: Float[Tensor, "frames"], target: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
     """Kernel widths one gradual step closer to a narrower target: a part of a frame may fit before all of it does."""
-    gently = torch.where(width.isfinite(), width / settings.fastest, torch.zeros_like(width))
+    gently = torch.where(width.isfinite(), width / _FASTEST, torch.zeros_like(width))
     return torch.minimum(width, torch.maximum(target, gently))
 
 
-def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
+def noise_of(r: Residuals, width: float) -> float:
     """Robust 1 sigma of one residual component, from the residuals that the kernel keeps; pattern pixels."""
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
-    return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)
+    return max(float(values.median()) * MAD_TO_SIGMA, NOISE_FLOOR_PX)
 
 
-def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], settings: KernelSettings) -> float:
+def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"]) -> float:
     """Distance from the border of what was decoded from which on residuals are no larger than usual.
 
     Classes by distance hold equally many. Only those that are nearer than most are asked, so at most half fall away.
     """
     if not len(distance):
         return 0.0
-    shares = np.linspace(0, 1, settings.border_classes + 1)[: settings.border_classes // 2 + 1]
+    shares = np.linspace(0, 1, _BORDER_CLASSES + 1)[: _BORDER_CLASSES // 2 + 1]
     edges = np.quantile(array(distance), shares)
-    most = settings.most_border_noise * float(size.median().clamp_min(settings.noise_floor_px))
+    most = _MOST_BORDER_NOISE * float(size.median().clamp_min(NOISE_FLOOR_PX))
     for low, high in reversed(list(pairwise(edges.tolist()))):
         mine = (distance >= low) & (distance < high)
         if mine.any() and float(size[mine].median()) > most:
@@ -421,7 +418,7 @@ def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], sett
     return 0.0
 
 
-def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSettings) -> Float[Tensor, "rows"]:
+def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"]) -> Float[Tensor, "rows"]:
     """Noise of each look-up over that of all, from the residuals of those that see their surface as obliquely.
 
     `cosine`: between the surface's normal and the line of sight. Classes hold equally many look-ups.
@@ -429,11 +426,11 @@ def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSe
     size, known = r.cross.norm(dim=-1), r.cross_valid
     if not known.any():
         return torch.ones_like(size)
-    shares = np.linspace(0, 1, settings.obliqueness_classes + 1)[1:-1]
+    shares = np.linspace(0, 1, _OBLIQUENESS_CLASSES + 1)[1:-1]
     group = torch.bucketize(cosine, torch.from_numpy(np.quantile(array(cosine[known]), shares)))
     usual, ratio = size[known].median(), torch.ones_like(size)
-    for k in range(settings.obliqueness_classes):
+    for k in range(_OBLIQUENESS_CLASSES):
         mine = group == k
         if (mine & known).any():
-            ratio[mine] = size[mine & known].median() / usual.clamp_min(settings.noise_floor_px)
-    return ratio.clamp_min(settings.least_noise_ratio)
+            ratio[mine] = size[mine & known].median() / usual.clamp_min(NOISE_FLOOR_PX)
+    return ratio.clamp_min(_LEAST_NOISE_RATIO)

@@ -40,8 +40,6 @@ from sl_nerfstudio.geometry.lie import (
 )
 from sl_nerfstudio.parallel import compiled, compiled_range
 
-# All devices of a scan as tensors in the scene frame, for solvers.
-
 
 @dataclass(frozen=True)
 class Rig:
@@ -54,7 +52,7 @@ class Rig:
 
     @staticmethod
     def of(cameras: Sequence[Device], projector: Device, poses: DevicePoses, S_scene_world: Similarity) -> "Rig":
-        """Devices with the given poses in a world; the rig's "world" is the scene."""
+        """Put devices with the given poses in a world into the scene, which is the rig's "world"."""
         scene = poses.mapped(S_scene_world)
         camera = torch.from_numpy(scene.T_world_camera)
         return Rig(
@@ -75,7 +73,7 @@ class Rig:
 
     @cached_property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
-        """For compiled loops: poses first, then parameters and model codes of cameras and projector.
+        """Arrays for compiled loops: poses first, then parameters and model codes of cameras and projector.
 
         The poses are those of the cameras, their inverses, and those of the cameras in the axes of their projectors.
         """
@@ -109,7 +107,7 @@ class Rig:
         )
 
     def scaled(self, scale: float) -> "Rig":
-        """With all lengths multiplied."""
+        """The rig with all lengths multiplied."""
         camera, relative = self.T_world_camera.clone(), self.T_camera_projector.clone()
         camera[:, :3, 3] *= scale
         relative[:, :3, 3] *= scale
@@ -123,12 +121,8 @@ def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tens
     return torch.from_numpy(out)
 
 
-# Residuals and their derivatives; `bundle_adjustment/residuals.py` says what they are.
-#
-# `devices` are a rig's arrays (`Rig.arrays`): poses of the cameras in the world, their inverses, those of the
-# cameras in their projectors, and parameters and model codes of cameras and projector. Arrays for derivatives may
-# be
-# empty: then none are computed.
+# Compiled residuals and derivatives. `devices` are `Rig.arrays`. Arrays for derivatives may be empty: then none are
+# computed.
 
 
 @compiled
@@ -148,7 +142,7 @@ def _world_point(devices, frame, depth, ray):
 
 @compiled_range
 def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, by_pose, by_depth):
-    """The anchors' own: decoded coordinates from their projector's view of them."""
+    """Own residuals of the anchors: decoded coordinates from their projector's view of them."""
     _, _, T_projector_camera, _, _, projector, code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
@@ -238,7 +232,7 @@ class Observations:
 
     @cached_property
     def memory(self) -> WindowMemory:
-        """Of the look-ups of these rows: anchors move little from one step to the next."""
+        """Last fits of the look-ups of these rows: anchors move little from one step to the next."""
         return WindowMemory.empty(array(self.frame))
 
 

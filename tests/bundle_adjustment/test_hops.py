@@ -11,8 +11,14 @@ from sl_nerfstudio.bundle_adjustment import adjust as hops
 from sl_nerfstudio.bundle_adjustment.adjust import Hopped, adjust, hopped, is_rough
 from sl_nerfstudio.bundle_adjustment.covariance import departure_of
 from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, RefinePoses
-from sl_nerfstudio.bundle_adjustment.search import SearchProblem, SearchProgress, problem_of, search
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
+from sl_nerfstudio.bundle_adjustment.search import (
+    AdjustmentSettings,
+    HopSettings,
+    SearchProblem,
+    SearchProgress,
+    problem_of,
+    search,
+)
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_so3
 
 from .analytic import ExactMaps, disturbed, rig_of, rough_prior
@@ -104,8 +110,9 @@ def test_other_ends_that_fit_as_well_widen_the_covariance_by_what_they_differ(tr
     def with_another(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -> Hopped:
         return Hopped(found, (replace(found, state=replace(found.state, rig=found.state.rig.moved(*step))),), True)
 
-    limits = OtherMinimaSettings(most_left=1e9, worse=1.4 if worse else 1e30)  # residuals are 1e-9 px
-    settings = replace(SETTINGS, other_minima=limits)
+    monkeypatch.setattr(adjustment, "_MOST_LEFT", 1e9)
+    monkeypatch.setattr(adjustment, "_WORSE", 1.4 if worse else 1e30)  # residuals are 1e-9 px
+    settings = SETTINGS
     alone = adjust(problem.start, problem.maps, problem.prior, "known-rig", settings)
     monkeypatch.setattr(adjustment, "hopped", with_another)
     found = adjust(problem.start, problem.maps, problem.prior, "known-rig", settings)

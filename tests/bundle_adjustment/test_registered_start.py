@@ -10,18 +10,14 @@ from sl_nerfstudio.bundle_adjustment import adjust as hops
 from sl_nerfstudio.bundle_adjustment.adjust import adjust, registered_start
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.parameters import baseline_scale, restore
-from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings
-from sl_nerfstudio.bundle_adjustment.search import problem_of, search
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings, HopSettings, problem_of, search
 from sl_nerfstudio.geometry.lie import inverse, log_so3
 
 from .analytic import disturbed, images_of, rig_of, rough_prior, turned
 
 FRAMES, SIZE, LOST = 6, 100, 2
 _EXACT = 0.5  # degrees: what images of 100 pixels and 100 look-ups of each frame allow
-SETTINGS = AdjustmentSettings(
-    anchors_per_frame=100, frames_per_anchor=3, max_iterations=20, other_minima=OtherMinimaSettings(searches=0)
-)
+SETTINGS = AdjustmentSettings(anchors_per_frame=100, frames_per_anchor=3, max_iterations=20, other_minima=0)
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +98,3 @@ def test_a_frame_that_is_far_off_is_found_by_its_surface(true, maps, degrees):
     rig = restore(found.start, found.rig, baseline_scale(found.start, found.rig, None))
     away = (inverse(start.T_world_camera) @ rig.T_world_camera)[others]
     assert float(torch.rad2deg(log_so3(away[:, :3, :3]).norm(dim=-1)).max()) < 1.5
-
-
-def test_frames_that_were_registered_before_are_not_registered_again():
-    assert not RegisteredFramesSettings().adjustment.hops.lost_by_surface
-    assert AdjustmentSettings().hops.lost_by_surface

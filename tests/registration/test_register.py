@@ -8,7 +8,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     RegisteredFramesSettings,
     adjust_registered,
 )
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.result import contradiction
 from sl_nerfstudio.registration.register import register
@@ -25,8 +25,7 @@ RIG = rig_of(FRAMES, SIZE)
 
 def small(anchors: int, iterations: int) -> RegisteredFramesSettings:
     """Settings without the question whether there are other minima."""
-    alone = replace(AdjustmentSettings().other_minima, searches=0)
-    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=alone)
+    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=0)
     return RegisteredFramesSettings(adjustment=adjustment)
 
 
