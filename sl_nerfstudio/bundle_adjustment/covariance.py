@@ -29,12 +29,7 @@ from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import Groups
-from sl_nerfstudio.bundle_adjustment.normal_equations import (
-    DepthCouplings,
-    NormalEquations,
-    block_sums,
-    normal_equations,
-)
+from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, block_sums, normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import Kernel
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
@@ -377,81 +372,50 @@ def pose_covariance(
         poses_exact = torch.zeros(12 * n, UNKNOWNS, dtype=torch.float64)
         return torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None
     weights = e.kernel.weights(e.linear.residuals)
-    equations = normal_equations(e.linear, e.rows, *weights)
-    known = normal_equations(e.smooth, e.rows, *weights)
-    gradients = block_gradients(e, equations.depths, weights)
-    problem = _Linear(e, free, equations, known, *gradients, _prior_terms(prior, start, e.rig))
-    found, own = problem.second_moments(noise), slice(12 * n, None)
-    of_intrinsics = found.larger[own, None] * found.formal[own]
-    calibration = SelfCalibration(found.step[own].clone(), of_intrinsics @ of_intrinsics.T)
-    moves = (found.formal[: 12 * n] != 0).any(1)
-    dependence = float(found.larger[: 12 * n][moves].median()) if moves.any() else 1.0
-    found = problem.second_moments(dependence * noise)
-    factor = torch.cat([found.larger[:, None] * found.formal, found.step[:, None]], 1)
-    return _by_kind(factor, n), calibration
-
-
-@dataclass(frozen=True)
-class _PriorTerms:
-    """What the prior adds to the normal equations, for a noise of one pixel."""
-
-    frames_H: Float[Tensor, "frames 12 12"]
-    common_H: Float[Tensor, "common"]  # diagonal
-    g: Float[Tensor, "unknowns"]
-
-    def root(self) -> Float[Tensor, "unknowns c"]:
-        """A factor of the information: `H` is it times its transpose, or on average is."""
-        n, rows = len(self.frames_H), len(self.g)
-        unit = unit_columns(rows, rows, _PRIOR_SEED)
-        frames = torch.linalg.cholesky(self.frames_H) @ unit[: 12 * n].reshape(n, 12, -1)
-        return torch.cat([frames.flatten(0, 1), self.common_H.sqrt()[:, None] * unit[12 * n :]])
-
-
-def _prior_terms(prior: PosePrior, start: Rig, rig: Rig) -> _PriorTerms:
-    H, g = prior_equations(prior, start, rig)
-    weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
+    equations, smooth = (normal_equations(linear, e.rows, *weights) for linear in (e.linear, e.smooth))
+    g = torch.cat([equations.g.flatten(), equations.g_common])
+    H_frames, g_frames = prior_equations(prior, start, e.rig)
+    H_common = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2  # of the prior, diagonal
     change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
-    return _PriorTerms(H, weight, torch.cat([g.flatten(), weight * change]))
+    g_prior = torch.cat([g_frames.flatten(), H_common * change])
+    columns, blocks = block_gradients(e, equations.depths, weights)
+    rows, G = free.count + UNKNOWNS, _gauge(e.rig, len(g))
+    free_blocks = max(blocks - rows, blocks / 4)  # left after the fit of the poses
+    curvature = max(e.kernel.curvature(e.linear.residuals), _LEAST_CURVATURE)
+    spread = (blocks / max(free_blocks, 1.0)) ** 0.5 / curvature * columns
 
+    def moments(noise: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors for a noise of one look-up, by the unknowns of each frame, then the intrinsics.
 
-@dataclass(frozen=True)
-class _Moments:
-    """Errors at the result; unknowns are those of the frames one after the other, then the intrinsics."""
-
-    formal: Float[Tensor, "unknowns c"]  # factor of the covariance for independent residuals
-    larger: Float[Tensor, "unknowns"]  # factor by which each sigma is really larger
-    step: Float[Tensor, "unknowns"]  # that is left
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """The normal equations at the result, with the spread of the blocks and with the prior."""
-
-    evidence: CovarianceEvidence
-    free: FreeParameters
-    equations: NormalEquations
-    known: NormalEquations  # with derivatives of wide windows
-    gradients: Float[Tensor, "unknowns c"]  # see `block_gradients`
-    blocks: int
-    prior: _PriorTerms
-
-    def second_moments(self, noise: float) -> _Moments:
-        """Errors for a noise of one look-up, in pixels."""
-        e, prior, free = self.evidence, self.prior, self.free
-        prior_H = noise**2 * prior.frames_H, noise**2 * prior.common_H
-        g = torch.cat([self.equations.g.flatten(), self.equations.g_common]) + noise**2 * prior.g
-        G = _gauge(e.rig, len(g))
-        factor = Cholesky.in_place(free.matrix(self.known.matrix(*prior_H)))
-        rows = free.count + UNKNOWNS
+        A factor of the covariance for independent residuals; how much larger each sigma really is; the step that is
+        left.
+        """
+        factor = Cholesky.in_place(free.matrix(smooth.matrix(noise**2 * H_frames, noise**2 * H_common)))
         formal = noise * _increments(free, G, factor.root(unit_columns(rows, len(g))))
-        free_blocks = max(self.blocks - rows, self.blocks / 4)  # left after the fit of the poses
-        curvature = max(e.kernel.curvature(e.linear.residuals), _LEAST_CURVATURE)
-        scale = (self.blocks / max(free_blocks, 1.0)) ** 0.5 / curvature
-        caused = _together(scale * self.gradients, noise**2 * prior.root())
-        moved = _increments(free, G, factor.solution(_parameters(free, torch.cat([caused, g[:, None]], 1))))
+        caused = _together(spread, noise**2 * _prior_root(H_frames, H_common))
+        pulls = torch.cat([caused, (g + noise**2 * g_prior)[:, None]], 1)
+        moved = _increments(free, G, factor.solution(_parameters(free, pulls)))
         robust = moved[:, :-1].square().sum(1)
         larger = (robust / formal.square().sum(1).clamp_min(1e-30)).clamp_min(1).sqrt()
-        return _Moments(formal, larger, -moved[:, -1])
+        return formal, larger, -moved[:, -1]
+
+    formal, larger, step = moments(noise)
+    of_intrinsics = larger[12 * n :, None] * formal[12 * n :]
+    calibration = SelfCalibration(step[12 * n :].clone(), of_intrinsics @ of_intrinsics.T)
+    moves = (formal[: 12 * n] != 0).any(1)
+    dependence = float(larger[: 12 * n][moves].median()) if moves.any() else 1.0
+    formal, larger, step = moments(dependence * noise)
+    return _by_kind(torch.cat([larger[:, None] * formal, step[:, None]], 1), n), calibration
+
+
+def _prior_root(
+    H_frames: Float[Tensor, "frames 12 12"], H_common: Float[Tensor, "common"]
+) -> Float[Tensor, "unknowns c"]:
+    """A factor of the prior's information, which is it times its transpose, or on average is."""
+    n, rows = len(H_frames), 12 * len(H_frames) + len(H_common)
+    unit = unit_columns(rows, rows, _PRIOR_SEED)
+    frames = torch.linalg.cholesky(H_frames) @ unit[: 12 * n].reshape(n, 12, -1)
+    return torch.cat([frames.flatten(0, 1), H_common.sqrt()[:, None] * unit[12 * n :]])
 
 
 def _together(a: Float[Tensor, "unknowns c"], b: Float[Tensor, "unknowns d"]) -> Float[Tensor, "unknowns k"]:

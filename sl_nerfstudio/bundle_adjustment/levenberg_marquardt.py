@@ -33,73 +33,52 @@ def damped_solver(
 ) -> Solve:
     """For the normal equations and prior of the frames that move; the damping is a share of the diagonal."""
     g = free.vector(equations.g + prior[1])
-    if len(free.frames) <= _FACTORISED_FRAMES:
-        return _Factorised(free.matrix(equations.matrix(prior[0], g.new_zeros(0))), g).solve
-    return _Iterative.of(equations, prior[0], free, g).solve
+    if len(free.frames) > _FACTORISED_FRAMES:
+        return _iterative_solver(equations, prior[0], free, g)
+    H = free.matrix(equations.matrix(prior[0], g.new_zeros(0)))
+
+    def solve(damping: float) -> Float[Tensor, "count"] | None:
+        factor = _damped_factor(H, damping)
+        return None if factor is None else torch.cholesky_solve(-g[:, None], factor)[:, 0]
+
+    return solve
 
 
-@dataclass(frozen=True)
-class _Factorised:
-    """The whole matrix."""
+def _iterative_solver(
+    equations: NormalEquations, prior: Float[Tensor, "m 12 12"], free: FreeParameters, g: Float[Tensor, "count"]
+) -> Solve:
+    """Conjugate gradients (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010, section 4).
 
-    H: Float[Tensor, "count count"]
-    g: Float[Tensor, "count"]
+    They start at zero, so every iterate lowers the quadratic model; the blocks on the diagonal precondition: of each
+    frame's own parameters, and of those that frames share.
+    """
 
-    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
-        """Solve by Cholesky's factorisation."""
-        damped = self.H.clone()
-        damped.diagonal().mul_(1 + damping)
-        factor, failed = torch.linalg.cholesky_ex(damped)
-        return None if bool(failed) else torch.cholesky_solve(-self.g[:, None], factor)[:, 0]
+    def product(x: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
+        step = free.step(x)
+        moving = equations.times(step)[free.frames]
+        return free.vector(moving + (prior @ step[free.frames, :, None])[..., 0])
 
+    own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
+    first = own.shape[0] * own.shape[2]
+    shared = torch.zeros(free.count - first, free.count - first, dtype=g.dtype)
+    for k in range(len(shared)):
+        one = torch.zeros_like(g)
+        one[first + k] = 1
+        shared[k] = product(one)[first:]
 
-@dataclass(frozen=True)
-class _Iterative:
-    """Products with the matrix, and its blocks on the diagonal."""
-
-    equations: NormalEquations
-    prior: Float[Tensor, "m 12 12"]
-    free: FreeParameters
-    g: Float[Tensor, "count"]
-    own: Float[Tensor, "m k k"]  # blocks of each frame's own parameters
-    shared: Float[Tensor, "s s"]  # block of those that frames share
-
-    @staticmethod
-    def of(
-        equations: NormalEquations, prior: Float[Tensor, "m 12 12"], free: FreeParameters, g: Float[Tensor, "count"]
-    ) -> "_Iterative":
-        """The equations with the blocks that precondition."""
-        own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
-        none = _Iterative(equations, prior, free, g, own, torch.zeros(0, 0, dtype=g.dtype))
-        first = own.shape[0] * own.shape[2]
-        unit = torch.eye(free.count, dtype=g.dtype)[first:]
-        columns = [none.product(one)[first:] for one in unit]
-        shared = torch.stack(columns) if columns else none.shared
-        return _Iterative(equations, prior, free, g, own, shared)
-
-    def product(self, x: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
-        """The matrix times `x`."""
-        step = self.free.step(x)
-        moving = self.equations.times(step)[self.free.frames]
-        return self.free.vector(moving + (self.prior @ step[self.free.frames, :, None])[..., 0])
-
-    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
-        """Solve by conjugate gradients (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010, section 4).
-
-        They start at zero, so every iterate lowers the quadratic model; the blocks on the diagonal precondition.
-        """
-        diagonal = torch.cat([self.own.diagonal(dim1=1, dim2=2).flatten(), self.shared.diagonal()])
-        factors = [_damped_factor(block, damping) for block in (self.own, self.shared[None])]
+    def solve(damping: float) -> Float[Tensor, "count"] | None:
+        diagonal = torch.cat([own.diagonal(dim1=1, dim2=2).flatten(), shared.diagonal()])
+        factors = [_damped_factor(block, damping) for block in (own, shared[None])]
         if any(factor is None for factor in factors):
             return None
-        x, r = torch.zeros_like(self.g), -self.g
+        x, r = torch.zeros_like(g), -g
         z = _preconditioned(r, factors)
         p, rz = z, float(r @ z)
         enough = _ITERATIVE_TOLERANCE**2 * rz
         for _ in range(_ITERATIVE_STEPS):
             if rz <= enough:
                 break
-            Hp = self.product(p) + damping * diagonal * p
+            Hp = product(p) + damping * diagonal * p
             curvature = float(p @ Hp)
             if not curvature > 0:
                 break
@@ -109,10 +88,12 @@ class _Iterative:
             p = z + rz / before * p
         return x
 
+    return solve
 
-def _damped_factor(blocks: Float[Tensor, "m k k"], damping: float) -> Float[Tensor, "m k k"] | None:
+
+def _damped_factor(blocks: Float[Tensor, "*m k k"], damping: float) -> Float[Tensor, "*m k k"] | None:
     damped = blocks.clone()
-    damped.diagonal(dim1=1, dim2=2).mul_(1 + damping)
+    damped.diagonal(dim1=-2, dim2=-1).mul_(1 + damping)
     factor, failed = torch.linalg.cholesky_ex(damped)
     return None if bool(failed.any()) else factor
 

@@ -286,48 +286,6 @@ def _visible(
     return visible
 
 
-@compiled_range
-def medians_by_frame(first, last, source_first, source_entries, viewer_first, viewer_entries, values, valid, out):
-    """Lower median over the valid entries of two groupings of the same values; infinite where there are none."""
-    for f in range(first, last):
-        most = source_first[f + 1] - source_first[f] + viewer_first[f + 1] - viewer_first[f]
-        mine = np.empty(most)
-        count = 0
-        for starts, entries in ((source_first, source_entries), (viewer_first, viewer_entries)):
-            for e in range(starts[f], starts[f + 1]):
-                if valid[entries[e]]:
-                    mine[count] = values[entries[e]]
-                    count += 1
-        out[f] = _smallest(mine, count, (count - 1) // 2) if count else np.inf
-
-
-@compiled
-def _smallest(values, count, k):
-    """The k-th smallest (from 0) of the first `count` values, which change places (Hoare's selection).
-
-    numpy's `partition` would do the same, but numba takes 7 s to compile it.
-    """
-    low, high = 0, count - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if k <= j:
-            high = j
-        elif k >= i:
-            low = i
-        else:
-            break
-    return values[k]
-
-
 # The robust kernel: its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately
 # for every frame. When most frames already fit, a frame that does not yet fit keeps a kernel wide enough to pull it in.
 
@@ -380,11 +338,13 @@ class Kernel:
 
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
-    """Median of the cross residuals that involve each frame; infinite if there are none."""
-    groups = [Groups.of(array(one), frames) for one in pair]
-    out = np.empty(frames)
-    parts = [part for group in groups for part in (group.first, group.entries)]
-    medians_by_frame(frames, *parts, array(r.cross.norm(dim=-1)), array(r.cross_valid), out)
+    """Lower median of the cross residuals that involve each frame; infinite if there are none."""
+    groups = Groups.of(array(pair[:, r.cross_valid]).ravel(), frames)
+    size, out = np.tile(array(r.cross[r.cross_valid].norm(dim=-1)), 2)[groups.entries], np.full(frames, np.inf)
+    for k, (first, last) in enumerate(pairwise(groups.first.tolist())):
+        if last > first:
+            middle = (last - first - 1) // 2
+            out[k] = np.partition(size[first:last], middle)[middle]
     return torch.from_numpy(out)
 
 

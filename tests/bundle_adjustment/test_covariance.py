@@ -24,8 +24,6 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
     pose_covariance,
     shake,
     stored_columns,
-    unit_columns,
-    widened,
 )
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.parameters import (
@@ -194,15 +192,6 @@ def test_a_stored_factor_has_the_same_covariance(monkeypatch):
         as_stored(torch.zeros(30, DRAWS + 9))
 
 
-def test_random_columns_are_a_unit_matrix_on_average(monkeypatch):
-    assert torch.equal(unit_columns(5, 100), torch.eye(5, dtype=torch.float64))
-    monkeypatch.setattr(covariance, "EXACT_UNKNOWNS", 0)
-    drawn = unit_columns(300, 300)
-    off = drawn @ drawn.T - torch.eye(300)
-    assert float(off.diagonal().abs().max()) < 1e-12 and float(off.square().mean().sqrt()) < 1.1 / DRAWS**0.5
-    assert torch.equal(drawn, unit_columns(300, 300)) and not torch.equal(drawn, unit_columns(300, 300, seed=1))
-
-
 def test_captures_that_say_nothing_leave_the_prior(monkeypatch):
     """Its factor, exact and from random columns, with the scene's motion and growth taken out."""
     rig = rig_of(FRAMES, SIZE)
@@ -261,13 +250,3 @@ def test_drawn_starts_scatter_as_the_prior_states(with_projectors):
     parts = (delta[..., :3], delta[..., 3:], there[..., :3, 3] - T[:, :3, 3], turn)
     wanted = [s if with_projectors or k < 2 else 0 for k, s in enumerate(SIGMAS)]
     assert [float(p.pow(2).mean().sqrt()) for p in parts] == pytest.approx(wanted, rel=0.1, abs=1e-12)
-
-
-def test_widening_adds_the_mean_square_to_poses_alone():
-    factor, k = random_factor(3), 12 * FRAMES
-    a, b = torch.randn(2, k, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    wide = widened(factor, [a, b])
-    more = wide @ wide.T - factor @ factor.T
-    assert torch.allclose(more[:k, :k], (torch.outer(a, a) + torch.outer(b, b)) / 2)
-    assert float(more[k:].abs().max()) < 1e-12
-    assert torch.equal(widened(factor, []), factor)

@@ -14,7 +14,6 @@ from sl_nerfstudio.bundle_adjustment.search import (
     frame_support,
     problem_of,
     relocalise,
-    unplaced_frames,
 )
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_so3
 
@@ -66,11 +65,6 @@ def test_lost_frames_are_those_with_little_support_best_first():
     assert not len(find_lost_frames(alike))  # 2.5 % below equally good frames is not lost
     alike[2] = 0.7
     assert find_lost_frames(alike).tolist() == [2]
-
-
-def test_a_frame_that_is_far_off_is_named_and_no_other(true, maps):
-    assert unplaced_frames(true, maps, NOISE, SETTINGS) == ()
-    assert unplaced_frames(turned(true, LOST, 60), maps, NOISE, SETTINGS) == (LOST,)
 
 
 def test_a_frame_that_agrees_as_well_as_is_expected_is_not_searched_for(true, maps):
