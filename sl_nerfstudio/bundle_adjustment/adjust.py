@@ -291,7 +291,7 @@ _WORSE = 1.4  # median residual of any frame, relative to the result's, beyond w
 
 @dataclass(frozen=True)
 class Searched:
-    """What a search began with and where it ended, for the question whether there are other minima."""
+    """Beginning and ends of the searches, for the question whether there are other minima."""
 
     problem: SearchProblem
     refine: RefinePoses
@@ -300,7 +300,7 @@ class Searched:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """What the bundle adjustment found."""
+    """Poses of all devices with their covariance, in the scene, and how well they agree with the captures."""
 
     rig: Rig
     factor: Float[Tensor, "joint k"]  # of the covariance of (delta, rho, intrinsics) without the gauge
@@ -354,14 +354,14 @@ def find_minimum(
 
 @one_library_thread()
 def with_other_minima(found: Adjustment) -> Adjustment:
-    """The same poses; where they are one of several minima, their covariance covers those of other searches."""
+    """Let the covariance cover other minima, if the poses are one of several; the poses stay."""
     if found.searched is None:
         return found
     return replace(found, factor=widened(found.factor, _departures(found, found.searched)), searched=None)
 
 
 def _departures(result: Adjustment, searched: Searched) -> list[Float[Tensor, "unknowns"]]:
-    """Where other searches end if the result is one of several minima: increments (delta, rho) from the result."""
+    """Increments (delta, rho) from the result to ends of other searches, if it is one of several minima."""
     problem, refine, found = searched.problem, searched.refine, searched.ends
     generator = torch.Generator().manual_seed(problem.settings.seed)
     if problem.settings.other_minima < 1 or refine not in FRAMES_MOVE or result.rig.frames > _MOST_FRAMES:
@@ -392,7 +392,7 @@ def _other_ends(
 
 
 def _placed_frames(other: SearchProgress, result: Adjustment) -> Rig:
-    """Where another search ended, with frames that are not placed where the result has them."""
+    """The end of another search, with frames that are not placed where the result has them."""
     return with_frames_of(other.state.rig, result.rig, result.unplaced)
 
 

@@ -8,11 +8,13 @@ the adjustment would turn that offset into wrong poses.)
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt64
+from jaxtyping import Bool, Float, Float64, Int, Int64, UInt64
 from numpy import ndarray
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
 from sl_nerfstudio.parallel import compiled, compiled_range
@@ -25,6 +27,7 @@ _LEAST_PIXELS = 24  # decoded pixels that a window of HALF_WINDOW must hold
 _LEAST_PIVOT = 1e-3  # share of a pivot that elimination must leave; below it the window's pixels lie on a conic
 _ROUGHNESS_PX = 2.0  # RMS distance of a window from its paraboloid, pattern pixels: beyond, the map is discontinuous
 _ROUGHNESS_MEDIANS = 3.0  # the same limit in roughnesses of the median window; the larger limit applies
+FARTHEST = 255  # steps from the border of what was decoded: larger distances are not told apart
 _SAMPLED_WINDOWS = 200  # windows of each frame from which that median is taken
 
 # Groups of the entries of an array, such as the rows of each frame or each anchor.
@@ -39,7 +42,7 @@ class Groups:
 
     @staticmethod
     def of(key: Int64[ndarray, "n"], groups: int) -> "Groups":
-        """From the group of each entry."""
+        """Group entries by a key."""
         first, entries = np.zeros(groups + 1, dtype=np.int64), np.empty(len(key), dtype=np.int64)
         _group(np.ascontiguousarray(key), first, entries)
         return Groups(first, entries)
@@ -98,7 +101,7 @@ class PixelIndex:
 
     @staticmethod
     def of(known: Sequence[UInt64[ndarray, "_h _words"]], widths: Sequence[int]) -> "PixelIndex":
-        """From the words of each frame's rows (`packed`)."""
+        """Index the words of each frame's rows (`packed`)."""
         counts = np.array([part.size for part in known], dtype=np.int64)
         words = np.empty((int(counts.sum()), 2), dtype=np.uint64)
         np.concatenate([part.ravel() for part in known], out=words[:, 0])
@@ -111,15 +114,11 @@ class PixelIndex:
         """The parts for compiled loops."""
         return self.words, self.first, self.widths, self.heights
 
-    def image(self, values: Float32[ndarray, "decoded 2"], frame: int) -> Float32[ndarray, "h w 2"]:
-        """One frame, NaN where nothing is known."""
+    def known(self, frame: int) -> Bool[ndarray, "h w"]:
+        """Which pixels of a frame have a coordinate."""
         w, h, first = self.widths[frame], self.heights[frame], self.first[frame]
         rows = self.words[first : first + h * words_of(w), 0].reshape(h, -1)
-        known = np.unpackbits(rows.astype("<u8").view(np.uint8), axis=1, count=w, bitorder="little").view(np.bool_)
-        out = np.full((h, w, 2), np.nan, dtype=np.float32)
-        start = int(self.words[first, 1])
-        out[known] = values[start : start + int(known.sum())]
-        return out
+        return np.unpackbits(rows.astype("<u8").view(np.uint8), axis=1, count=w, bitorder="little").view(np.bool_)
 
 
 def packed(known: Bool[ndarray, "h w"]) -> UInt64[ndarray, "h words"]:
@@ -180,52 +179,6 @@ def _count_before(words):
     for k in range(len(words)):
         words[k, 1] = total
         total += _bits_of(words[k, 0])
-
-
-FARTHEST = 255  # pixels from the border of what was decoded: larger distances are not told apart
-
-
-@compiled_range
-def border_distances(first, last, index, starts, entries, pixel, found):
-    """Steps (also diagonal ones) to the nearest pixel without a coordinate or outside, up to `FARTHEST`.
-
-    `entries[starts[f] : starts[f + 1]]` are the positions in frame f, at `pixel` of it, or outside where that is
-    negative.
-    """
-    words, first_words, widths, heights = index
-    for f in range(first, last):
-        if starts[f] == starts[f + 1]:
-            continue
-        steps = np.zeros(widths[f] * heights[f], dtype=np.uint8)
-        _steps(words, first_words[f], widths[f], heights[f], steps)
-        for k in entries[starts[f] : starts[f + 1]]:
-            found[k] = steps[pixel[k]] if pixel[k] >= 0 else 0
-
-
-@compiled
-def _steps(words, first_word, w, h, out):
-    """Distances in one frame, by two passes over it (Rosenfeld and Pfaltz, Pattern Recognition, 1968)."""
-    for y in range(h):
-        row_word = first_word + y * words_of(w)
-        for x in range(w):
-            pixel = y * w + x
-            if not is_known(words, row_word, x):
-                continue
-            least = 0
-            if 0 < x < w - 1 and y > 0:
-                above = pixel - w
-                least = min(out[above - 1], out[above], out[above + 1], out[pixel - 1])
-            out[pixel] = min(least + 1, FARTHEST)
-    for y in range(h - 1, -1, -1):
-        for x in range(w - 1, -1, -1):
-            pixel = y * w + x
-            if out[pixel] == 0:
-                continue
-            least = 0
-            if 0 < x < w - 1 and y < h - 1:
-                below = pixel + w
-                least = min(out[below - 1], out[below], out[below + 1], out[pixel + 1])
-            out[pixel] = min(out[pixel], least + 1)
 
 
 @compiled_range
@@ -499,7 +452,7 @@ class CoordinateMaps:
         return maps.with_windows(HALF_WINDOW)
 
     def with_windows(self, half_window: int) -> "CoordinateMaps":
-        """The same images, looked up in windows of another size, as full of decoded pixels as before.
+        """Look the same images up in windows of another size, as full of decoded pixels as before.
 
         Windows that are much rougher than the median one count as discontinuous.
         """
@@ -532,7 +485,10 @@ class CoordinateMaps:
 
     def image(self, frame: int) -> Float[Tensor, "h w 2"]:
         """The coordinate image of a frame, NaN where not decoded."""
-        return torch.from_numpy(self.index.image(self.values.numpy(), frame))
+        known, start = self.index.known(frame), int(self.index.words[self.index.first[frame], 1])
+        out = torch.full((*known.shape, 2), torch.nan)
+        out[torch.from_numpy(known)] = self.values[start : start + int(known.sum())]
+        return out
 
     @property
     def arrays(self) -> tuple[ndarray, tuple[ndarray, ...]]:
@@ -544,13 +500,17 @@ class CoordinateMaps:
         return torch.from_numpy(self.index.widths), torch.from_numpy(self.index.heights)
 
     def border_distance(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-        """Pixels to the nearest one without a coordinate, from positions in `frame`; 0 outside the image."""
+        """Steps, also diagonal ones, to the nearest pixel without a coordinate (up to `FARTHEST`); 0 outside."""
         w, h = (size[frame] for size in self._sizes)
         x, y = (uv_camera[:, k].nan_to_num(-1.0).clamp(-1, 2**30).floor().long() for k in range(2))
         inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
         pixel = torch.where(inside, y * w + x, torch.full_like(x, -1)).numpy()
         groups, found = Groups.of(frame.numpy(), self.frames), np.zeros(len(frame))
-        border_distances(self.frames, self.index.arrays, groups.first, groups.entries, pixel, found)
+        for f, (first, last) in enumerate(pairwise(groups.first.tolist())):
+            mine = groups.entries[first:last]
+            if len(mine):
+                steps = distance_transform_cdt(np.pad(self.index.known(f), 1), "chessboard")[1:-1, 1:-1].ravel()
+                found[mine] = np.where(pixel[mine] >= 0, np.minimum(steps[pixel[mine]], FARTHEST), 0)
         return torch.from_numpy(found)
 
     def look_up(

@@ -31,7 +31,7 @@ def damped_solver(
     prior: tuple[Float[Tensor, "m 12 12"], Float[Tensor, "m 12"]],
     free: FreeParameters,
 ) -> Solve:
-    """For the normal equations and prior of the frames that move; the damping is a share of the diagonal."""
+    """A solver of the normal equations with the prior; the damping is a share of the diagonal."""
     g = free.vector(equations.g + prior[1])
     if len(free.frames) > _FACTORISED_FRAMES:
         return _iterative_solver(equations, prior[0], free, g)

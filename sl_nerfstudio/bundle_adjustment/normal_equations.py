@@ -71,7 +71,7 @@ add_6, add_12 = _adding(6, 2), _adding(12, 4)
 
 @compiled_range
 def depth_couplings(first, last, by_anchor, own, cross, depth_by_own, depth_by_row, depth_by_common, H_depth, g_depth):
-    """What couples the depth of each anchor with the unknowns of its own frame, of those that see it, and of all.
+    """Couplings of the depth of each anchor with the unknowns of its own frame, of those that see it, and of all.
 
     `own` and `cross` are residuals, derivatives by pose and depth, and weights; `by_anchor` the rows of each anchor.
     """
@@ -126,7 +126,7 @@ def _add_12(H, at, w, J, n, first):
 
 @compiled
 def _add_common(border, s, first, w, J, n, second, common):
-    """The same for the columns `second` and later of J, which are those of the common unknowns."""
+    """Add the columns by common unknowns, the last ones of J, to rows `first` to `first + 6` of a frame's border."""
     for x in range(6):
         for y in range(common):
             both = J[n, 0, second + x] * J[n, 0, J.shape[2] - common + y]
@@ -143,7 +143,7 @@ def _subtract(H, at, scale, v, i, u, j):
 
 @compiled
 def _subtract_depth(H, g, border, s, scale, v, i, u, u_g):
-    """What the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
+    """Subtract what the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
     _subtract(H, 144 * s, scale, v, i, v, i)
     for x in range(12):
         g[s, x] -= scale * v[i, x] * u_g
@@ -366,7 +366,7 @@ def _add_scaled(g, at, r, J, first, count):
 
 @compiled
 def _through_depth(g, a, pull, row_first, row_entries, frame, viewer, couplings, common):
-    """What a pull on the depth of an anchor does to the gradient."""
+    """Add to the gradient what a pull on the depth of an anchor does to it."""
     by_own, by_row, by_common, H_depth, _ = couplings
     scale = -pull / H_depth[a]
     _add_scaled(g, 12 * frame[a], scale, by_own[a], 0, 12)

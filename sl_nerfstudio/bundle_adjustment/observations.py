@@ -108,7 +108,7 @@ def count_chosen(first, last, visible, most, counts):
 
 @compiled_range
 def choose_frames(first, last, visible, starts, seed, number, frames):
-    """As many frames as `starts` leaves room for, at random among those that see an anchor, in order.
+    """Choose as many frames as `starts` leaves room for, at random among those that see an anchor, in order.
 
     Selection sampling (Knuth, The Art of Computer Programming 2, algorithm S); `number` identifies each anchor.
     """
@@ -164,7 +164,7 @@ def observe(
     generator: torch.Generator,
     allowed: Bool[Tensor, "frames frames"] | None = None,
 ) -> Observations:
-    """For every anchor, up to `per_anchor` other frames that decoded something near it, within `gate_px` of it.
+    """Choose for every anchor up to `per_anchor` other frames that decoded something near it, within `gate_px`.
 
     Frames whose camera or projector is behind the anchor's surface, or sees it at a cosine below `least_cosine`, are
     left out: they see, or light, another side of the object. `allowed[i, j]` says whether frame j may look up anchors
@@ -187,7 +187,7 @@ def away_from_borders(
     least: float,
     frames: int,
 ) -> tuple[Anchors, Observations]:
-    """Only anchors, and rows, that are at least so many pixels from the border of what was decoded.
+    """Keep anchors and rows that are at least so many pixels from the border of what was decoded.
 
     `distances` are those of anchors in their own frame and of rows in the frame that looks up. Of frames of thin
     things, which are all border, the better half remains.
@@ -210,7 +210,7 @@ def every_other(frames: int) -> Bool[Tensor, "frames frames"]:
 
 
 def involving(frame: int, frames: int) -> Bool[Tensor, "frames frames"]:
-    """Only pairs of one frame and another."""
+    """Pairs of one frame and any other."""
     involved = torch.arange(frames) == frame
     return every_other(frames) & (involved[:, None] | involved)
 
@@ -218,7 +218,7 @@ def involving(frame: int, frames: int) -> Bool[Tensor, "frames frames"]:
 def partners(
     rig: Rig, anchors: Anchors, maps: CoordinateMaps, most: int, least_cosine: float, generator: torch.Generator
 ) -> Bool[Tensor, "frames frames"]:
-    """For each frame about `most` others, at random from those that see the same surface; every other if there are few.
+    """Choose for each frame about `most` others that see the same surface, at random; every other if there are few.
 
     Random partners hold the frames together better than neighbours do: no chain of frames is long.
     """

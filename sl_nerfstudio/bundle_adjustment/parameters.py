@@ -276,7 +276,7 @@ class FreeParameters:
         return torch.cat([mine.flatten(0, 1), shared]).reshape(self.count, *g.shape[2:])
 
     def matrix(self, H: Float[Tensor, "unknowns unknowns"]) -> Float[Tensor, "parameters parameters"]:
-        """The same for both sides of a normal matrix; unknowns after those of the frames stay. It may be `H` itself."""
+        """A normal matrix by the parameters; unknowns after those of the frames stay. It may be `H` itself."""
         if self.own.shape[2] == 12 and not self.shared.shape[2]:
             return H
         return self._rows(self._rows(H).T)
@@ -287,7 +287,7 @@ class FreeParameters:
 
 
 def free_parameters(refine: RefinePoses, rig: Rig) -> FreeParameters:
-    """What a choice leaves free at a rig."""
+    """Parameters that a choice leaves free at a rig."""
     n = rig.frames
     eye = torch.eye(12, dtype=torch.float64).expand(n, 12, 12)
     own, shared = eye[..., :6], eye[..., :0]
@@ -372,7 +372,7 @@ class SelfCalibration:
         return torch.linalg.solve(C[:3, :3], C[:3, 3:]).T
 
     def allowing(self, sigma: Float64[ndarray, "6"]) -> "SelfCalibration":
-        """With stated values that are themselves uncertain, by 1 sigma each: no contradiction within it."""
+        """Allow for stated values that are themselves uncertain, by 1 sigma each: no contradiction within it."""
         return SelfCalibration(self.change, self.covariance + torch.from_numpy(sigma).square().diag())
 
     @property
@@ -394,7 +394,7 @@ class SelfCalibration:
 def linearise_with_intrinsics(
     linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
 ) -> Linearisation:
-    """The same residuals with added derivatives by the six intrinsics, which come after the poses."""
+    """Add derivatives by the six intrinsics, which come after the poses."""
     i, j, a = anchors.frame, observations.frame, observations.anchor
     ray = rig.camera[i]
     K = project_jacobian(ray, anchors.d_camera)
@@ -433,7 +433,7 @@ def by_intrinsics(devices: Intrinsics, uv: Float[Tensor, "n 2"]) -> Float[Tensor
 def with_smooth_derivatives(
     linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
 ) -> Linearisation:
-    """The same residuals; derivatives by poses and intrinsics from wide windows where a paraboloid fits them."""
+    """Replace derivatives by those of wide windows, where a paraboloid fits them."""
     wide = maps.with_windows(WIDE_HALF_WINDOW)
     rows = Observations(observations.anchor, observations.frame)  # with a memory of its own
     found = linearise_with_intrinsics(linearise(rig, anchors, rows, wide), rig, anchors, rows, wide)

@@ -43,7 +43,7 @@ _LEAST_SIGMA = 1e-9  # smallest sigma that is stated, scene units or radian
 
 @dataclass(frozen=True)
 class ProjectorKnowledge:
-    """What is known of the projector's focal length and principal point: shares of the focal length."""
+    """Prior knowledge of the projector's focal length and principal point: shares of the focal length."""
 
     sigma: tuple[float, float, float]
     change: DeviceChange = field(default_factory=DeviceChange)  # of the current projector against the known one
@@ -94,14 +94,14 @@ class AdjustedFrames:
 
 @dataclass(frozen=True)
 class RegisteredMinimum:
-    """Where the adjustment of all registered frames has ended; whether it is one of several minima is not known yet."""
+    """Adjustment of all registered frames, of which it is not known yet whether it is one of several minima."""
 
     frames: AdjustedFrames  # with the sigma of this minimum alone
     adjustment: Adjustment
     unit: float  # of the scene, in that of the frames
 
     def with_other_minima(self) -> AdjustedFrames:
-        """The same poses; their sigma also covers how far other minima are, which takes several more searches."""
+        """Let sigma cover how far other minima are, which takes several more searches; the poses stay."""
         index = np.flatnonzero([s is not None for s in self.frames.sigma]).tolist()
         sigma = _stated_sigma(with_other_minima(self.adjustment), self.unit)
         return replace(self.frames, sigma=_sigmas_among_all(sigma, index, len(self.frames.sigma)))

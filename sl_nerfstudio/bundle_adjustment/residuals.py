@@ -142,7 +142,7 @@ def _world_point(devices, frame, depth, ray):
 
 @compiled_range
 def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, by_pose, by_depth):
-    """Own residuals of the anchors: decoded coordinates from their projector's view of them."""
+    """Own residuals of the anchors: their projector's view of them less the decoded coordinates."""
     _, _, T_projector_camera, _, _, projector, code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
@@ -159,7 +159,7 @@ def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, 
 
 @compiled_range
 def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_front):
-    """Where other cameras see the anchors."""
+    """Pixels at which other cameras see the anchors."""
     _, T_camera_world, _, cameras, code, _, _ = devices
     for k in range(first, last):
         a, j = anchor[k], viewer[k]
@@ -172,7 +172,7 @@ def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_
 def cross_residuals(
     first, last, devices, frame, rays, depths, anchor, viewer, seen, seen_by_pixel, residual, by_pose, by_depth
 ):
-    """What other frames decoded (`seen`, with its derivatives by the pixel), from their projectors' views."""
+    """Cross residuals: the views of their projectors less what other frames decoded (`seen`, `seen_by_pixel`)."""
     T_world_camera, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
@@ -215,7 +215,7 @@ class Anchors:
         return replace(self, depth=depth)
 
     def chosen(self, index: Tensor) -> "Anchors":
-        """Some of the anchors, by mask or by index."""
+        """Choose anchors by mask or by index."""
         return Anchors(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
@@ -291,7 +291,7 @@ def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: C
 def pixels_of_rows(
     rig: Rig, anchors: Anchors, observations: Observations
 ) -> tuple[Float[Tensor, "rows 2"], Bool[Tensor, "rows"]]:
-    """Where the seeing cameras have the anchors, and whether in front of them."""
+    """Pixels of the anchors in the cameras that see them, and whether they are in front."""
     n = len(observations.anchor)
     uv, in_front = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
     rows = (array(observations.anchor), array(observations.frame))

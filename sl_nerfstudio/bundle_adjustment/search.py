@@ -131,7 +131,7 @@ class AdjustmentSettings:
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """What does not change during an adjustment."""
+    """A search: the measurements, the prior, and where it begins."""
 
     start: Rig  # to which the prior belongs
     begin: Rig  # where the search begins
@@ -151,7 +151,7 @@ class SearchProblem:
         )  # fmt: skip
 
     def again(self, start: Rig, begin: Rig, expected: Float[Tensor, "frames"]) -> "SearchProblem":
-        """The same problem for another search, which expects that support of each frame."""
+        """Another search with the same measurements, which expects that support of each frame."""
         return replace(problem_of(start, self.maps, self.prior, self.settings, begin), expected=expected)
 
 
@@ -171,7 +171,7 @@ class SearchProgress:
         return self.rows.pairs(self.state.anchors)
 
     def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "SearchProgress":
-        """The same with some frames at other poses; the kernels of those frames are wide again."""
+        """Continue with some frames at other poses; the kernels of those frames are wide again."""
         widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
         return replace(self, state=replace(self.state, rig=rig), widths=widths)
 
@@ -309,7 +309,7 @@ def find_lost_frames(support: Float[Tensor, "frames"]) -> Int[Tensor, "lost"]:
 
 @dataclass(frozen=True)
 class Relocalised:
-    """What a search for lost frames has found."""
+    """Result of a search for lost frames."""
 
     rig: Rig
     found: tuple[int, ...]  # frames that the others support now
@@ -417,7 +417,7 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
 
 
 def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchProgress:
-    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual.
+    """Leave out look-ups so near to the border of what was decoded that their residuals are larger than usual.
 
     As wide a strip beside those falls away, too, if windows reach that far: their look-ups average over both.
     """

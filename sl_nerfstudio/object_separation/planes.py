@@ -101,12 +101,8 @@ class FramePoints:
         return len(self.p_world)
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "FramePoints":
-        """Some of the points."""
+        """Choose points by mask or by index."""
         return FramePoints(*(values[index] for values in vars(self).values()))
-
-    def scaled_noise(self, factor: float) -> "FramePoints":
-        """The same points with all sigmas multiplied."""
-        return replace(self, sigma=self.sigma * factor)
 
     def sigma_along(self, normal: Float[ndarray, "3"] | Float[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
         """1 sigma of each point's place along a direction."""
@@ -276,7 +272,7 @@ class PointPool:
         return pool.chosen(np.isfinite(pool.normal).all(-1))
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "PointPool":
-        """Some of the points."""
+        """Choose points by mask or by index."""
         return PointPool(self.points.chosen(index), self.normal[index], self.frame[index])
 
     def __len__(self) -> int:
@@ -321,17 +317,11 @@ def _largest(pool: PointPool, radius: float, rng: np.random.Generator) -> Plane 
         return None
     best = Plane(planes[most, :3], float(planes[most, 3]))
     for _ in range(3):
-        best = _refitted(pool, pool.on(best), best)
+        on = pool.points.chosen(pool.on(best))
+        if len(on) >= FEWEST:
+            found = fit_plane(on.p_world, 1 / on.sigma_along(best.normal) ** 2)
+            best = found if found.normal @ best.normal > 0 else found.flipped()
     return best
-
-
-def _refitted(pool: PointPool, on: Bool[ndarray, "n"], plane: Plane) -> Plane:
-    """The plane fitted to some points; unchanged if they are too few."""
-    if on.sum() < FEWEST:
-        return plane
-    points = pool.points.chosen(on)
-    found = fit_plane(points.p_world, 1 / points.sigma_along(plane.normal) ** 2)
-    return found if found.normal @ plane.normal > 0 else found.flipped()
 
 
 # Where all cameras look at: the point that their axes pass nearest, and how far around it they see.
@@ -352,7 +342,7 @@ class ViewedRegion:
 
 
 def viewed_region(frames: Sequence[DecodedFrame], p_world: Float[ndarray, "n 3"]) -> ViewedRegion:
-    """From the poses and fields of view of all devices; `p_world` are points of all frames."""
+    """Find the region from the poses and fields of view of all devices; `p_world` are points of all frames."""
     middle = np.median(p_world, axis=0)
     A, b = _TOWARDS_POINTS * np.eye(3), _TOWARDS_POINTS * middle
     for frame in frames:

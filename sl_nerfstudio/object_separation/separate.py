@@ -5,7 +5,7 @@ surroundings, or behind one, is left out; of the rest, the connected part on whi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import product
 
@@ -256,7 +256,7 @@ def separate(frames: Sequence[DecodedFrame], seed: int = 0) -> Separation:
     few = [p.chosen(_spread(len(p), _POINTS // len(points), rng)) for p in points]
     normals = [normals_of(p) for p in few]
     pose_noise = cross_frame_noise(few, normals)
-    pool = PointPool.of([p.scaled_noise(pose_noise) for p in few], normals)
+    pool = PointPool.of([replace(p, sigma=p.sigma * pose_noise) for p in few], normals)
     region = viewed_region(thin, pool.points.p_world)
     size = _voxel_size(points, region)
     findings = tuple(

@@ -23,7 +23,7 @@ from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inve
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels, evenly_spaced, geman_mcclure_weight
 from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
 from sl_nerfstudio.parallel import one_library_thread
-from sl_nerfstudio.scan.types import Frame, PoseSigma, Scan
+from sl_nerfstudio.scan.types import PoseSigma, Scan
 
 _PIXELS_PER_FRAME, _MOST_PIXELS, _LEAST_PIXELS_PER_FRAME = 500, 12000, 60  # that are looked up in other frames
 _COMPARED_FRAMES = 150  # most frames of which each is compared with every other
@@ -311,14 +311,8 @@ _EDGE = 2.0  # per cent of the points on each side that may lie outside the obje
 
 def compare_scan_frames(scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None]) -> CrossFrameAgreement:
     """Compare the frames of a scan: `compare_frames` with coordinates from its files, where the masks allow them."""
-    images = (_masked_coords(frame) for frame in scan.frames)
+    images = (np.where(f.read_mask()[..., None], f.read_coords(), np.float32(np.nan)) for f in scan.frames)
     return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma)
-
-
-def _masked_coords(frame: Frame) -> Float32[ndarray, "h w 2"]:
-    coords = frame.read_coords()
-    coords[~frame.read_mask()] = np.nan
-    return coords
 
 
 def compare_frames(

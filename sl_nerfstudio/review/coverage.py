@@ -52,7 +52,7 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class SurfaceShares:
-    """What one frame has of the surface that others show; None where too little is known."""
+    """Shares of the surface that others show in one frame; None where too little is known."""
 
     decoded: float | None  # see `shared_surface`
     missing: float | None  # see `missing_shares`
@@ -60,7 +60,7 @@ class SurfaceShares:
 
 @dataclass(frozen=True)
 class SharedSurface:
-    """What the frames of a scan show of each other's surface."""
+    """The surface that the frames of a scan show, and how much of the others' each of them decoded."""
 
     points: SurfacePoints
     decoded: tuple[float | None, ...]  # see `shared_surface`

@@ -126,7 +126,7 @@ def undetermined(found: BoardCalibration) -> tuple[str, ...]:
 
 
 def shortcomings(found: BoardCalibration) -> tuple[str, ...]:
-    """What the poses lack, in half sentences."""
+    """Shortcomings of the poses, in half sentences."""
     c, out = found.coverage, []
     if c.tilt_deg < _LEAST_TILT_DEG:
         out.append(f"the boards are nearly parallel (the largest angle between two is {c.tilt_deg:.0f} degrees)")
@@ -294,7 +294,7 @@ def _undecided(facts: ScanFacts) -> Iterator[Reason]:
 
 
 def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
-    """That the rotation of frames is uncertain, with the most uncertain one."""
+    """Say that the rotation of frames is uncertain, with the most uncertain one."""
     sigma = max(f.sigma_rotation_deg or 0.0 for f in frames)
     said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
     return (
@@ -304,7 +304,7 @@ def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
 
 
 def symmetry_sentence(turns_deg: Sequence[float]) -> str:
-    """That the surface looks the same after turns, and what it means."""
+    """Say that the surface looks the same after turns, and what it means."""
     return (
         f"{_same_after(turns_deg)}, and pairs of frames contradict each other by it: frames may be placed at another "
         "side than they show. The surface is right if the object really is that symmetric; for the poses, capture in "
@@ -313,7 +313,7 @@ def symmetry_sentence(turns_deg: Sequence[float]) -> str:
 
 
 def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
-    """What it means that the order of capture decided which side each frame shows."""
+    """Say what it means that the order of capture decided which side each frame shows."""
     how = "each was placed by the order of capture, turned as little as possible against the one before"
     if not turns_deg:
         return Reason(
@@ -357,12 +357,12 @@ def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
 
 
 def _support(name: str, pairs: Iterable[PairFacts], used: bool) -> float:
-    """Of the pairs of a frame that are used, or are not, together."""
+    """Sum the support of the pairs of a frame that are used, or are not."""
     return math.fsum(p.support for p in pairs if name in p.frames and p.used == used)
 
 
 def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[Reason]:
-    """What the coordinates of the frames say about each other; `names` in the order of `cross.frames`."""
+    """Reasons in how the coordinates of the frames agree; `names` in the order of `cross.frames`."""
     alone = [name for name, f in zip(names, cross.frames, strict=True) if not f.seen >= _LEAST_SEEN]
     if alone:
         yield Reason(

@@ -198,7 +198,7 @@ ONE = replace(SEVERAL, other_minima=0)
 
 
 def noisy_maps(seed: int, noise: float, size: int = SIZE) -> CoordinateMaps:
-    """Of the scene as it is now."""
+    """Noisy coordinate images of the scene as it is now."""
     generator = torch.Generator().manual_seed(seed)
     images = images_of(rig_of(FEW, size), size)
     return CoordinateMaps.of([image + noise * torch.randn(size, size, 2, generator=generator) for image in images])
@@ -247,7 +247,8 @@ def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkey
     maps = CoordinateMaps.of([strange if frame == stranger else maps.image(frame) for frame in range(FEW)])
     one: Adjustment = find_minimum(disturbed(rig_of(FEW, SIZE), 1), maps, TIGHT, "free", SEVERAL)
     assert one.unplaced == (stranger,)
-    assert torch.equal(one.factor, with_other_minima(one).factor) and len(searches) == 1
+    searches.clear()  # the first one, and one with the stranger where its surface fits best
+    assert torch.equal(one.factor, with_other_minima(one).factor) and not searches
 
 
 # Cross-validation.

@@ -36,7 +36,7 @@ def maps(true):
 
 
 def relocalised(rig, maps, mode="free", expected=WHATEVER):
-    """After a search for lost frames."""
+    """Search for lost frames."""
     return relocalise(problem_of(rig, maps, PRIOR, SETTINGS), mode, rig, NOISE, expected)
 
 

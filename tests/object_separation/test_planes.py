@@ -198,6 +198,7 @@ def test_where_all_axes_are_parallel_the_points_decide():
 # Every plane of a case, and why it is surroundings or part of the object.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("background", "verdict"), [("table", "leaves the views"), ("plate", "object stands on it")])
 def test_the_supporting_plane_is_found_where_it_is(separated, background, verdict):
     """The box stands on z = 0; a plate as large as the box is high has edges that the frames see."""
