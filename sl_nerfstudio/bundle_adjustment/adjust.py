@@ -6,16 +6,14 @@ and a fixed gauge. See `residuals` for what is minimised, and docs/method.md for
 rendering.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int, Int64
-from numpy import ndarray
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from sl_nerfstudio.bundle_adjustment.basin_hopping import MOST_FRAMES, MOST_LEFT, Hopped, hopped, with_lost_frames
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import (
     CovarianceEvidence,
@@ -35,7 +33,6 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     frame_medians,
     observe,
     partners,
-    place_anchors,
 )
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
@@ -43,8 +40,6 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     PosePrior,
     RefinePoses,
     SelfCalibration,
-    alignment,
-    baseline_scale,
     free_parameters,
     linearise_with_intrinsics,
     prior_equations,
@@ -63,229 +58,18 @@ from sl_nerfstudio.bundle_adjustment.search import (
     frame_support,
     kernel_of,
     problem_of,
-    rows_of_all,
     run_stage,
     search,
     unplaced_frames,
 )
-from sl_nerfstudio.geometry.devices import PARAMETERS, Device, Intrinsics, unproject
-from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
+from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.parallel import one_library_thread, results
-from sl_nerfstudio.registration.register import register
-from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
-from sl_nerfstudio.relative_pose.epipolar import correspondences_of, lattice_step
-from sl_nerfstudio.relative_pose.estimation import RelativePoseError, relative_pose_near
-
-# Where the surfaces of single frames fit together, as another place to begin a search: for rough starts, lost
-# frames.
-#
-# Look-ups compare coordinates at one place and lead a frame home from about its own details away. Each frame alone
-# shows
-# a surface, too, from its coordinates and the pose of its projector, and surfaces can be registered from much
-# farther.
-
-_FEWEST = 2  # frames that a registration may join
-
-
-def registered_start(problem: SearchProblem, refine: RefinePoses, beside: Rig, known: Sequence[int]) -> Rig | None:
-    """A rig with frames where the registration of their surfaces puts them; None if it joins too few.
-
-    `known` frames of the rig `beside` give the axes and the scale; the others may be anywhere. A frame that was not
-    joined stays where it is there. Projectors move only where they are free.
-    """
-    start = problem.start
-    clouds = [c for c in results([partial(_cloud, problem, k) for k in range(start.frames)]) if c is not None]
-    frame = np.array([int(c.name) for c in clouds])
-    if len(clouds) < _FEWEST:
-        return None
-    roughly = start.T_world_camera.numpy()[frame]
-    roughly[~np.isin(frame, list(known))] = np.nan
-    found = register(clouds, False, problem.settings.seed, roughly)
-    joined = np.flatnonzero(found.registered)
-    common = np.isin(frame[joined], list(known))
-    if common.sum() < _FEWEST:
-        return None
-    cameras, relative = found.T_world_camera[joined], np.stack([clouds[k].pose.T_camera_projector for k in joined])
-    relative[:, :3, 3] *= found.baseline[joined, None]
-    reference = _frames(beside, frame[joined][common])
-    same = replace(reference, **_poses(cameras[common], relative[common]))
-    scale = baseline_scale(reference, same, None)
-    S = alignment(reference, same, scale) @ Similarity.scaling(scale)
-    camera, projector = beside.T_world_camera.numpy().copy(), beside.T_camera_projector.numpy().copy()
-    camera[frame[joined]] = S.poses(cameras)
-    if refine == "free":
-        relative[:, :3, 3] *= scale
-        projector[frame[joined]] = relative
-    return replace(beside, **_poses(camera, projector))
-
-
-def _poses(camera: Float64[ndarray, "n 4 4"], relative: Float64[ndarray, "n 4 4"]) -> dict[str, Tensor]:
-    return {"T_world_camera": torch.from_numpy(camera), "T_camera_projector": torch.from_numpy(relative)}
-
-
-def _frames(rig: Rig, index: Int64[ndarray, "n"]) -> Rig:
-    chosen = torch.from_numpy(index)
-    return Rig(rig.camera[chosen], rig.projector, rig.T_world_camera[chosen], rig.T_camera_projector[chosen])
-
-
-def _cloud(problem: SearchProblem, k: int) -> FrameCloud | None:
-    """The surface of one frame, named by its number; None where too little of it was decoded."""
-    rig, s = problem.start, problem.settings.hops
-    coords = _thinned(problem.maps.image(k).numpy(), s.registered_side)
-    uv_camera, uv_projector = correspondences_of(coords)
-    if len(uv_camera) < s.registered_pixels:
-        return None
-    h, w = coords.shape[:2]
-    lit = np.ceil(uv_projector.max(0)).astype(int)  # the part of the pattern that matters
-    devices = _device(rig.camera[k], w, h), _device(rig.projector, int(lit[0]), int(lit[1]))
-    try:
-        pose = relative_pose_near(rig.T_camera_projector[k].numpy(), uv_camera, uv_projector, *devices)
-        return frame_cloud(str(k), coords, *devices, pose)
-    except RelativePoseError:  # hardly any coordinate agrees with a pose near the stated one
-        return None
-
-
-def _thinned(image: ndarray, side: int) -> Float32[ndarray, "h w 2"]:
-    """Only every n-th decoded pixel of an image that is much larger than surfaces are compared at."""
-    used = lattice_step(*image.shape[:2])  # correspondences are taken there only: a multiple loses none of the kept
-    step = used * max(round(max(image.shape[:2]) / (used * side)), 1)
-    kept = np.full_like(image, np.nan, dtype=np.float32)
-    kept[::step, ::step] = image[::step, ::step]
-    return kept
-
-
-def _device(intrinsics: Intrinsics, w: int, h: int) -> Device:
-    values = dict(zip(PARAMETERS, intrinsics.params.tolist(), strict=True))
-    return Device(w, h, **values, model=intrinsics.model)
-
-
-# After rough starts: a search is begun again beside its end, and goes on from wherever more is explained.
-#
-# From starting poses that are off by several degrees some frames end in a minimum of their own, where two or three
-# of
-# them agree with each other and well enough with the rest. Poses drawn about that end let them out again, while the
-# frames that are right return. (Basin hopping: Wales and Doye, J. Phys. Chem. A, 1997; only what is better is
-# kept.)
-
-_HALF = 0.5  # share of the frames that every second hop moves
-
-
-@dataclass(frozen=True)
-class Hopped:
-    """Where further searches have ended."""
-
-    best: SearchProgress
-    others: tuple[SearchProgress, ...]  # where those after the best one have ended, if it was elsewhere
-    settled: bool  # the last one led back, or none was asked for
-
-
-def hopped(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -> Hopped:
-    """The end of the search, or a better one; ends as soon as a hop leads back to the best one, or none is better.
-
-    The first hop begins where a registration of the frames' surfaces puts them. Frames that agree with no others at the
-    first end are not searched for again.
-    """
-    s, generator = problem.settings.hops, torch.Generator().manual_seed(problem.settings.seed)
-    possible = refine in FRAMES_MOVE and found.state.rig.frames <= s.most_frames
-    if s.most < 1 or not possible or not is_rough(problem.prior, s.from_deg):
-        return Hopped(found, (), True)
-    best, others = found, []
-    unplaced = unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
-    expected = problem.expected.clone()
-    expected[list(unplaced)] = float("-inf")
-    registered = registered_start(problem, refine, problem.start, range(problem.start.frames))
-    for hop in range(s.most):
-        if hop == 0 and registered is not None:
-            again = problem.again(problem.start, registered, problem.expected)
-        else:
-            begin = _moved(best.state.rig, problem.prior, s.size, 1.0 if hop % 2 else _HALF, generator)
-            again = problem.again(problem.start, begin, expected)
-        end = search(again, refine)
-        if end is None:
-            continue
-        other = end[0]
-        width = s.width_noises * min(best.noise, other.noise)
-        now, then = (_explained(p.state.rig, problem.maps, width, problem.settings) for p in (other, best))
-        if now > (1 + s.least_gain) * then:
-            best, others = other, []
-        elif _leads_back(with_frames_of(other.state.rig, best.state.rig, unplaced), best.state.rig, problem):
-            return Hopped(best, tuple(others), True)
-        else:
-            others.append(other)
-            if len(others) == s.patience:
-                break
-    return Hopped(best, tuple(others), False)
-
-
-def _leads_back(other: Rig, best: Rig, problem: SearchProblem) -> bool:
-    """Whether every frame has come back, most of the way that hops take it."""
-    s = problem.settings.hops
-    departure = departure_of(other, best).reshape(2, -1, 6)[0] / (s.size * problem.prior.sigma[:, :6])
-    return float(departure.square().mean(1).max().sqrt()) <= s.most_left
-
-
-def is_rough(prior: PosePrior, from_deg: float) -> bool:
-    """Whether the starting poses of most frames are as uncertain as that."""
-    return float(torch.rad2deg(prior.frame_rotation).median()) >= from_deg
-
-
-def _moved(rig: Rig, prior: PosePrior, size: float, share: float, generator: torch.Generator) -> Rig:
-    """Some frames as a whole at poses drawn about theirs, with a share of the uncertainty of the starting poses."""
-    chosen = torch.rand(rig.frames, 1, generator=generator, dtype=torch.float64) < share
-    draw = torch.randn(rig.frames, 6, generator=generator, dtype=torch.float64)
-    delta = torch.where(chosen, size * draw * prior.sigma[:, :6], torch.zeros_like(draw))
-    return rig.moved(delta, torch.zeros_like(delta))
-
-
-def _explained(rig: Rig, maps: CoordinateMaps, width_px: float, settings: AdjustmentSettings) -> float:
-    """Look-ups of an anchor that agree, about: a large residual counts little, a look-up that fails nothing."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    anchors = place_anchors(rig, maps, settings.hops.anchors_per_frame, generator)
-    rows = rows_of_all(rig, anchors, maps, settings, generator)
-    r = residuals_of(rig, anchors, rows, maps)
-    share = (r.cross[r.cross_valid] / width_px).square().sum(-1)
-    return float((1 - geman_mcclure_cost(share)).sum()) / max(len(anchors.frame), 1)
-
-
-# Frames that agree with no others after a search: their surfaces may show where they belong, however far that is.
-
-
-def with_lost_frames(
-    problem: SearchProblem, refine: RefinePoses, found: SearchProgress
-) -> tuple[SearchProblem, SearchProgress] | None:
-    """The problem and the end of a search with lost frames where their surfaces put them; None if none is found there.
-
-    The stated uncertainty of such a frame's starting pose was wrong: from now on it holds about the new place. What was
-    known of its projector against its camera stays.
-    """
-    s = problem.settings.hops
-    if not s.lost_by_surface or refine not in FRAMES_MOVE or problem.start.frames > s.most_frames:
-        return None
-    lost = _lost(problem, found)
-    others = [k for k in range(problem.start.frames) if k not in lost]
-    rig = registered_start(problem, refine, found.state.rig, others) if lost else None
-    if rig is None:
-        return None
-    begin = with_frames_of(found.state.rig, rig, lost)
-    start = replace(problem.start, T_world_camera=with_frames_of(problem.start, rig, lost).T_world_camera)
-    end = search(problem.again(start, begin, problem.expected), refine)
-    if end is None or not set(_lost(problem, end[0])) < set(lost):
-        return None
-    return replace(problem, start=start), end[0]
-
-
-def _lost(problem: SearchProblem, found: SearchProgress) -> tuple[int, ...]:
-    return unplaced_frames(found.state.rig, problem.maps, found.noise, problem.settings)
-
 
 # The adjustment, and whether its result is one of several minima.
 
 _SHAKE_SIGMAS = 2.0  # distance from the result, in its sigma, from which further steps should lead back
 _SHAKE_STEPS = 6  # most of those steps
-_MOST_LEFT = 0.35  # share of that distance that may be left in any frame
-_MOST_FRAMES = 100  # beyond which the question is not asked: it takes time, and many frames hold each other
 _WORSE = 1.4  # median residual of any frame, relative to the result's, beyond which a search has lost that frame
 
 
@@ -364,7 +148,7 @@ def _departures(result: Adjustment, searched: Searched) -> list[Float[Tensor, "u
     """Increments (delta, rho) from the result to ends of other searches, if it is one of several minima."""
     problem, refine, found = searched.problem, searched.refine, searched.ends
     generator = torch.Generator().manual_seed(problem.settings.seed)
-    if problem.settings.other_minima < 1 or refine not in FRAMES_MOVE or result.rig.frames > _MOST_FRAMES:
+    if problem.settings.other_minima < 1 or refine not in FRAMES_MOVE or result.rig.frames > MOST_FRAMES:
         return []
     ends = list(found.others)
     if not found.settled or not _shaken_leads_back(problem, refine, found.best, result, generator):
@@ -417,7 +201,7 @@ def _shaken_leads_back(
     beside = replace(state, rig=rig, anchors=anchors)
     back = run_stage(problem, SearchStage(refine, False, _SHAKE_STEPS), replace(found, state=beside))
     left = farthest_frame(result.factor, departure_of(_placed_frames(back, result), result.rig))
-    return left <= _MOST_LEFT * _SHAKE_SIGMAS
+    return left <= MOST_LEFT * _SHAKE_SIGMAS
 
 
 def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, before: float) -> Adjustment:

@@ -20,7 +20,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     restore,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings, HopSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on
@@ -57,9 +57,7 @@ class RegisteredFramesSettings:
     """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
     projector: ProjectorKnowledge | None = None
     """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
-    adjustment: AdjustmentSettings = field(
-        default_factory=lambda: AdjustmentSettings(hops=HopSettings(lost_by_surface=False))
-    )
+    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(lost_by_surface=False))
     """The bundle adjustment itself; surfaces were registered before."""
 
 

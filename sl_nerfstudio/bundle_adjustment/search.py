@@ -5,7 +5,7 @@ unknowns and thousands of residuals. Starting with a wide kernel, and from a few
 the surface that the others agree on.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -57,7 +57,7 @@ PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: 
 _LEAST_ANCHORS = 60  # of each frame, however many frames there are
 _RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
 _OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
-_INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
+INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
 _KERNEL_MEDIANS = 2.0  # width that a frame's kernel narrows to, in its median residuals
 _KERNEL_NOISES = 3.0  # smallest width, in estimated noises
 _CONVERGED = 1e-4  # largest component of a step, scene units or radian, below which the poses have converged
@@ -66,7 +66,7 @@ _SETTLED = 0.98  # share of its last width above which a kernel counts as no lon
 # Frames that are lost.
 _ROUNDS = 3  # of searching; frames that were found help to find the others
 _LOST_ANCHORS = 200  # decoded pixels of each frame that are used
-_LOST_FRAMES_PER_ANCHOR = 16
+EVERY_FRAME_PER_ANCHOR = 16  # in which an anchor is looked up where every frame that may see it is asked
 _MOST_RESIDUALS = 6000  # between one frame and all others
 _STARTS = 12  # starting poses for a lost frame, drawn from the prior
 _FRAME_STEPS = 10  # from each, in which the frame moves as a whole
@@ -76,37 +76,6 @@ _INLIER_NOISES = 5.0  # largest residual that supports a pose
 LEAST_GAIN = 0.01  # share of supporting residuals that a new pose must add to replace the old one
 _LOST_SIGMAS = 4.0  # robust standard deviations below the median frame's support at which a frame is lost,
 _LEAST_SHARE, _MOST_SHARE = 0.75, 0.95  # always below the first share of that, and never above the second
-
-
-@dataclass(frozen=True)
-class HopSettings:
-    """Further searches after rough starts, each begun beside the best end so far."""
-
-    most: int = 12
-    """Most of them; they end as soon as one leads back. 0: none."""
-    patience: int = 4
-    """Searches after the best one that end elsewhere, after which there is no further one."""
-    from_deg: float = 1.5
-    """Uncertainty of the starting rotations, 1 sigma per axis of the median frame in degrees, from which starts count
-    as rough."""
-    size: float = 0.3
-    """Distance from the best end at which a search begins, as a share of the starting poses' uncertainty."""
-    least_gain: float = 0.002
-    """Share by which a search must explain more to replace the best one."""
-    most_left: float = 0.35
-    """Share of that distance within which all frames must return for a search to lead back."""
-    width_noises: float = 4.0
-    """Residual that counts half, as a multiple of the noise."""
-    anchors_per_frame: int = 300
-    """Decoded pixels of each frame that are looked up for that comparison."""
-    most_frames: int = 100
-    """Frames beyond which no further search is made: it takes time, and many frames hold each other."""
-    lost_by_surface: bool = True
-    """Whether frames that agree with no others after all searches are looked for by their surfaces."""
-    registered_side: int = 240
-    """Pixels along the longer side of an image that are used to register surfaces, before the first of them."""
-    registered_pixels: int = 300
-    """Decoded pixels that a frame must have for its surface to be registered."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +94,10 @@ class AdjustmentSettings:
     """Seed of the choice of pixels."""
     other_minima: int = 3
     """Searches from other starting poses if a result turns out to be one of several minima; 0: none."""
-    hops: HopSettings = field(default_factory=HopSettings)
-    """Further searches after rough starts."""
+    hops: int = 12
+    """Most further searches after rough starts, each begun beside the best end so far; 0: none."""
+    lost_by_surface: bool = True
+    """Whether frames that agree with no others after all searches are looked for by their surfaces."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +204,7 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         widths = narrowed(found.widths, target).clamp_min(_KERNEL_NOISES * noise)
         kernel = kernel_of(found.state, found.rows, widths, r)
         per_frame = float(r.cross_valid.sum()) / start.frames
-        weight = rough_weight(noise, per_frame, _INDEPENDENT) if stage.rough else noise**2
+        weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
         free = free_parameters(stage.refine, found.state.rig)
         state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free)
@@ -247,19 +218,14 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
 
 
 def rows_of_all(
-    rig: Rig,
-    anchors: Anchors,
-    maps: CoordinateMaps,
-    settings: AdjustmentSettings,
-    generator: torch.Generator,
-    around: int | None = None,
+    rig: Rig, anchors: Anchors, maps: CoordinateMaps, generator: torch.Generator, around: int | None = None
 ) -> Observations:
     """Every anchor in other frames that may see it; with `around`, only anchors of or in one frame."""
     if around is None:
         allowed = partners(rig, anchors, maps, PARTNERS, LEAST_COSINE, generator)
     else:
         allowed = involving(around, rig.frames)
-    return observe(rig, anchors, maps, _LOST_FRAMES_PER_ANCHOR, float("inf"), LEAST_COSINE, generator, allowed)
+    return observe(rig, anchors, maps, EVERY_FRAME_PER_ANCHOR, float("inf"), LEAST_COSINE, generator, allowed)
 
 
 def support_of(
@@ -281,7 +247,7 @@ def frame_support(
     """Share of residuals within the noise of each frame, the same ones of the same poses; NaN where there are none."""
     generator = torch.Generator().manual_seed(settings.seed)
     anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
-    return support_of(rig, anchors, rows_of_all(rig, anchors, maps, settings, generator), maps, noise)
+    return support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
 
 
 def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
@@ -327,7 +293,7 @@ def relocalise(
     """
     maps, prior, generator = problem.maps, problem.prior, problem.generator
     anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
-    support = support_of(rig, anchors, rows_of_all(rig, anchors, maps, problem.settings, generator), maps, noise)
+    support = support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
     lost = find_lost_frames(support)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     searched = [k for k in lost.tolist() if support[k] < expected[k]]
@@ -364,7 +330,7 @@ def _place_one(
 
     def rows_near(rig: Rig) -> tuple[Int[Tensor, "n"], Observations]:
         """Numbers of anchors that take part, and their rows; a random subset of these if there are too many."""
-        rows, frame = rows_of_all(rig, all_anchors, maps, problem.settings, problem.generator, k), all_anchors.frame
+        rows, frame = rows_of_all(rig, all_anchors, maps, problem.generator, k), all_anchors.frame
         chosen = (allowed[frame[rows.anchor]] & allowed[rows.frame]).nonzero().squeeze(-1)
         chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:_MOST_RESIDUALS]]
         taking_part = frame == k
@@ -386,7 +352,7 @@ def _place_one(
         pair = rows.pairs(state.anchors)
         target = _KERNEL_MEDIANS * float(frame_medians(linear.residuals, pair, n)[k])
         width = narrowed(width, torch.full_like(width, target)).clamp_min(_KERNEL_NOISES * noise)
-        weight = rough_weight(noise, float(linear.residuals.cross_valid.sum()), _INDEPENDENT)
+        weight = rough_weight(noise, float(linear.residuals.cross_valid.sum()), INDEPENDENT)
         term = PriorTerm(problem.prior, problem.start, weight)
         kernel = Kernel(width, state.anchors.frame, pair)
         free = of_one_frame(k, n, with_projector=step >= _FRAME_STEPS)

@@ -12,7 +12,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.covariance import with_known_length
 from sl_nerfstudio.bundle_adjustment.parameters import gauge_directions
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings, HopSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan, PixelSamples, build_samples, scan_fingerprint
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
@@ -54,7 +54,7 @@ QUICK = AdjustmentSettings(
     anchors_per_frame=80,
     frames_per_anchor=3,
     max_iterations=14,
-    hops=HopSettings(most=0),
+    hops=0,
     other_minima=0,
 )
 
