@@ -8,6 +8,7 @@ the adjustment would turn that offset into wrong poses.)
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy import ndarray
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from sl_nerfstudio.parallel import compiled, compiled_range
+from sl_nerfstudio.parallel import compiled, compiled_range, results
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
 HALF_WINDOW = 3  # camera pixels to each side of the window in which a paraboloid is fitted
@@ -181,66 +182,30 @@ def _count_before(words):
         total += _bits_of(words[k, 0])
 
 
-@compiled_range
-def draw_pixels(first, last, frames, index, seed, pixels, counts):
-    """Up to `pixels.shape[1]` pixels of each frame, one of each occupied square of a lattice; `counts` says how many.
-
-    Both the pixel of a square and the squares are chosen by random bits of the pixels' numbers.
-    """
-    words, first_words, widths, heights = index
-    most = pixels.shape[1]
-    for k in range(first, last):
-        f = frames[k]
-        w, h, first_word = widths[f], heights[f], first_words[f]
-        decoded = known_pixels(words, first_word, w, h)
-        counts[k] = 0
-        if decoded == 0 or most == 0:
-            continue
-        step = max(1, int((decoded / most) ** 0.5))
-        across = w // step + 1
-        chosen = np.full(across * (h // step + 1), -1)
-        smallest = np.zeros(len(chosen), dtype=np.uint64)
-        for row in range(h):
-            row_word = first_word + row * words_of(w)
-            for column in range(w):
-                if is_known(words, row_word, column):
-                    n, square = row * w + column, row // step * across + column // step
-                    bits = mixed(mixed(seed, f), n)
-                    if chosen[square] < 0 or bits < smallest[square]:
-                        chosen[square], smallest[square] = n, bits
-        count = 0
-        for square in range(len(chosen)):
-            if chosen[square] >= 0:
-                chosen[count] = chosen[square]
-                smallest[count] = mixed(mixed(seed + 1, f), chosen[square])
-                count += 1
-        counts[k] = min(most, count)
-        _sort_together(smallest, chosen, count)
-        for n in range(counts[k]):
-            pixels[k, n] = chosen[n]
-
-
 @compiled
-def _sort_together(keys, values, count):
-    """Sort the first `count` keys, and values with them (heapsort); numba takes 1.5 s to compile numpy's `argsort`."""
-    start, end = count // 2, count
-    while end > 1:
-        if start > 0:  # make a heap, then take its largest again and again
-            start -= 1
-        else:
-            end -= 1
-            keys[end], keys[0] = keys[0], keys[end]
-            values[end], values[0] = values[0], values[end]
-        parent = start
-        while 2 * parent + 1 < end:
-            child = 2 * parent + 1
-            if child + 1 < end and keys[child] < keys[child + 1]:
-                child += 1
-            if not keys[parent] < keys[child]:
-                break
-            keys[parent], keys[child] = keys[child], keys[parent]
-            values[parent], values[child] = values[child], values[parent]
-            parent = child
+def pixels_of_squares(words, first_word, w, h, step, seed, frame):
+    """One decoded pixel of each occupied square of a lattice, and random bits by which to choose among the squares.
+
+    Both are random by the pixels' numbers.
+    """
+    across = w // step + 1
+    chosen = np.full(across * (h // step + 1), -1)
+    smallest = np.zeros(len(chosen), dtype=np.uint64)
+    for row in range(h):
+        row_word = first_word + row * words_of(w)
+        for column in range(w):
+            if is_known(words, row_word, column):
+                n, square = row * w + column, row // step * across + column // step
+                bits = mixed(mixed(seed, frame), n)
+                if chosen[square] < 0 or bits < smallest[square]:
+                    chosen[square], smallest[square] = n, bits
+    count = 0
+    for square in range(len(chosen)):
+        if chosen[square] >= 0:
+            chosen[count] = chosen[square]
+            smallest[count] = mixed(mixed(seed + 1, frame), chosen[square])
+            count += 1
+    return chosen[:count], smallest[:count]
 
 
 # A paraboloid belongs to the pixel at its window's centre and serves every position within that pixel. Positions that
@@ -476,10 +441,17 @@ class CoordinateMaps:
 
         Returns their frames and their centres.
         """
-        pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
-        draw_pixels(len(frames), frames.numpy(), self.index.arrays, seed_from(generator), pixels, counts)
-        frame = torch.repeat_interleave(frames, torch.from_numpy(counts))
-        pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
+        seed, words = seed_from(generator), self.index.words
+
+        def pixels(frame: int) -> Int64[ndarray, "_"]:
+            w, h, first = (int(part[frame]) for part in (self.index.widths, self.index.heights, self.index.first))
+            step = max(1, int((known_pixels(words, first, w, h) / max(count, 1)) ** 0.5))
+            chosen, bits = pixels_of_squares(words, first, w, h, step, seed, frame)
+            return chosen[np.argsort(bits)[:count]]
+
+        found = results([partial(pixels, frame) for frame in frames.tolist()])
+        frame = torch.repeat_interleave(frames, torch.tensor([len(part) for part in found], dtype=torch.int64))
+        pixel = torch.from_numpy(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
         w = self._sizes[0][frame]
         return frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double()
 

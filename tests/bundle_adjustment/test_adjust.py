@@ -238,6 +238,7 @@ def test_a_scene_that_holds_its_frames_is_searched_once(searches):
     assert torch.equal(one.factor, with_other_minima(one).factor) and len(searches) == 1
 
 
+@pytest.mark.slow
 def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkeypatch, searches):
     """It agrees with nothing anywhere, which says nothing about where the others are."""
     stranger = 2

@@ -12,7 +12,6 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     Kernel,
     away_from_borders,
     frame_medians,
-    involving,
     narrowed,
     noise_of,
     noise_ratios,
@@ -104,16 +103,6 @@ def test_no_anchor_is_looked_up_more_often_than_wanted(scene):
     for most in (1, 2):
         rows = observe(rig, anchors, maps, most, ALL, 0.1, torch.Generator().manual_seed(1))
         assert torch.equal(torch.bincount(rows.anchor), everything.clamp_max(most))
-
-
-def test_around_one_frame_selects_all_observations_that_involve_it(scene):
-    rig, maps, anchors = scene
-    generator = torch.Generator().manual_seed(1)
-    rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator)
-    around = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator, involving(2, FRAMES))
-    mine = (anchors.frame[rows.anchor] == 2) | (rows.frame == 2)
-    wanted = set(zip(rows.anchor[mine].tolist(), rows.frame[mine].tolist(), strict=True))
-    assert set(zip(around.anchor.tolist(), around.frame.tolist(), strict=True)) == wanted
 
 
 def test_partners_see_the_same_surface_and_are_few(scene):

@@ -67,6 +67,7 @@ def test_lost_frames_are_those_with_little_support_best_first():
     assert find_lost_frames(alike).tolist() == [2]
 
 
+@pytest.mark.slow
 def test_a_frame_that_agrees_as_well_as_is_expected_is_not_searched_for(true, maps):
     rig, expected = turned(true, LOST, 5), WHATEVER.clone()
     expected[LOST] = float(frame_support(rig, maps, NOISE, SETTINGS)[LOST]) - 0.05
