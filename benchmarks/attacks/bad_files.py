@@ -1,13 +1,18 @@
-"""Input files that are wrong: intrinsics, patterns, poses, meshes, and every key and file of a scan."""
+"""Input files that are wrong, each in a way that once broke something: intrinsics, meshes, reference points.
 
+Random damage of every file that is read, patterns and poses included, is in tests/fuzz.
+"""
+
+import io
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.attacks.case import Case, Fixture
-from benchmarks.attacks.commands import call
-from benchmarks.attacks.expect import refused
+import numpy as np
+
+from benchmarks.attacks.commands import Case, call, refused
 
 _XML = '<?xml version="1.0"?><opencv_storage>{}</opencv_storage>'
 _YAML = "%YAML:1.0\n---\n{}"
@@ -74,41 +79,6 @@ _INTRINSICS: dict[str, tuple[str, str]] = {  # name: file, content
     "an empty file": ("i.json", ""),
 }
 
-_PATTERN: dict[str, Any] = {
-    f"{key} = {str(value)[:20]}": (key, value)
-    for key, values in {
-        "w": (0, -800, 800.5, 10**9, 1e308, "800", None, True),
-        "period": (0, -20, 1e-300, 1e308, "20", float("nan"), 1e400),
-        "gap": (-1, 20, 1e308, None),
-        "line_width": (0, 20, -4),
-        "dark": (-1, 1, 2, 1e308),
-        "seed": (-1, 0.5, 7, 10**400),
-        "rows": (39, 0, "40"),
-        "x0": (0, 1e308),
-        "kind": ("dots", None, ["grid"], {}),
-        "sl_pattern": (0, 2, "1", None),
-        "hamming_margin": (None, "3", 1e308),
-        "codes": (None, [], {}, "0", [[]], [[0] * 40] * 39, [[2] * 40] * 40, [[9] * 40] * 40, [[0.5] * 40] * 40),
-    }.items()
-    for value in values
-}
-
-
-def cases() -> list[Case]:
-    """Every file that a command reads, with every fault."""
-    found = [_intrinsics(name, *what) for name, what in _INTRINSICS.items()]
-    found += [_pattern(name, lambda d, k=key, v=value: d.update({k: v})) for name, (key, value) in _PATTERN.items()]
-    found += [
-        _pattern(f"a code of {code!r:.12}", lambda d, c=code: _set_code(d, c)) for code in (1e308, 10**30, 0.5, -1)
-    ]
-    found += [_pattern(f"symbol {k} edited", lambda d, k=k: _edit_symbol(d, k)) for k in range(0, 1600, 160)]
-    found += [_pattern(f"without {key}", lambda d, k=key: d.pop(k)) for key in ("codes", "w", "period", "seed", "kind")]
-    found += [_poses(name, change) for name, change in _poses_changes().items()]
-    found += [
-        _process_flag(f"--pattern {what}", "--pattern", what) for what in ("captures", "captures/pattern.png", "no")
-    ]
-    return found
-
 
 def _process(folder: Path, **flags: str) -> str:
     given = {"images": "captures/images", "pattern": "captures/pattern.json", "intrinsics": "captures/intrinsics.json"}
@@ -118,68 +88,104 @@ def _process(folder: Path, **flags: str) -> str:
     return fault or (f"left {left[0]} behind" if left else "")
 
 
-def _case(group: str, name: str, attack: Callable[[Path], str], fixture: Fixture = "captures") -> Case:
-    return Case(group, name, (fixture,), attack)
-
-
 def _intrinsics(name: str, file: str, content: str) -> Case:
     def attack(folder: Path) -> str:
         (folder / file).write_text(content, encoding="latin-1" if "UTF-16" in name else "utf-8")
         return _process(folder, intrinsics=file)
 
-    return _case("Intrinsics files", name, attack)
+    return Case("Intrinsics files", name, ("captures",), attack)
 
 
-def _pattern(name: str, change: Callable[[dict[str, Any]], Any]) -> Case:
+_TRUTH = "scan/ground_truth/mesh.ply"
+_HEAD = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+_FACES = "element face {}\nproperty list uchar int vertex_indices\n"
+_CORNERS = "0 0 0\n1 0 0\n0 1 0\n"
+
+
+def _ply(vertices: str, faces: str, counts: tuple[int, int] = (3, 1)) -> bytes:
+    return f"{_HEAD.format(counts[0])}{_FACES.format(counts[1])}end_header\n{vertices}{faces}".encode()
+
+
+_MESHES: dict[str, bytes] = {  # name of the file: content
+    "empty.ply": b"",
+    "zeros.ply": b"\0" * 500,
+    "header only.ply": b"ply\nformat ascii 1.0\n",
+    "no elements.ply": b"ply\nformat ascii 1.0\nend_header\n",
+    "points only.ply": f"{_HEAD.format(3)}end_header\n{_CORNERS}".encode(),
+    "no faces.ply": _ply(_CORNERS, "", (3, 0)),
+    "face out of range.ply": _ply(_CORNERS, "3 0 1 7\n"),
+    "negative face.ply": _ply(_CORNERS, "3 0 1 -1\n"),
+    "NaN.ply": _ply("nan 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n"),
+    "infinity.ply": _ply("inf 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n"),
+    "huge.ply": _ply("1e30 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n"),
+    "words.ply": _ply("a b c\n1 0 0\n0 1 0\n", "3 0 1 2\n"),
+    "too few vertices.ply": _ply(_CORNERS, "3 0 1 2\n", (30, 1)),
+    "a billion vertices.ply": _ply(_CORNERS, "3 0 1 2\n", (10**9, 1)),
+    "a billion faces.ply": _ply(_CORNERS, "3 0 1 2\n", (3, 10**9)),
+    "negative count.ply": _ply(_CORNERS, "3 0 1 2\n", (-3, 1)),
+    "a face of two.ply": _ply(_CORNERS, "2 0 1\n"),
+    "no area.ply": _ply("0 0 0\n0 0 0\n0 0 0\n", "3 0 1 2\n"),
+    "empty.obj": b"",
+    "points.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+    "face out of range.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n",
+    "two numbers.obj": b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
+    "words.obj": b"v a b c\nf 1 2 3\n",
+    "NaN.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "empty.stl": b"",
+    "count too large.stl": b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50,
+    "no triangles.stl": b"\0" * 80 + struct.pack("<I", 0),
+    "text.stl": b"solid x\nfacet normal a b c\n",
+    "not glTF.glb": b"hello" * 100,
+    "a length too large.glb": struct.pack("<4sIII4s", b"glTF", 2, 2**31, 2**31 - 1, b"JSON"),
+    "deep.glb": struct.pack("<4sIII4s", b"glTF", 2, 100_020, 100_000, b"JSON") + b"[" * 100_000,
+    "unknown.xyz": b"0 0 0\n",
+    "no suffix": b"0 0 0\n",
+}
+
+
+def _points(values: np.ndarray, key: str = "xyz") -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=True, **{key: values})
+    return buffer.getvalue()
+
+
+_REFERENCES: dict[str, bytes] = {
+    "NaN.npz": _points(np.full((200, 3), np.nan)), "few.npz": _points(np.zeros((5, 3))),
+    "flat.npz": _points(np.zeros(300)), "two columns.npz": _points(np.zeros((200, 2))),
+    "text.npz": _points(np.array([["a", "b", "c"]] * 200)), "objects.npz": _points(np.array([[None] * 3] * 200)),
+    "other key.npz": _points(np.zeros((200, 3)), "points"), "no zip.npz": b"hello" * 50,
+    "cut.npz": _points(np.zeros((200, 3)))[:500],
+    **{f"mesh: {name}": content for name, content in _MESHES.items() if name.startswith(("NaN", "points", "face"))},
+}  # fmt: skip
+
+
+def cases() -> list[Case]:
+    """Every file that a command reads, with every fault."""
+    found = [_intrinsics(name, *what) for name, what in _INTRINSICS.items()]
+    found += [_mesh(f"--mesh {name}", name, lambda _, c=content: c) for name, content in _MESHES.items()]
+    found += [
+        _mesh(f"--reference {n}", n.removeprefix("mesh: "), lambda _, c=c: c, True) for n, c in _REFERENCES.items()
+    ]
+    found += [
+        _mesh(f"--mesh cut to {p} %", "cut.ply", lambda whole, p=p: whole[: len(whole) * p // 100]) for p in (1, 30, 99)
+    ]
+    return [*found, Case("Meshes", "--poses of 1e30", ("scan",), _far_poses)]
+
+
+def _mesh(title: str, name: str, content: Callable[[bytes], bytes], reference: bool = False) -> Case:
     def attack(folder: Path) -> str:
-        path = folder / "captures" / "pattern.json"
-        document = json.loads(path.read_text())
-        change(document)
-        path.write_text(json.dumps(document))
-        return _process(folder)
+        whole = (folder / _TRUTH).read_bytes()
+        (folder / name).write_bytes(content(whole))
+        files = ("--mesh", _TRUTH, "--reference", name) if reference else ("--mesh", name)
+        done = call(folder, "sl-eval", *files, "--data", "scan", "--json", "figures.json")
+        return refused(done, name) or ("wrote figures.json" if (folder / "figures.json").exists() else "")
 
-    return _case("Pattern files", name, attack)
-
-
-def _set_code(document: dict[str, Any], code: Any) -> None:
-    document["codes"][3][4] = code
+    return Case("Meshes", title, ("scan",), attack)
 
 
-def _edit_symbol(document: dict[str, Any], number: int) -> None:
-    row = document["codes"][number // 40]
-    row[number % 40] = (row[number % 40] + 1) % 5
-
-
-def _poses_changes() -> dict[str, Callable[[dict[str, Any]], Any]]:
-    identity = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
-
-    def with_pose(T: Any) -> Callable[[dict[str, Any]], Any]:
-        return lambda d: d["frames"][0].update(transform_matrix=T)
-
-    def moved(x: float) -> Any:
-        return [[1.0, 0, 0, x], *identity[1:]]
-
-    found: dict[str, Callable[[dict[str, Any]], Any]] = {
-        f"units {value!r}": lambda d, v=value: d.update(units=v) for value in (["mm"], {}, 1, None, "inch", True)
-    }
-    found |= {f"a position of {x:g}": with_pose(moved(x)) for x in (1e30, -1e308, float("nan"))}
-    found |= {f"a pose {str(T)[:20]}": with_pose(T) for T in ("T", None, [], 1, [[0] * 4] * 4, identity[:3], [[]])}
-    found |= {f"frames {value!r}": lambda d, v=value: d.update(frames=v) for value in (None, [], [1], "all", {}, [[]])}
-    found["a key deep in lists"] = lambda d: d.update(extra=json.loads("[" * 500 + "]" * 500))
-    return found
-
-
-def _poses(name: str, change: Callable[[dict[str, Any]], Any]) -> Case:
-    def attack(folder: Path) -> str:
-        names = sorted(path.stem for path in (folder / "captures" / "images").iterdir())
-        pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
-        document = {"units": "mm", "frames": [{"file_path": f"{n}.png", "transform_matrix": pose} for n in names]}
-        change(document)
-        (folder / "poses.json").write_text(json.dumps(document))
-        return _process(folder, poses="poses.json")
-
-    return _case("Poses files", name, attack)
-
-
-def _process_flag(name: str, flag: str, value: str) -> Case:
-    return _case("Pattern files", name, lambda folder: _process(folder, **{flag.removeprefix("--"): value}))
+def _far_poses(folder: Path) -> str:
+    document = json.loads((folder / "scan/transforms.json").read_text())
+    document["frames"][1]["transform_matrix"][0][3] = 1e30
+    (folder / "poses.json").write_text(json.dumps(document))
+    done = call(folder, "sl-eval", "--mesh", _TRUTH, "--data", "scan", "--poses", "poses.json")
+    return refused(done, "frame_00001", "from the origin")

@@ -1,6 +1,6 @@
 """Projectors that nobody has calibrated: intrinsics and surface, found against known.
 
-    python -m benchmarks.unknown_projector [--output benchmarks/results/unknown_projector.json] [--sets 4]
+    python -m benchmarks.unknown_projector [--sets 4] [--output FILE]
 
 Free-hand sets under a projector with lens shift, whose starting focal length is 20 % wrong and whose principal point
 counts as the middle of its image. Each set is processed with the true intrinsics and with those that are found: poses,
@@ -8,19 +8,18 @@ registration, joint adjustment. The surface is the triangulated points after one
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from benchmarks.common.machine import write_rows
-from benchmarks.unknown_projector.sets import CoordinateSet, SetOptions, make_set
+from benchmarks.common.measuring import Rows, options
 from sl_nerfstudio.calibration.stated import CERTAIN
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.lie import fit_similarity
+from sl_nerfstudio.geometry.lie import DevicePoses, fit_similarity
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
 from sl_nerfstudio.processing.projector import FoundProjector, adjustment_settings, refine_projector, sigma_of_fields
 from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
@@ -29,26 +28,87 @@ from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
 from sl_nerfstudio.relative_pose.intrinsics import camera_depth
 from sl_nerfstudio.relative_pose.unknown_projector import FrameMatches, NoProjector, estimate_projector
-
-SETS = (
-    SetOptions("head", 1, 16),
-    SetOptions("frog", 2, 16),
-    SetOptions("cone-and-cylinder", 3, 16),
-    SetOptions("dog", 4, 20),
-    SetOptions("chair", 5, 16),
-    SetOptions("head", 6, 16, aspect=0.97, k1=-0.03),
+from sl_nerfstudio.synthesis.devices import (
+    CoordinateNoise,
+    DeviceOptions,
+    DevicePair,
+    disturb_coords,
+    make_devices,
+    make_paths,
+    pixels,
 )
-_START = 1.2  # of the true focal length
+from sl_nerfstudio.synthesis.render import RayCaster, visible_centres
+from sl_nerfstudio.synthesis.scenes import make_scene
+from sl_nerfstudio.synthesis.synthesise import make_cells
+
+PATTERN, _RESOLUTION = (1280, 800), 400
+NOISE = CoordinateNoise(sigma=0.3, missing=0.15, wrong=0.02)
 
 
 @dataclass(frozen=True)
-class Arguments:
-    """Which sets, and where the figures go."""
+class SetOptions:
+    """One set."""
 
-    output: Path = Path("benchmarks/results/unknown_projector.json")
-    """JSON file to write"""
-    sets: int = len(SETS)
-    """number of sets, from the first on"""
+    scene: str
+    seed: int
+    frames: int
+    shift: float = 1.2  # of the principal point below the middle of the image, in image heights
+    aspect: float = 1.0  # fl_y over fl_x
+    k1: float = 0.0
+
+
+@dataclass(frozen=True)
+class CoordinateSet:
+    """Decoded coordinates of all frames, with the truth; lengths in millimetres."""
+
+    devices: DevicePair
+    coords: tuple[Float32[ndarray, "h w 2"], ...]  # as decoded; NaN where nothing was
+    p_world: tuple[Float64[ndarray, "h w 3"], ...]  # what every pixel sees
+
+
+def make_set(options: SetOptions) -> CoordinateSet:
+    """Render one set."""
+    scene = make_scene(options.scene, 1.0)
+    poses = make_paths(scene, options.frames, "hand-held", np.random.default_rng([options.seed, 1]))
+    devices = make_devices(scene, poses, PATTERN, DeviceOptions(_RESOLUTION))
+    projector, poses = _with_shift(devices.projector, poses, scene.vertices[::20], options)
+    devices = DevicePair(devices.camera, projector)
+    caster, cells = RayCaster(scene), make_cells(np.zeros(PATTERN[::-1], np.float32), None)
+    coords, points = [], []
+    for k in range(options.frames):
+        seen = visible_centres(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k])
+        shape = devices.camera.h, devices.camera.w
+        exact = np.where(seen.lit[:, None], seen.uv_projector, np.nan).astype(np.float32).reshape(*shape, 2)
+        rng = np.random.default_rng([options.seed, 2, k])
+        coords.append(disturb_coords(exact, seen.lit.reshape(shape), cells, NOISE, rng))
+        points.append(seen.p_world.reshape(*shape, 3))
+    return CoordinateSet(devices, tuple(coords), tuple(points))
+
+
+def _with_shift(
+    projector: Device, poses: DevicePoses, p_world: Float64[ndarray, "n 3"], options: SetOptions
+) -> tuple[Device, DevicePoses]:
+    """The projector with lens shift, turned so that its image stays where it was and the object fills 90 % of it."""
+    middle = np.array([projector.w / 2, projector.h / 2])
+    device = replace(projector, cy=projector.h * (0.5 + options.shift), k1=options.k1)
+    for _ in range(10):
+        device = replace(device, fl_y=device.fl_x * options.aspect)
+        turn = np.eye(4)
+        angle = np.arctan2(device.cy - middle[1], device.fl_y)  # from the axis to the middle of the image
+        turn[:3, :3] = Rotation.from_euler("x", -angle).as_matrix()
+        turned = poses.T_world_projector @ turn
+        reach = max(float((np.abs(pixels(device, T, p_world)[0] - middle) / middle).max()) for T in turned)
+        if abs(reach - 0.9) < 1e-3:
+            break
+        device = replace(device, fl_x=device.fl_x * 0.9 / reach)
+    return device, replace(poses, T_world_projector=turned)
+
+
+SETS = (
+    SetOptions("head", 1, 16), SetOptions("frog", 2, 16), SetOptions("cone-and-cylinder", 3, 16),
+    SetOptions("dog", 4, 20), SetOptions("chair", 5, 16), SetOptions("head", 6, 16, aspect=0.97, k1=-0.03),
+)  # fmt: skip
+_START = 1.2  # of the true focal length
 
 
 @dataclass(frozen=True)
@@ -72,18 +132,15 @@ class Row:
 
 
 def main() -> None:
-    """Run, print and write all sets."""
-    arguments = tyro.cli(Arguments)
-    rows = []
-    for options in SETS[: arguments.sets]:
-        row = run(options)
-        rows.append(row)
-        print(row, flush=True)
-        write_rows(arguments.output, rows, start=_START)
+    """Run, print and write the first sets, by default all."""
+    given = options(__doc__, sets=len(SETS), output=Path("benchmarks/results/unknown_projector.json"))
+    rows: Rows[Row] = Rows(given.output, start=_START)
+    for one in SETS[: given.sets]:
+        rows.add(run(one))
 
 
 def run(options: SetOptions) -> Row:
-    """One set with the true intrinsics, and with those that are found."""
+    """Process one set with the true intrinsics, and with those that are found."""
     made = make_set(options)
     true = made.devices.projector
     known = surface_error(made, *processed(made, true, None))
@@ -98,21 +155,16 @@ def run(options: SetOptions) -> Row:
     clouds, consistent = processed(made, found.projector, found)
     refined = refine_projector(clouds, consistent, found, CERTAIN, adjustment_settings("free", found), lambda _: None)
     error = surface_error(made, refined.clouds, refined.consistent)
-    return Row(
-        options.scene, options.seed, options.frames,
-        *_errors(found, true), *_errors(refined.found, true),
-        round(known, 5), round(error, 5), round(error / known, 3),
-    )  # fmt: skip
+    return Row(options.scene, options.seed, options.frames, *_errors(found, true), *_errors(refined.found, true),
+               round(known, 5), round(error, 5), round(error / known, 3))  # fmt: skip
 
 
 def _errors(found: FoundProjector, true: Device) -> tuple[float, float, tuple[float, float], tuple[float, float]]:
     device, sigma = found.projector, found.sigma
     return (
-        round(100 * (device.fl_x / true.fl_x - 1), 4),
-        round(100 * sigma[0] / true.fl_x, 4),
-        (round(device.cx - true.cx, 2), round(device.cy - true.cy, 2)),
-        (round(sigma[2], 2), round(sigma[3], 2)),
-    )
+        round(100 * (device.fl_x / true.fl_x - 1), 4), round(100 * sigma[0] / true.fl_x, 4),
+        (round(device.cx - true.cx, 2), round(device.cy - true.cy, 2)), (round(sigma[2], 2), round(sigma[3], 2)),
+    )  # fmt: skip
 
 
 def processed(
@@ -125,8 +177,7 @@ def processed(
         clouds.append(frame_cloud(f"{k:03d}", coords, camera, projector, pose))
     choice = choose_projectors(clouds, True, 0)
     clouds = chosen_clouds(clouds, choice.chosen)
-    registration = register(clouds)
-    return clouds, adjust_consistent(clouds, registration, lambda _: None, adjustment_settings("free", found))
+    return clouds, adjust_consistent(clouds, register(clouds), lambda _: None, adjustment_settings("free", found))
 
 
 def surface_error(made: CoordinateSet, clouds: Sequence[FrameCloud], consistent: ConsistentFrames) -> float:

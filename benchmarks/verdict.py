@@ -8,16 +8,15 @@ lies between the figures of surfaces that are right and those that are not. Rows
 measured again.
 """
 
-import argparse
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.whole_runs import run
+from benchmarks.common.measuring import Rows, kept_rows, options
+from benchmarks.common.runs import export, run, train
 from sl_nerfstudio.evaluation.evaluate import evaluate, read_inputs, typical_sigma
 from sl_nerfstudio.evaluation.judgement import judge, trained_steps
 
@@ -65,16 +64,12 @@ def turned_frame(document: dict) -> None:
 
 KNOWN = ("--pipeline.model.prior.intrinsics", "0.001")
 FAULTS = {
-    "none": Fault(train=KNOWN),
-    "intrinsics not stated": Fault(),
+    "none": Fault(train=KNOWN), "intrinsics not stated": Fault(),
     "starting poses kept": Fault(train=(*KNOWN, "--pipeline.model.refine-poses", "off")),
-    "20 steps": Fault(train=KNOWN, steps=20),
-    "90 % missing": Fault(synth=("--missing", "0.9"), train=KNOWN),
-    "2 px noise": Fault(synth=("--noise", "2"), train=KNOWN),
-    "4 frames": Fault(synth=("--frames", "4"), train=KNOWN),
-    "focal 2 % off": Fault(change=longer_focal),
-    "frame turned": Fault(train=KNOWN, change=turned_frame),
-}
+    "20 steps": Fault(train=KNOWN, steps=20), "90 % missing": Fault(synth=("--missing", "0.9"), train=KNOWN),
+    "2 px noise": Fault(synth=("--noise", "2"), train=KNOWN), "4 frames": Fault(synth=("--frames", "4"), train=KNOWN),
+    "focal 2 % off": Fault(change=longer_focal), "frame turned": Fault(train=KNOWN, change=turned_frame),
+}  # fmt: skip
 
 
 def measure(scene: str, name: str, folder: Path) -> Row:
@@ -84,24 +79,16 @@ def measure(scene: str, name: str, folder: Path) -> Row:
     config = here / "runs/run/sl-neus/now/config.yml"
     if not scan.exists():
         usual = ("--frames", str(FRAMES)) if "--frames" not in fault.synth else ()
-        run(
-            "sl-synth", "--output", str(scan), "--scene", scene, "--seed", "31", "--resolution", str(RESOLUTION),
-            *usual, *fault.synth,
-        )  # fmt: skip
+        run("sl-synth", "--output", scan, "--scene", scene, "--seed", 31, "--resolution", RESOLUTION, *usual,
+            *fault.synth)  # fmt: skip
         if fault.change:
             path = scan / "transforms.json"
             document = json.loads(path.read_text())
             fault.change(document)
             path.write_text(json.dumps(document, indent=1))
     if not list(config.parent.glob("nerfstudio_models/*.ckpt")):
-        run(
-            "ns-train", "sl-neus", "--data", str(scan), "--output-dir", str(here / "runs"), "--experiment-name", "run",
-            "--timestamp", "now", "--max-num-iterations", str(fault.steps), *fault.train,
-        )  # fmt: skip
-    run(
-        "sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(refined),
-        "--resolution", "192", "--overwrite",
-    )  # fmt: skip
+        train(scan, here / "runs", "now", ("--max-num-iterations", fault.steps, *fault.train))
+    export(config, mesh, refined, "--resolution", 192, "--overwrite")
     return judged_row(scene, name, mesh, scan, refined)
 
 
@@ -116,29 +103,21 @@ def judged_row(scene: str, name: str, mesh: Path, scan: Path, refined: Path) -> 
     rigid, similar = (
         100 * found.surface[kind].accuracy.rmse / found.reference.size for kind in ("rigid", "similarity")
     )
-    band = judgement.verdict.band
-    return Row(
-        scene, name, rigid, similar, band,
-        list(judgement.verdict.reasons),
-        {figure.name: figure.value for figure in judgement.figures},
-    )  # fmt: skip
+    figures = {figure.name: figure.value for figure in judgement.figures}
+    return Row(scene, name, rigid, similar, judgement.verdict.band, list(judgement.verdict.reasons), figures)
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
-    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=FAULTS)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/verdict"))
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/verdict.json"))
-    options = parser.parse_args()
-    rows = [Row(**row) for row in json.loads(options.output.read_text())["rows"]] if options.output.exists() else []
-    for name in options.faults:
-        for scene in options.scenes:
+    given = options(
+        __doc__, scenes=list(SCENES), faults=FAULTS, folder=Path("outputs/verdict"),
+        output=Path("benchmarks/results/verdict.json"),
+    )  # fmt: skip
+    rows = Rows(given.output, kept_rows(given.output, Row))
+    for name in given.faults:
+        for scene in given.scenes:
             if (scene, name) not in {(row.scene, row.fault) for row in rows}:
-                rows.append(measure(scene, name, options.folder))
-                write_rows(options.output, rows)
-                print(asdict(rows[-1]), flush=True)
+                rows.add(measure(scene, name, given.folder))
 
 
 if __name__ == "__main__":
