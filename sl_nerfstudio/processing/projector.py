@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    DEPENDENCE,
     AdjustedFrames,
     ProjectorKnowledge,
     RegisteredFramesSettings,
@@ -354,7 +355,7 @@ def refine_projector(
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:
             break
-        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma, settings)
+        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma)
     return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance))
 
 
@@ -364,11 +365,9 @@ def _chi_square(calibration: SelfCalibration) -> float:
     return float(step @ torch.linalg.solve(uncertainty, step))
 
 
-def _covariance(
-    calibration: SelfCalibration, camera_sigma: Shares, settings: RegisteredFramesSettings
-) -> Float[Tensor, "3 3"]:
+def _covariance(calibration: SelfCalibration, camera_sigma: Shares) -> Float[Tensor, "3 3"]:
     """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
-    return settings.dependence**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
+    return DEPENDENCE**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
 
 
 def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None) -> FoundProjector:
