@@ -10,7 +10,6 @@ from sl_nerfstudio.evaluation.agreement import FrameAgreement
 from sl_nerfstudio.evaluation.completeness import Completeness, NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Length, SurfaceScore
 from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, PoseErrors
-from sl_nerfstudio.review.agreement import VerdictSettings
 from sl_nerfstudio.review.verdict import (
     Band,
     DepartedFrame,
@@ -134,7 +133,7 @@ def disagreeing_frames(evaluation: Evaluation) -> tuple[str, ...]:
     bad = {f.name for f in frames if _stands_out(f, frames)}
     if evaluation.cross is not None and evaluation.cross.pairs:
         judged = zip(frames, evaluation.cross.frames, strict=True)
-        bad |= {f.name for f, one in judged if frame_band(one, VerdictSettings()) != "good"}
+        bad |= {f.name for f, one in judged if frame_band(one) != "good"}
     names = [f.name for f in frames if f.name in bad]
     if not names or len(names) > _MOST * len(frames):
         return ()
@@ -248,7 +247,7 @@ def judge(
     reasons += [Reason("acceptable", f"{f.name}: cannot be judged") for f in figures if f.band == "unknown"]
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:
-        reasons += cross_reasons(names, evaluation.cross, VerdictSettings())
+        reasons += cross_reasons(names, evaluation.cross)
     reasons += [
         Reason("poor", f"{name}: could not be placed; leave it out or register it again, and train again")
         for name in unplaced

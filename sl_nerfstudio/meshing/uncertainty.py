@@ -11,10 +11,9 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import HALF_WINDOW, CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, is_exact
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, by_intrinsics
-from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import MODELS, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.lie import DevicePoses, hat, inverse, transform
@@ -233,7 +232,7 @@ def _correlation(window_ratios: Sequence[float]) -> float:
     If errors were independent, as many pixels as a decoded window has would gain what the fit in it gains.
     """
     known = [ratio for ratio in window_ratios if np.isfinite(ratio)]
-    half = LookUpSettings().half_window
+    half = HALF_WINDOW
     y, x = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1).astype(float)
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
     pixels = 1 / float(np.linalg.inv(basis.T @ basis)[0, 0])

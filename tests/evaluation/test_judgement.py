@@ -11,7 +11,7 @@ from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.judgement import TrainedSteps, capture_next, disagreeing_frames, judge, trained_steps
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.review.verdict import DepartedFrame
-from tests.verdict.cases import ring
+from tests.review.cases import ring
 
 from .test_completeness import cut_sphere
 
