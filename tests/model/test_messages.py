@@ -37,14 +37,10 @@ def test_intrinsics_that_may_be_correct_are_not_mentioned():
 
 def test_both_residuals_are_in_the_message():
     rig = rig_of(3, 60)
-    better = CrossValidation(
-        before_px=3.0, after_px=0.25, difference=-8.0, standard_error=0.1, standard_errors=2.0, least_gain=0.01
-    )
+    better = CrossValidation(before_px=3.0, after_px=0.25, difference=-8.0, standard_error=0.1, least_gain=0.01)
     text = poses_message(ScanAdjustment(rig, torch.zeros(3, 12), torch.zeros(42, 42), better, 0.1))
     assert text == "Poses adjusted: held-out pixels agree to 0.25 px, before 3 px."
-    chance = CrossValidation(
-        before_px=0.3, after_px=0.29, difference=-0.01, standard_error=0.1, standard_errors=2.0, least_gain=0.01
-    )
+    chance = CrossValidation(before_px=0.3, after_px=0.29, difference=-0.01, standard_error=0.1, least_gain=0.01)
     text = poses_message(ScanAdjustment(rig, torch.zeros(3, 12), torch.zeros(42, 42), chance, 0.1))
     assert text.startswith("Poses NOT changed") and text.endswith("starting poses are kept.")
     assert "0.29 px, before 0.3 px" in text
