@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    DEPENDENCE,
     AdjustedFrames,
     ProjectorKnowledge,
     RegisteredFramesSettings,
@@ -38,7 +39,7 @@ from sl_nerfstudio.processing.inputs import Inputs
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration
 from sl_nerfstudio.registration.static_projector import (
-    STATIC_DEFAULTS,
+    DOUBTFUL_SIGMA,
     NoPlacement,
     StaticPlacement,
     place_under_static_projector,
@@ -151,7 +152,7 @@ def _remedy(role: Role) -> str:
 
 def static_doubt(sigma_focal: float, frames: int) -> str:
     """Why the intrinsics of a static projector are uncertain; "" if they are well determined."""
-    if sigma_focal <= STATIC_DEFAULTS.doubtful_sigma:
+    if sigma_focal <= DOUBTFUL_SIGMA:
         return ""
     return (
         f"the projector's focal length is known only to {100 * sigma_focal:.1f} % (1 sigma), from {frames} cameras\n"
@@ -354,7 +355,7 @@ def refine_projector(
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:
             break
-        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma, settings)
+        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma)
     return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance))
 
 
@@ -364,11 +365,9 @@ def _chi_square(calibration: SelfCalibration) -> float:
     return float(step @ torch.linalg.solve(uncertainty, step))
 
 
-def _covariance(
-    calibration: SelfCalibration, camera_sigma: Shares, settings: RegisteredFramesSettings
-) -> Float[Tensor, "3 3"]:
+def _covariance(calibration: SelfCalibration, camera_sigma: Shares) -> Float[Tensor, "3 3"]:
     """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
-    return settings.dependence**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
+    return DEPENDENCE**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
 
 
 def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None) -> FoundProjector:
