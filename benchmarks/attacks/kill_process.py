@@ -1,5 +1,6 @@
 """sl-process killed, terminated and interrupted: the next run goes on, with the same bytes; no worker lives on."""
 
+import hashlib
 import os
 import random
 import shutil
@@ -9,13 +10,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import sl_nerfstudio
 from benchmarks.attacks.case import Case
 from benchmarks.attacks.commands import call, start
 from benchmarks.attacks.dying import dying
 from benchmarks.attacks.expect import accepted, refused
 from benchmarks.attacks.kills import contents
 from benchmarks.attacks.output_folders import PROCESS
-from sl_nerfstudio.processing.cache import surroundings
 from sl_nerfstudio.storage import LOCK, locked
 
 GROUP = "Killed sl-process"
@@ -45,9 +46,15 @@ def _case(title: str, attack: Callable[[Path], str]) -> Case:
     return Case(GROUP, title, ("captures",), attack)
 
 
+def _code() -> str:
+    """Digest of the sources of the package: a run by other code is no reference."""
+    sources = sorted(Path(sl_nerfstudio.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+
+
 def prepared(folder: Path) -> Path:
     """Scan and work folder of a run that nothing stopped, made once by the same code beside the fixtures."""
-    root = folder.parents[1] / "fixtures" / f"processed-{surroundings()[:12]}"
+    root = folder.parents[1] / "fixtures" / f"processed-{_code()}"
     while not (root / "complete").exists():
         try:
             with locked(root):

@@ -160,7 +160,7 @@ def refine_camera(
         raise ValueError("no frame has a pose")
     notes = CameraNotes(start, found)
     log(notes.sentence())
-    return replace(refined, camera_known=True), again, notes
+    return replace(refined, last_step="match"), again, notes
 
 
 # What the user's files say of the projector.
@@ -433,20 +433,10 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     projector, stated = read_projector(config, (layout.w, layout.h))
     masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
-    known_beam = not config.finds_projector
+    last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
+    devices = cameras.first, projector
     return Inputs(
-        FrameJob(
-            config.work_folder,
-            decoder,
-            cameras.first,
-            projector,
-            config.seed,
-            masks,
-            cameras.several,
-            doubt,
-            known_beam,
-            cameras.start is None,
-        ),
+        FrameJob(config.work_folder, decoder, *devices, config.seed, masks, cameras.several, doubt, last_step),
         cameras,
         captures,
         stated,

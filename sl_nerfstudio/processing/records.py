@@ -26,7 +26,7 @@ from sl_nerfstudio.storage import in_file, largest_in_memory, read_checked, writ
 
 # Decoded frames that are kept between runs: only changed images, patterns or decoders need decoding again.
 
-_KEY_LENGTH = 24
+KEY_LENGTH = 24  # of a digest in a file name
 MANIFEST = "manifest.json"
 DECODED = "decoded"
 
@@ -43,7 +43,7 @@ class DecodedStore:
         digest = hashlib.sha256(self._decoder_key.encode())
         for path in frame.images:
             digest.update(hashlib.sha256(read_bytes(path)).digest())
-        return digest.hexdigest()[:_KEY_LENGTH]
+        return digest.hexdigest()[:KEY_LENGTH]
 
     def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
         """A frame that was decoded before; None if there is none, or if its file is damaged."""

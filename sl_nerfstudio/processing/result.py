@@ -357,6 +357,7 @@ def summarise(
     shares: Sequence[SurfaceShares] = (),
     found: FoundProjector | None = None,
     contradicted: str = "",
+    captured: CaptureNotes | None = None,
 ) -> ProcessResult:
     """The result of a run; without `poses` no frame is in a scan.
 
@@ -401,6 +402,7 @@ def summarise(
         ),
         projector=found,
         contradiction=wrong,
+        captured=captured,
         placed=place_frames(results, registration, poses),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
