@@ -57,11 +57,6 @@ def test_of_many_decoded_pixels_a_part_is_enough_to_learn_from(predicted, monkey
     assert np.nanmax(error(found)) < 1
 
 
-def test_without_a_mask_the_image_itself_says_where_the_pattern_is(predicted):
-    found, facts = again(with_holes(truth(), 0.6), predicted, mask=None)
-    assert facts.shown == MASK.size and facts.decoded_after > 0.75 * MASK.sum() and np.nanmax(error(found)) < 1
-
-
 def test_noise_makes_no_wrong_values(predicted):
     rng = np.random.default_rng(0)
     image = (picture() + 0.03 * rng.standard_normal(MASK.shape)).astype(np.float32)

@@ -16,7 +16,6 @@ from sl_nerfstudio.scan.check_conventions import (
     Interpretation,
     apply_interpretation,
     convention_problems,
-    fit_geometry,
     other_interpretations,
     sample_pixels,
 )
@@ -175,20 +174,6 @@ def test_units_that_cannot_be(metres: float | None, words: str) -> None:
     found = list(convention_problems(frames_of(poses()), PROJECTOR, metres))
     assert [key for _, key, _ in found] == (["units"] if words else [])
     assert all(words in problem.problem and "m and mm mixed up" in problem.cause for _, _, problem in found)
-
-
-def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
-    frames = frames_of(poses())
-    fit = fit_geometry(frames, PROJECTOR)
-    assert fit.typical_px < 0.5
-    assert np.median(np.linalg.norm(fit.clouds[0], axis=1)) == pytest.approx(40, abs=0.5)
-    apart = [
-        replace(f, T_world_camera=f.T_world_camera.copy(), T_world_projector=f.T_world_projector.copy()) for f in frames
-    ]
-    for index, frame in enumerate(apart):
-        frame.T_world_camera[0, 3] += 1e4 * index
-        frame.T_world_projector[0, 3] += 1e4 * index
-    assert np.allclose(fit_geometry(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
 
 
 def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:

@@ -28,11 +28,6 @@ def test_an_ordinary_data_set_gets_one_sentence(sphere: Path) -> None:
         read_scan(sphere)
 
 
-def test_a_scan_that_lost_its_projector_is_no_ordinary_data_set(sphere: Path) -> None:
-    edit(sphere, lambda document: document.pop("projector"))
-    assert (only_fault(sphere).field, only_fault(sphere).problem) == ("projector", "is missing")
-
-
 def test_faults_of_one_kind_are_one_entry(sphere: Path) -> None:
     edit(sphere, lambda document: [frame.pop("transform_matrix") for frame in document["frames"]])
     (sphere / "masks" / f"{NAMES[0]}.png").unlink()
@@ -105,10 +100,3 @@ def test_a_device_far_from_all_others(sphere: Path, key: str, x: float) -> None:
     fault = only_fault(sphere)
     assert (fault.frame, fault.field) == (NAMES[1], key)
     assert "puts the device" in fault.problem
-
-
-def test_an_uncertainty_without_bound(sphere: Path) -> None:
-    sigma = {"camera_translation": 1e308, "camera_rotation_deg": 1.0,
-             "relative_translation": 1.0, "relative_rotation_deg": 1.0}  # fmt: skip
-    edit(sphere, lambda document: document.update(sl_pose_sigma=sigma))
-    assert only_fault(sphere).field == "sl_pose_sigma.camera_translation"

@@ -4,7 +4,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
@@ -55,23 +54,6 @@ def test_a_path_is_inside_the_folder_or_refused(text: str) -> None:
         assert found.problem and found.cause and found.remedy
     else:
         assert os.path.normpath(found).startswith(str(root)) and ".." not in found.parts
-
-
-@pytest.mark.parametrize("text", ["../x", "a/../../x", "/etc/passwd", "C:\\x", "..\\x", "a\\..\\..\\x", "\\\\host\\x"])
-def test_paths_that_lead_out_are_refused_on_every_system(tmp_path: Path, text: str) -> None:
-    assert isinstance(resolve_inside(tmp_path, text), Problem)
-
-
-def test_links_are_followed_and_may_only_lead_inside(tmp_path: Path) -> None:
-    root = tmp_path / "scan"
-    (root / "deep").mkdir(parents=True)
-    (tmp_path / "secret").write_text("x")
-    (root / "deep/file").write_text("x")
-    (root / "inside").symlink_to(root / "deep")
-    (root / "outside").symlink_to(tmp_path)
-    assert resolve_inside(root, "inside/file") == root / "inside/file"
-    refused = resolve_inside(root, "outside/secret")
-    assert isinstance(refused, Problem) and "a link out of the scan folder" in refused.problem
 
 
 json_values = st.recursive(

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy import ndarray
 from PIL import Image
-from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, edit_coords, only_fault, poses, write_sphere
+from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, edit_coords, only_fault, write_sphere
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
@@ -90,12 +90,6 @@ def test_a_damaged_byte_is_noticed(sphere: Path) -> None:
     fault = only_fault(sphere)
     assert "cannot be read" in fault.problem
     assert "damaged" in fault.cause
-
-
-def test_missing_coordinates(sphere: Path) -> None:
-    (sphere / COORDS).unlink()
-    fault = only_fault(sphere)
-    assert (fault.file, fault.frame, fault.problem) == (COORDS, NAME, "is missing")
 
 
 def test_plain_npy_any_order_any_byte_order(tmp_path: Path) -> None:
@@ -277,14 +271,6 @@ def test_doe_coordinates_beyond_the_horizon(tmp_path: Path) -> None:
     faults = [fault for fault in check_scan(root) if fault.file.startswith("coords/")]
     assert len(faults) == len(NAMES)
     assert all("pixels more than 90 degrees from the axis" in fault.problem for fault in faults)
-
-
-def test_the_factory_is_right(sphere: Path) -> None:
-    for frame, pose in zip(read_scan(sphere).frames, poses(), strict=True):
-        assert np.array_equal(frame.read_coords(), correspondences(*pose), equal_nan=True)
-    fit = check_folder(sphere).fit
-    assert fit is not None
-    assert fit.typical_px < 1e-4
 
 
 def test_faults_come_in_the_order_of_the_frames_however_many_threads_there_are(sphere: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, pattern_image, poses, write_sphere
+from sphere_scan import CAMERA, PROJECTOR, edit, pattern_image, poses, write_sphere
 
 from sl_nerfstudio.errors import ScanError, UserError
 from sl_nerfstudio.geometry.devices import Device
@@ -83,12 +83,6 @@ def test_everything_comes_back_as_it_was(tmp_path: Path) -> None:
     assert read_ground_truth(scan).mesh_path == tmp_path / "ä" / "scan" / "ground_truth" / "mesh.ply"
 
 
-def test_what_lies_in_a_folder(sphere: Path) -> None:
-    kinds = {"images": "png", "patterns": "png", "coords": "npz", "masks": "png"}
-    expected = {f"{folder}/{name}.{suffix}" for folder, suffix in kinds.items() for name in NAMES}
-    assert files(sphere) == expected | {"transforms.json", "pattern.png"}
-
-
 def test_the_same_scan_is_written_as_the_same_bytes(tmp_path: Path) -> None:
     a, b = write_sphere(tmp_path / "a", frames=2), write_sphere(tmp_path / "b", frames=2)
     assert all((a / name).read_bytes() == (b / name).read_bytes() for name in files(a))
@@ -133,36 +127,10 @@ def test_nothing_stays_of_a_scan_that_failed(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_empty_folder_that_was_there_stays(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), ScanWriter(tmp_path, **settings()) as writer:
-        writer.add_frame("f0", **frame())
-        raise KeyboardInterrupt
-    assert tmp_path.is_dir()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_files_of_others_stay(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), ScanWriter(tmp_path / "scan", **settings()) as writer:
-        writer.add_frame("f0", **frame())
-        (tmp_path / "scan" / "images" / "mine.txt").write_text("keep")
-        raise ZeroDivisionError
-    assert files(tmp_path) == {"scan/images/mine.txt"}
-
-
 def test_a_scan_without_frames_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no frame was written"), ScanWriter(tmp_path / "scan", **settings()):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_with_something_in_it_is_never_overwritten(sphere: Path) -> None:
-    before = {name: (sphere / name).read_bytes() for name in files(sphere)}
-    with pytest.raises(UserError, match="is not empty") as error:
-        ScanWriter(sphere, **settings())
-    assert "remedy: choose another output" in str(error.value)
-    with pytest.raises(UserError, match="is a file"):
-        ScanWriter(sphere / "pattern.png", **settings())
-    assert before == {name: (sphere / name).read_bytes() for name in files(sphere)}
 
 
 @pytest.mark.parametrize(

@@ -96,22 +96,6 @@ def test_without_a_known_scale_all_baselines_err_and_their_geometric_mean_is_rig
     assert (np.abs(ratio) > 1e-4).all()
 
 
-def test_a_baseline_too_long_moves_both_devices_away_from_the_object(scene, truth, rig):
-    start = _start(truth, scene, rig, PoseNoise(0.0, 0.0, 0.0, 0.0, 0.02))
-    longer = np.linalg.norm(_relative(start)[:, :3, 3], axis=1) / np.linalg.norm(_relative(truth)[:, :3, 3], axis=1)
-    for before, after in (
-        (truth.T_world_camera, start.T_world_camera),
-        (truth.T_world_projector, start.T_world_projector),
-    ):
-        farther = np.linalg.norm(after[:, :3, 3] - scene.centre, axis=1) / np.linalg.norm(
-            before[:, :3, 3] - scene.centre, axis=1
-        )
-        np.testing.assert_allclose(farther - 1, longer - 1, atol=1e-3)
-    assert np.ptp(longer) > 0.03
-    turned = truth.T_world_camera[:, :3, :3].transpose(0, 2, 1) @ start.T_world_camera[:, :3, :3]
-    assert _angles(turned).max() < 0.02
-
-
 def test_disturbed_rigs_are_put_where_their_points_fit_best(scene, truth, rig):
     """A projector turned by 0.2 deg shifts depth by far more than a millimetre; registration takes that up."""
     noise = PoseNoise(0.0, 0.0, 0.22, 0.37, 0.0)
@@ -138,13 +122,6 @@ def _midpoints(devices, T_c, T_p, match):
             A, b = A + across, b + across @ T[:3, 3]
         out.append(np.linalg.solve(A, b))
     return np.array(out)
-
-
-def test_no_error_means_the_very_same_poses(scene, truth, rig):
-    start = _start(truth, scene, rig, PoseNoise(0.0, 0.0, 0.0, 0.0, 0.0))
-    assert np.array_equal(start.T_world_camera, truth.T_world_camera)
-    assert np.array_equal(start.T_world_projector, truth.T_world_projector)
-    assert pose_sigma(truth, start, scene.centre) is None
 
 
 def test_poses_stay_rigid_and_follow_the_seed(scene, truth, rig):
@@ -175,9 +152,3 @@ def test_sigma_is_the_error_along_each_axis(scene, truth):
     assert sigma.camera_rotation_deg == pytest.approx(0.7, rel=0.05)
     assert sigma.relative_translation == pytest.approx(0.5, rel=0.05)
     assert sigma.relative_rotation_deg == pytest.approx(0.1, rel=0.05)
-
-
-def test_sigma_has_no_zeros_where_only_registration_errs(scene, truth, rig):
-    sigma = pose_sigma(truth, _start(truth, scene, rig, PoseNoise(1.0, 3.0, 0.0, 0.0, 0.0)), scene.centre)
-    assert 0 < sigma.relative_translation < 1e-3 and 0 < sigma.relative_rotation_deg < 1e-3
-    assert sigma.camera_translation == pytest.approx(3.0 / np.sqrt(3), rel=1e-6)

@@ -110,39 +110,12 @@ def test_normals_of_free_forms_point_outwards(scenes, name):
     np.testing.assert_allclose(np.linalg.norm(scene.vertex_normals, axis=1), 1, atol=1e-9)
 
 
-def test_shapes_differ_truly(scenes):
-    """Brought to the same size, each surface leaves the others by several percent of it."""
-    points = {}
-    for name, scene in scenes.items():
-        sample = trimesh.sample.sample_surface(_mesh(scene), 600, seed=0)[0]
-        points[name] = (sample - scene.centre) / scene.size
-    for a in points:
-        for b in points:
-            if a < b:
-                near = np.linalg.norm(points[a][:, None] - points[b][None], axis=-1).min(1)
-                assert near.mean() > 0.03
-
-
 def test_a_sphere_from_its_field():
     scene = mesh_of("ball", ellipsoid((1, 2, 3), (10, 10, 10)), (-12, -12, -12), (14, 14, 16), 1.0)
     radius = np.linalg.norm(scene.vertices - (1, 2, 3), axis=1)
     np.testing.assert_allclose(radius, 10, atol=1e-3)
     np.testing.assert_allclose(scene.vertex_normals, (scene.vertices - (1, 2, 3)) / radius[:, None], atol=5e-3)
     assert _mesh(scene).volume == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
-
-
-def test_a_vase_is_the_same_from_all_sides(scenes):
-    """Turned by any of its segments, it is itself; the normals are perpendicular to the surface's edges."""
-    scene = scenes["vase"]
-    radius = np.hypot(scene.vertices[:, 0], scene.vertices[:, 1])
-    rings = radius[:-2].reshape(-1, 720)
-    np.testing.assert_allclose(rings, np.broadcast_to(rings[:, :1], rings.shape), rtol=1e-12)
-    assert radius.max() == pytest.approx(42, abs=0.01)
-    # Guldin's rule for the solid: area of the half profile times the way of its centroid
-    r, z = rings[:, 0], scene.vertices[:-2, 2].reshape(-1, 720)[:, 0]
-    r, z = np.append(r, 0), np.append(z, scene.vertices[-1, 2])
-    volume = abs(np.pi / 3 * np.sum((r[:-1] ** 2 + r[:-1] * r[1:] + r[1:] ** 2) * np.diff(z)))
-    assert _mesh(scene).volume == pytest.approx(volume, rel=1e-4)
 
 
 def test_a_form_that_leaves_its_box_is_refused():
