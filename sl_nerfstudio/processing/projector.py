@@ -348,10 +348,7 @@ def refine_projector(
         new = DeviceChange(*step.tolist()).applied(projector)
         new_clouds = with_projector(clouds, consistent, new)
         again = adjust_consistent(
-            new_clouds,
-            at_adjusted_poses(consistent),
-            log,
-            replace(settings, projector=knowledge(found, new)),
+            new_clouds, at_adjusted_poses(consistent), log, replace(settings, projector=knowledge(found, new))
         )
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:

@@ -218,11 +218,7 @@ def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Patt
 
 
 def check_content(
-    frame: PartialFrame,
-    partial: PartialScan,
-    pattern: PatternImage | None,
-    good: set[Path],
-    faults: Faults,
+    frame: PartialFrame, partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> FrameContent:
     """Decode all files of a frame that are in `good`, and report what is wrong with their pixels."""
     image_path, pattern_path, coords_path, mask_path = (
@@ -465,11 +461,7 @@ def check_folder(root: Path) -> FolderCheck:
 
 
 def _contents(
-    frames: Sequence[PartialFrame],
-    partial: PartialScan,
-    pattern: PatternImage | None,
-    good: set[Path],
-    faults: Faults,
+    frames: Sequence[PartialFrame], partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> Iterator[FrameContent]:
     """In threads; the faults come in the order of the frames, whichever was done first."""
     together = threads()

@@ -438,9 +438,7 @@ def resolve_inside(root: Path, text: str) -> Path | Problem:
         return Problem("contains characters that no file name can have", "the text is damaged", "correct the path")
     if text.startswith("/") or windows.drive:
         return Problem(
-            f"is absolute ({text})",
-            "it is valid on one machine only",
-            "give the path relative to the scan folder",
+            f"is absolute ({text})", "it is valid on one machine only", "give the path relative to the scan folder"
         )
     if ".." in windows.parts:
         return Problem(

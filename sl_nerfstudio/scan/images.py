@@ -161,10 +161,7 @@ def _header(path: Path, image: ImageFile) -> ImageHeader:
     """Size and kind; FileError for every kind that a scan must not hold."""
     if getattr(image, "n_frames", 1) != 1:
         raise FileError(
-            path,
-            "holds several images",
-            "it is an animation or a multi-page TIFF",
-            "write each image to its own file",
+            path, "holds several images", "it is an animation or a multi-page TIFF", "write each image to its own file"
         )
     raw = str(image.tile[0][3]) if image.tile else ""
     transparent = "transparency" in image.info
@@ -464,10 +461,7 @@ def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
         raise
     except ARRAY_DAMAGE as error:
         raise FileError(
-            path,
-            f"cannot be read ({error})",
-            "the file is truncated, damaged or not what its name says",
-            _EXPORT_AGAIN,
+            path, f"cannot be read ({error})", "the file is truncated, damaged or not what its name says", _EXPORT_AGAIN
         ) from error
 
 

@@ -311,11 +311,7 @@ def head(cell: float = 1.25) -> Scene:
     brow = mirrored(capsule((9, 62, 122), (38, 49, 121), 7.5, 6.0))
     cheek = mirrored(ellipsoid((31, 48, 86), (15, 14, 14)))
     nose = union(6.0, capsule((0, 63, 118), (0, 81, 91), 5.5, 8.0), mirrored(ellipsoid((8.5, 71, 88), (6.5, 8.5, 6))))
-    lips = union(
-        1.5,
-        ellipsoid((0, 64, 69.5), (18, 7.5, 4.6)),
-        ellipsoid((0, 64.5, 62), (15, 7.5, 5.2)),
-    )
+    lips = union(1.5, ellipsoid((0, 64, 69.5), (18, 7.5, 4.6)), ellipsoid((0, 64.5, 62), (15, 7.5, 5.2)))
     body = union(9.0, union(16.0, skull, neck), brow, cheek, nose)
     body = union(3.0, body, lips)
     sockets = mirrored(ellipsoid((23, 66, 108), (14.5, 13, 9.5)))
@@ -327,9 +323,7 @@ def head(cell: float = 1.25) -> Scene:
     face = union(1.2, face, carve(0.8, eyes, lids))
     face = carve(1.0, face, mouth, nostrils)
     ear = carve(
-        2.0,
-        ellipsoid((65, -8, 106), (7.5, 19, 29), (0, 0, -22)),
-        ellipsoid((73, -3, 109), (7.5, 12, 20), (0, 0, -22)),
+        2.0, ellipsoid((65, -8, 106), (7.5, 19, 29), (0, 0, -22)), ellipsoid((73, -3, 109), (7.5, 12, 20), (0, 0, -22))
     )
     cap = ridges(ellipsoid((0, -16, 137), (68.5, 79.5, 64)), 1.3, _strands)
     hair = carve(1.0, cap, half_space((0, -0.79, 0.613), 57.0))

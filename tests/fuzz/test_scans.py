@@ -10,15 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.scan import (
-    PickedPixel,
-    PoseSigma,
-    Scale,
-    ScaleBar,
-    Scan,
-    check_scan,
-    read_scan,
-)
+from sl_nerfstudio.scan import PickedPixel, PoseSigma, Scale, ScaleBar, Scan, check_scan, read_scan
 from tests.fuzz.damage import IMPOSSIBLE, at, damaged, places, removed, replaced
 from tests.fuzz.damage import Path as Place
 from tests.scan.sphere_scan import NAMES, write_sphere

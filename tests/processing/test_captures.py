@@ -60,11 +60,7 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
-        (
-            False,
-            ["x/1.png", "y/1.png"],
-            "holds 0 images.*\n.*do not suit the pattern: a coded grid needs",
-        ),
+        (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
     ],

@@ -7,17 +7,7 @@ import pytest
 
 from sl_nerfstudio.redecoding.measure import Ambiguity
 from sl_nerfstudio.redecoding.redecode import PredictedSurface, redecode_frame
-from tests.redecoding.lit_ball import (
-    CAMERA,
-    PROJECTOR,
-    T_CAMERA,
-    T_PROJECTOR,
-    ball,
-    grid,
-    picture,
-    truth,
-    with_holes,
-)
+from tests.redecoding.lit_ball import CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR, ball, grid, picture, truth, with_holes
 
 MASK = np.isfinite(truth()).all(-1)
 

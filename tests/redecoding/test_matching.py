@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
 
-from sl_nerfstudio.redecoding.measure import (
-    Ambiguity,
-    CorrelationWindow,
-    PatternView,
-    correlations,
-    fit_shifts,
-)
+from sl_nerfstudio.redecoding.measure import Ambiguity, CorrelationWindow, PatternView, correlations, fit_shifts
 from tests.redecoding.lit_ball import grid
 
 RNG = np.random.default_rng(1)

@@ -9,34 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.cli.redecode import (
-    RedecodeArguments,
-    check,
-    main,
-    redecode_trained,
-)
+from sl_nerfstudio.cli.redecode import RedecodeArguments, check, main, redecode_trained
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.redecoding.redecode import RedecodeSettings, redecode_run
 from sl_nerfstudio.runs.run import TrainedRun
-from sl_nerfstudio.scan import (
-    PoseSigma,
-    Scale,
-    Scan,
-    ScanWriter,
-    check_scan,
-    read_scan,
-)
-from tests.redecoding.lit_ball import (
-    CAMERA,
-    PROJECTOR,
-    RADIUS,
-    T_CAMERA,
-    T_PROJECTOR,
-    grid,
-    picture,
-    truth,
-    with_holes,
-)
+from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, check_scan, read_scan
+from tests.redecoding.lit_ball import CAMERA, PROJECTOR, RADIUS, T_CAMERA, T_PROJECTOR, grid, picture, truth, with_holes
 from tests.runs.ball_run import BallModel, run_of
 
 MASK = np.isfinite(truth()).all(-1)

@@ -7,13 +7,7 @@ import pytest
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_up, only_fault, pattern_image, poses
 
 from sl_nerfstudio.errors import ScanError
-from sl_nerfstudio.scan import (
-    Scale,
-    ScanWriter,
-    check_scan,
-    read_scan,
-    write_transforms,
-)
+from sl_nerfstudio.scan import Scale, ScanWriter, check_scan, read_scan, write_transforms
 from sl_nerfstudio.scan.images import encode_png
 
 NAME = NAMES[1]

@@ -14,12 +14,7 @@ from PIL import Image
 from sphere_scan import CAMERA, NAMES, edit, only_fault
 
 from sl_nerfstudio.scan import FileError, check_scan
-from sl_nerfstudio.scan.images import (
-    as_grey,
-    encode_png,
-    read_header,
-    read_image,
-)
+from sl_nerfstudio.scan.images import as_grey, encode_png, read_header, read_image
 
 IMAGE = f"images/{NAMES[1]}.png"
 
@@ -130,8 +125,7 @@ def test_colour_is_for_images_only(sphere: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "cause"),
-    [((60, 72), "swapped"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")],
+    ("size", "cause"), [((60, 72), "swapped"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")]
 )
 @pytest.mark.parametrize("folder", ["images", "patterns", "masks"])
 def test_wrong_size(sphere: Path, size: tuple[int, int], cause: str, folder: str) -> None:

@@ -11,12 +11,7 @@ from sphere_scan import NAMES, edit
 from sl_nerfstudio.errors import ScanError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses
-from sl_nerfstudio.scan import (
-    FileError,
-    check_scan,
-    read_poses,
-    read_scan,
-)
+from sl_nerfstudio.scan import FileError, check_scan, read_poses, read_scan
 from sl_nerfstudio.scan.write import read_devices, write_transforms
 
 

@@ -58,10 +58,7 @@ def test_the_file_states_names_pixels_and_length(tmp_path: Path) -> None:
     assert json.loads((root / "transforms.json").read_text())["scale"] == {
         "known": True,
         "source": "two marks",
-        "distance_between": [
-            {"frame": NAMES[1], "pixel": [30.25, 20.0]},
-            {"frame": NAMES[3], "pixel": [40.5, 33.5]},
-        ],
+        "distance_between": [{"frame": NAMES[1], "pixel": [30.25, 20.0]}, {"frame": NAMES[3], "pixel": [40.5, 33.5]}],
         "length": 51.5,
     }
     root = write_sphere(tmp_path / "baseline", scale=BASELINE)
@@ -130,10 +127,7 @@ def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere:
     edit(sphere, with_scale({"known": True, "source": f"baseline of frame 1 ({NAMES[1]})"}))
     edit(sphere, remove(NAMES[1]))
     fault = only_fault(sphere)
-    assert (fault.field, fault.problem) == (
-        "scale.baseline_of",
-        f"names frame {NAMES[1]!r}, which is not in the scan",
-    )
+    assert (fault.field, fault.problem) == ("scale.baseline_of", f"names frame {NAMES[1]!r}, which is not in the scan")
 
 
 def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sphere: Path) -> None:

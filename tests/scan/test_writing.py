@@ -10,14 +10,7 @@ from sphere_scan import CAMERA, PROJECTOR, edit, pattern_image, poses, write_sph
 
 from sl_nerfstudio.errors import ScanError, UserError
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.scan import (
-    PoseSigma,
-    Scale,
-    ScanWriter,
-    check_scan,
-    read_ground_truth,
-    read_scan,
-)
+from sl_nerfstudio.scan import PoseSigma, Scale, ScanWriter, check_scan, read_ground_truth, read_scan
 from sl_nerfstudio.storage import LOCK
 
 

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.synthesis.devices import (
-    CoordinateNoise,
-    NoisyCells,
-    disturb_coords,
-    disturb_image,
-)
+from sl_nerfstudio.synthesis.devices import CoordinateNoise, NoisyCells, disturb_coords, disturb_image
 
 _CELLS = NoisyCells(period=20.0, x0=10.0, y0=10.0, rows=40, columns=40, w=800, h=800)
 _SIZE = 240

@@ -13,12 +13,7 @@ from sl_nerfstudio.scan.images import as_grey, read_image
 from sl_nerfstudio.synthesis.appearance import HARD, REALISTIC
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import pixels
-from sl_nerfstudio.synthesis.photograph import (
-    Shot,
-    choose_useless,
-    plan_shots,
-    turn_away,
-)
+from sl_nerfstudio.synthesis.photograph import Shot, choose_useless, plan_shots, turn_away
 from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 _CONFIG = SynthConfig(frames=8, resolution=90, seed=6, images_only=True, supersampling=1)

@@ -24,16 +24,7 @@ from sl_nerfstudio.synthesis.scenes import (
     staircase,
     vase,
 )
-from sl_nerfstudio.synthesis.sdf import (
-    capsule,
-    carve,
-    cylinder,
-    ellipsoid,
-    half_space,
-    mesh_of,
-    mirrored,
-    union,
-)
+from sl_nerfstudio.synthesis.sdf import capsule, carve, cylinder, ellipsoid, half_space, mesh_of, mirrored, union
 
 
 def _mesh(scene):
