@@ -1,4 +1,4 @@
-"""The photographs of each frame."""
+"""The photographs of each frame, and the Gray-code sequence that they show."""
 
 import os
 import re

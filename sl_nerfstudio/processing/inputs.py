@@ -406,6 +406,9 @@ def _points(T: Float64[ndarray, "n 4 4"], distance: float) -> Float64[ndarray, "
     return np.concatenate([centre, *(centre + distance * axis for axis in (right, up, -back))])
 
 
+# Everything together.
+
+
 @dataclass(frozen=True)
 class Inputs:
     """Everything that the stages start from."""

@@ -1,4 +1,4 @@
-"""`--object-only`: which part every pixel of the registered frames shows, after all poses are known."""
+"""`--object-only`: which part every pixel of the registered frames shows; with small pictures for the report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -99,7 +99,7 @@ def require_given_poses(
         lines = []
         for name in with_pose:
             failure = reasons[name]
-            what = "registered" if failure is None else f"left out in {failure.stage}: {first_line(failure.reason)}"
+            what = "registered" if failure is None else f"left out in {failure[0]}: {first_line(failure[1])}"
             lines.append(f"{name}: {what}")
         raise UserError(
             f"{path}: {len(usable)} of the {len(with_pose)} frames with given poses could be registered, the axes and "

@@ -1,4 +1,4 @@
-"""The frame stage with what is known of the projector and of the rig: every frame decoded and calibrated."""
+"""Projector and rig: intrinsics found from the frames, tested and refined; all frames calibrated with them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -65,7 +65,7 @@ from sl_nerfstudio.relative_pose.unknown_projector import (
     estimate_projector,
 )
 
-# Sentences on a projector that was, or could not be, found.
+# Sentences on intrinsics that were found, could not be found, or are contradicted.
 
 _MORE_CAMERAS = (
     "add views from places that differ more, of something with depth; or give the projector's intrinsics (sl-calibrate)"

@@ -1,4 +1,4 @@
-"""Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code."""
+"""Values kept between runs and on disk: decoded frames, dataclasses as bytes without pickle, clouds of many frames."""
 
 import hashlib
 import json
@@ -108,6 +108,8 @@ class Manifest:
             return {}
         return dict(frames) if isinstance(frames, dict) else {}
 
+
+# Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code.
 
 T = TypeVar("T")
 _TREE = "tree"  # name of the archive's member that is no array

@@ -1,4 +1,4 @@
-"""The axes and the unit of the scan: those of given poses, of a known length, or arbitrary ones."""
+"""The axes and the unit of the scan, by given poses, a known length or neither, and where frames are in them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

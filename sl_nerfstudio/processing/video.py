@@ -112,6 +112,8 @@ def _resized(grey: UInt8[ndarray, "h w"], longest: int) -> UInt8[ndarray, "h w"]
     return np.asarray(cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA))
 
 
+# The choice of frames, kept in the work folder.
+
 ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 FOLDER = "video"  # in the work folder
 _VERSION = 1  # of the choice

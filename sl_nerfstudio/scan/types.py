@@ -27,10 +27,7 @@ PROJECTOR_KEYS = ("model", *REQUIRED, *DISTORTION, "pattern_path")
 _UNSUPPORTED = ("k3", "k4", "k5", "k6")
 _NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: fields of view of 0.57 and 157 degrees
 _ROUND_TRIP_PX = 1e-3
-_LEAST_STRETCH, _MOST_STRETCH = (
-    0.2,
-    2.0,
-)  # of distances from the principal point: fisheye lenses shrink them, none doubles
+_LEAST_STRETCH, _MOST_STRETCH = 0.2, 2.0  # of distances from the principal point: fisheyes shrink, none doubles them
 
 
 def read_device(fields: Fields, kind: str) -> Device | None:
@@ -147,6 +144,8 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
 def _plausible(stretch: float) -> bool:
     return _LEAST_STRETCH <= stretch <= _MOST_STRETCH
 
+
+# The scan.
 
 FORMAT = 1  # of the scan folder
 

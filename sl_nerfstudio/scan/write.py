@@ -1,4 +1,4 @@
-"""Other poses and devices for the frames of a scan: true ones read, refined ones written, as a transforms.json."""
+"""Writing a scan folder; and other poses and devices for its frames, in a transforms.json beside it."""
 
 import json
 from collections.abc import Sequence
@@ -232,6 +232,8 @@ def encode_json(document: dict[str, Any]) -> bytes:
     """JSON text as UTF-8; raises ValueError for NaN and infinity, which JSON cannot hold."""
     return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
+
+# Poses and devices in another transforms.json: true ones read, refined ones written.
 
 GROUND_TRUTH = "ground_truth"
 _FOCAL_AND_CENTRE = ("fl_x", "fl_y", "cx", "cy")

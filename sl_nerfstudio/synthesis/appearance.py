@@ -1,4 +1,4 @@
-"""Optical properties of the object, the room, the projector's lamp and the lens."""
+"""How captures look: material, light, projector and lens of photographs, and the plain surface of grey images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -103,8 +103,7 @@ def draw_log(rng: np.random.Generator, bounds: Range) -> float:
 
 # Solid textures: where a surface is darker, as a function of the point in space, so that all frames agree.
 #
-# Each function draws one texture for an object of a given size and returns a map from points (relative to the
-# object's
+# Each function draws one texture for an object of a given size and returns a map from points (relative to the object's
 # middle, in its unit) to values from 0 (untouched) to 1 (fully coloured).
 
 Texture = Callable[[Float32[ndarray, "n 3"]], Float32[ndarray, "n"]]
@@ -290,18 +289,15 @@ def make_material(
         texture = TEXTURES[str(name)](size, rng)
         taken = draw(rng, ranges.texture_contrast) * rng.uniform(0.7, 1.0, 3)
         layers.append(Layer(texture, (1 - taken).astype(np.float32)))
+    brightness = draw(rng, ranges.brightness)
+    base = tint(0.25, rng) * np.float32(brightness)
     return Material(
         centre,
-        _tinted(draw(rng, ranges.brightness), 0.25, rng),
+        base,
         tuple(layers),
         draw(rng, ranges.gloss),
         draw_log(rng, ranges.gloss_exponent),
     )
-
-
-def _tinted(brightness: float, strength: float, rng: np.random.Generator) -> Float32[ndarray, "3"]:
-    """A colour of the given luma."""
-    return tint(strength, rng) * np.float32(brightness)
 
 
 def tint(strength: float, rng: np.random.Generator) -> Float32[ndarray, "3"]:
@@ -526,6 +522,8 @@ def make_look(
         draw(of_sensor, ranges.gamma),
     )
 
+
+# Plain images: one grey matte surface.
 
 _ALBEDO_WAVES = 14
 

@@ -1,4 +1,4 @@
-"""Intrinsics that fit a scene: the object fills the image, and the pattern covers the object."""
+"""Devices that fit a scene, their paths around it, and the errors of poses, coordinates and images."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -14,6 +14,8 @@ from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3, fit_similarity, log
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.sdf import Scene
+
+# Intrinsics: the object fills the image, and the pattern covers the object.
 
 Distortion = tuple[float, float, float, float]
 _CAMERA_FILL = 0.92  # of half the image, reached by the object in the frame where it extends farthest
@@ -218,13 +220,10 @@ def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Gene
 
 # Errors of the starting poses, like those of auto-calibration and registration; nothing here renders.
 #
-# Auto-calibration has errors in the pose of a projector relative to its camera: rotation, direction and length of
-# the
-# baseline. The frame's triangulated points are then slightly deformed and have a wrong size, and registration
-# aligns
-# *them* with the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. The
-# error of
-# registration itself moves a frame as a whole and rotates it about the object.
+# Auto-calibration has errors in the pose of a projector relative to its camera: rotation, direction and length of the
+# baseline. The frame's triangulated points are then slightly deformed and have a wrong size, and registration aligns
+# *them* with the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. The error
+# of registration itself moves a frame as a whole and rotates it about the object.
 
 _FEWEST_POINTS = 20  # with fewer, a frame is not registered again
 

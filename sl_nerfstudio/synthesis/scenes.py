@@ -1,4 +1,4 @@
-"""Scenes by name, and from mesh files."""
+"""Scenes: built-in objects by name, and mesh files."""
 
 import math
 from collections.abc import Callable
@@ -539,8 +539,7 @@ def _faces(rings: int) -> Int[ndarray, "f 3"]:
 
 # Objects whose geometry hardly determines some motions of a frame: the hard cases of registration and adjustment.
 #
-# A frame may slide along planes, turn about an axis of revolution or about a sphere's centre, at hardly any cost.
-# Each
+# A frame may slide along planes, turn about an axis of revolution or about a sphere's centre, at hardly any cost. Each
 # object has a little that prevents it.
 
 _FROM_ABOVE = (45.0, 78.0)  # degrees: planes that lie down are seen from above

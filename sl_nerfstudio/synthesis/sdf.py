@@ -39,11 +39,6 @@ class Scene:
         return (self.vertices.min(0) + self.vertices.max(0)) / 2
 
     @cached_property
-    def radius(self) -> float:
-        """Radius of the sphere around `centre` that contains the object."""
-        return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
-
-    @cached_property
     def size(self) -> float:
         """Longest side of the bounding box."""
         return float(np.ptp(self.vertices, axis=0).max())

@@ -41,7 +41,6 @@ from sl_nerfstudio.synthesis.devices import (
     pose_sigma,
 )
 from sl_nerfstudio.synthesis.photograph import (
-    FrameGeometry,
     Photograph,
     Shot,
     choose_useless,
@@ -50,6 +49,7 @@ from sl_nerfstudio.synthesis.photograph import (
     turn_away,
 )
 from sl_nerfstudio.synthesis.render import (
+    FrameGeometry,
     RayCaster,
     RenderedCapture,
     above_the_table,
@@ -113,22 +113,17 @@ class Setup:
 
     def render(self, frame: int, supersampling: int) -> RenderedCapture:
         """Frame number `frame`, without noise."""
-        return render_capture(
-            self.caster,
-            self.devices,
-            self.truth.T_world_camera[frame],
-            self.truth.T_world_projector[frame],
-            self.pattern,
-            self.appearance,
-            supersampling,
-        )
+        return render_capture(self._geometry(frame), self.pattern, self.appearance, supersampling)
 
     def photograph(self, frame: int, supersampling: int, photography: Photography, seed: int) -> Photograph:
         """Frame number `frame` as a camera takes it."""
-        poses = self.truth.T_world_camera[frame], self.truth.T_world_projector[frame]
-        stage = FrameGeometry(self.caster, self.devices, *poses)
         noise = random_stream(seed, Stream.SENSOR, frame)
-        return take_photograph(stage, photography.look, photography.shots[frame], supersampling, noise)
+        shot = photography.shots[frame]
+        return take_photograph(self._geometry(frame), photography.look, shot, supersampling, noise)
+
+    def _geometry(self, frame: int) -> FrameGeometry:
+        poses = self.truth.T_world_camera[frame], self.truth.T_world_projector[frame]
+        return FrameGeometry(self.caster, self.devices, *poses)
 
 
 def make_setup(config: SynthConfig) -> Setup:
@@ -150,7 +145,7 @@ def make_setup(config: SynthConfig) -> Setup:
     caster = RayCaster(scene, surroundings)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
-    matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
+    matches = [_matches(FrameGeometry(caster, devices, *poses)) for poses in pairs]
     start = disturb_poses(truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES))
     return Setup(
         scene=scene,
@@ -198,16 +193,12 @@ def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarra
     return Photography(look, plan_shots(ranges, rngs, useless))
 
 
-def _matches(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-) -> ExactMatches:
+def _matches(frame: FrameGeometry) -> ExactMatches:
     """Exact correspondences on a coarse grid of pixels."""
     place = (np.arange(_REGISTRATION_GRID) + 0.5) / _REGISTRATION_GRID
-    uv = np.stack(np.meshgrid(place * devices.camera.w, place * devices.camera.h), -1).reshape(-1, 2)
-    seen = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    camera = frame.devices.camera
+    uv = np.stack(np.meshgrid(place * camera.w, place * camera.h), -1).reshape(-1, 2)
+    seen = visible_points(frame, uv)
     return ExactMatches(uv[seen.lit], seen.uv_projector[seen.lit], seen.p_world[seen.lit])
 
 
@@ -372,14 +363,6 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, truth: str
             writer.add_file(f"{truth}{name}.ply", encode_ply(S_world_scene.points(part.vertices), part.faces))
 
 
-def _object_mask_path(frame: SyntheticFrame) -> str:
-    return f"object_masks/{frame.name}.png"
-
-
-def _encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
-    return encode_png(mask.astype(np.uint8) * np.uint8(255))
-
-
 def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
     """Which frames are of use, and what the others lack."""
     shots = [None] * config.frames if setup.photography is None else setup.photography.shots
@@ -400,7 +383,10 @@ def _write_scan(config: SynthConfig, setup: Setup, folder: NewFolder) -> None:
         for index, frame in enumerate(_frames(config, setup)):
             start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
             _add(writer, frame, start, truth)
-            writer.add_file(f"ground_truth/{_object_mask_path(frame)}", _encode_mask(frame.object_mask))
+            writer.add_file(
+                f"ground_truth/object_masks/{frame.name}.png",
+                encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255)),
+            )
         _add_files(writer, config, setup, "ground_truth/")
 
 
@@ -410,7 +396,9 @@ def _write_captures(config: SynthConfig, setup: Setup, folder: NewFolder) -> Non
     with _scan_writer(exact, setup, folder.root / "ground_truth", folder) as truth:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
-            truth.add_file(_object_mask_path(frame), _encode_mask(frame.object_mask))
+            truth.add_file(
+                f"object_masks/{frame.name}.png", encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255))
+            )
             folder.write(f"images/{frame.name}{frame.suffix}", frame.encoded)
         truth.add_file("captures.json", encode_json(_captures_document(config, setup)))
         _add_files(truth, exact, setup, "")

@@ -1,4 +1,4 @@
-"""Frames whose coordinates contradict the others after the joint adjustment: taken out, or moved to where they agree."""
+"""Frames whose coordinates contradict the others after the joint adjustment: taken out, or moved to where they fit."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -192,7 +192,7 @@ def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
 def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_path, monkeypatch):
     T = ramp_scan.T_world_camera.copy()
     T[:3, :3, 3] = (1, 2, 3)
-    lost = SimpleNamespace(stage="registering", reason="alone")
+    lost = "registering", "alone"
     monkeypatch.setattr(stages, "left_out", lambda result, _: lost if result.name == NAMES[3] else None)
     results = [SimpleNamespace(name=name) for name in NAMES]
     config = ramp_scan.config(tmp_path / "s", poses=tmp_path / "r.json")

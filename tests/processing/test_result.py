@@ -182,8 +182,7 @@ def test_a_frame_that_failed_has_only_the_figures_that_were_reached(
     assert (frame.in_scan, frame.stage, frame.reason) == (False, stage, lost.reason)
     assert (frame.decode_rate, frame.mask_share) == (rate, share)
     assert frame.epipolar_px is frame.baseline is frame.fitness is None
-    failure = left_out(lost, registration)
-    assert (failure.stage, failure.reason) == (stage, lost.reason)
+    assert left_out(lost, registration) == (stage, lost.reason)
 
 
 def test_a_frame_that_was_not_registered_says_why(config, results, registration, poses):
@@ -209,7 +208,7 @@ def test_residuals_that_do_not_exist_are_left_out(config, results, registration,
 
 
 def _frame(name, **values):
-    return FrameRecord(name, **{"in_scan": True, "stage": "", "reason": "", **values})
+    return FrameRecord(name, **values)
 
 
 def _edge(a, b, used=True):

@@ -10,7 +10,7 @@ from tests.verdict.cases import ring
 
 N = 12
 NAMES = [f"f{k:02d}" for k in range(N)]
-GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decoded_share=0.9, own_share=0.95) for name in NAMES)
+GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decode_rate=0.9, own_share=0.95) for name in NAMES)
 CHAIN = tuple(PairFacts((NAMES[k], NAMES[(k + gap) % N]), True) for gap in (1, 2) for k in range(N))
 
 
@@ -32,13 +32,13 @@ def test_a_scan_without_any_doubt_is_good():
     [
         ({"undecided": True}, "acceptable", "f03: the pose is undecided; along the surface, others fit as well"),
         ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
-        ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
+        ({"decode_rate": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
         (
-            {"decoded_share": 0.9, "shared_decoded": 0.3},
+            {"decode_rate": 0.9, "shared_decoded": 0.3},
             "acceptable",
             "f03: only 30% of the surface that other frames show was decoded (at least 50%)",
         ),
-        ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
+        ({"decode_rate": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
         ({"missing_share": 0.07}, "acceptable", "f03: saw nothing of the pattern where other frames show a surface"),
         ({"missing_share": 0.2}, "acceptable", "(20% of it in the worst of them; at most 5%)"),
         ({"own_share": 0.1}, "acceptable", "f03: only 10% of the decoded pixels agree with the pose of the projector"),
@@ -73,7 +73,7 @@ def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
 
 
 def test_background_that_no_frame_decodes_is_no_fault():
-    verdict = judge_scan(scan({k: {"decoded_share": 0.2, "shared_decoded": 0.8} for k in range(N)}))
+    verdict = judge_scan(scan({k: {"decode_rate": 0.2, "shared_decoded": 0.8} for k in range(N)}))
     assert verdict.band == "good" and verdict.reasons == ()
 
 
@@ -148,8 +148,8 @@ def test_too_few_frames_wrong_intrinsics_and_weak_poses():
     lost = {k: {"in_scan": False} for k in range(1, N)}
     assert judge_scan(scan(lost)).reasons == ("only 1 of 12 frames could be used",)
     assert judge_scan(scan(wrong_intrinsics=True)).band == "acceptable"
-    assert judge_scan(scan({0: {"degenerate": True}})).band == "good"  # the other frames determine it
-    assert judge_scan(scan({k: {"degenerate": True} for k in range(5)})).band == "acceptable"
+    assert judge_scan(scan({0: {"degeneracies": ("flat",)}})).band == "good"  # the other frames determine it
+    assert judge_scan(scan({k: {"degeneracies": ("flat",)} for k in range(5)})).band == "acceptable"
 
 
 def test_the_worst_reason_comes_first():
