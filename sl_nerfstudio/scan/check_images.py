@@ -1,4 +1,4 @@
-"""Frames whose coordinates are not those of their image: shifted, of another frame, or of no image at all."""
+"""Do coordinates belong to the pattern and to the image? Shifted ones, those of another frame, or of no image."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import uniform_filter
 
-from sl_nerfstudio.scan.check_conventions import Interpretation, describe_coords
+from sl_nerfstudio.scan.check_conventions import Interpretation, converted_coords, describe_coords
 from sl_nerfstudio.scan.document import Problem
 
 # Are coordinates shifted relative to the pattern, for example because pixels are counted from their centres?
 #
-# The pattern, looked up at the coordinates, must resemble the captured pattern. The shift that makes the two most
-# alike
+# The pattern, looked up at the coordinates, must resemble the captured pattern. The shift that makes the two most alike
 # is estimated from the correlation at five places. Poses are not used.
 
 _STEP = 1.0  # px
@@ -92,8 +91,7 @@ def look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2
 
 # Does a frame show the pattern where its coordinates say? Poses are not used.
 #
-# The pattern, looked up at the coordinates, must resemble the captured image. If it resembles it better after a
-# move by
+# The pattern, looked up at the coordinates, must resemble the captured image. If it resembles it better after a move by
 # whole pixels, the coordinates are shifted; if it never does, they are of another image, or of none.
 
 _FEWEST_COMPARED = 200
@@ -176,7 +174,7 @@ def match_image(
     size = (pattern.shape[1], pattern.shape[0])
     uv = coords[rows, columns]
     found = [
-        ImagePrediction(rows, columns, look_up(pattern, _interpreted(uv, how, size))).correlation(shown, allowed)
+        ImagePrediction(rows, columns, look_up(pattern, converted_coords(uv, how, size))).correlation(shown, allowed)
         for how in _OTHER_AXES
     ]
     return ImageMatch(
@@ -188,11 +186,6 @@ def match_image(
         interpreted=max(found),
         prediction=prediction.thinned(_KEPT),
     )
-
-
-def _interpreted(uv: Float32[ndarray, "n 2"], how: Interpretation, size: tuple[int, int]) -> Float32[ndarray, "n 2"]:
-    x, y = uv.T[::-1] if how.swapped else uv.T
-    return np.stack([size[0] - x if how.mirrored_x else x, size[1] - y if how.mirrored_y else y], -1)
 
 
 def _best_move(

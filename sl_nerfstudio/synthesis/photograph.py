@@ -204,12 +204,11 @@ def take_photograph(
 
     view = sample_view(stage, centres, light, look.room.nothing, supersampling)
     depth = -(centres.p_world - stage.T_world_camera[:3, 3]) @ stage.T_world_camera[:3, 2]
-    image = look.lens.blurred(view.radiance, depth.reshape(view.shape))
+    image = look.lens.blurred(view.radiance, depth.reshape(view.mask.shape))
     image = moved(image, shot.motion * stage.devices.camera.w / _MOTION_WIDTH, shot.motion_direction)
     sensor = Sensor(look.gain * shot.exposure, look.noise, look.gamma, shot.jpeg_quality)
     jpeg = sensor.encode(sensor.develop(image, rng))
-    on_object = stage.caster.on_object(centres.face).reshape(view.shape)
-    return Photograph(view.coords, view.mask, on_object, decode_jpeg(jpeg), jpeg)
+    return Photograph(view.coords, view.mask, view.object_mask, decode_jpeg(jpeg), jpeg)
 
 
 def _reflected(

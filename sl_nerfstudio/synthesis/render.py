@@ -204,32 +204,7 @@ class RenderedCapture:
     coords: Float32[ndarray, "h w 2"]  # exact at pixel centres; NaN outside the mask
     mask: Bool[ndarray, "h w"]
     object_mask: Bool[ndarray, "h w"]  # the object, lit or not, and not its surroundings
-    radiance: Float32[ndarray, "h w"]  # 1 is a white surface facing the projector, in its full light
-
-
-@dataclass(frozen=True)
-class SampledView:
-    """What rays through the pixels of a camera meet."""
-
-    at_centres: VisiblePoints  # (h * w) pixels, row by row
-    radiance: Float32[ndarray, "h w *c"]  # mean over each pixel
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of the image."""
-        return self.radiance.shape[0], self.radiance.shape[1]
-
-    @property
-    def mask(self) -> Bool[ndarray, "h w"]:
-        """Pixels with coordinates."""
-        return self.at_centres.lit.reshape(self.shape)
-
-    @property
-    def coords(self) -> Float32[ndarray, "h w 2"]:
-        """Exact at pixel centres; NaN outside the mask."""
-        coords = np.full((self.at_centres.lit.size, 2), np.nan, dtype=np.float32)
-        coords[self.at_centres.lit] = self.at_centres.uv_projector[self.at_centres.lit]
-        return coords.reshape(*self.shape, 2)
+    radiance: Float32[ndarray, "h w *c"]  # mean over each pixel; 1: a white surface in the projector's full light
 
 
 Light = Callable[[VisiblePoints, Int64[ndarray, "n"]], Float32[ndarray, "n *c"]]
@@ -263,8 +238,7 @@ def render_capture(
 
     centres = visible_centres(frame)
     view = sample_view(frame, centres, light, np.float32(appearance.background), supersampling)
-    on_object = frame.caster.on_object(centres.face).reshape(view.shape)
-    return RenderedCapture(view.coords, view.mask, on_object, appearance.through_lens(view.radiance))
+    return replace(view, radiance=appearance.through_lens(view.radiance))
 
 
 def visible_centres(frame: FrameGeometry) -> VisiblePoints:
@@ -285,7 +259,7 @@ def sample_view(
     light: Light,
     nothing: Float32[ndarray, "*c"] | np.float32,
     supersampling: int,
-) -> SampledView:
+) -> RenderedCapture:
     """Light as the mean of `supersampling`^2 rays per pixel; `nothing` is what is seen where no surface is."""
     w, h = frame.devices.camera.w, frame.devices.camera.h
     corner = _corners(frame.devices.camera)
@@ -298,7 +272,15 @@ def sample_view(
         for dx in step:
             total += light(visible_points(frame, corner[near] + (dx, dy)), near)
     radiance[near] = total / supersampling**2
-    return SampledView(centres, radiance.reshape(h, w, *np.shape(nothing)))
+    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
+    coords[centres.lit] = centres.uv_projector[centres.lit]
+    on_object = frame.caster.on_object(centres.face)
+    return RenderedCapture(
+        coords.reshape(h, w, 2),
+        centres.lit.reshape(h, w),
+        on_object.reshape(h, w),
+        radiance.reshape(h, w, *np.shape(nothing)),
+    )
 
 
 def _corners(camera: Device) -> Int64[ndarray, "n 2"]:

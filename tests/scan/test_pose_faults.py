@@ -1,4 +1,4 @@
-"""Poses and intrinsics, one by one; how they fit together is in test_conventions.py."""
+"""Poses and intrinsics, one by one; how they fit together is in test_check_conventions.py."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sphere_scan import edit
-from test_conventions import disturbed, undo
+from test_check_conventions import disturbed, undo
 
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.check import FolderCheck, check_folder

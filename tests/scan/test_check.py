@@ -83,15 +83,6 @@ def test_files_that_hold_no_coordinates(sphere: Path, content: bytes, problem: s
     assert not Path("/tmp/unpickled-by-sl-check").exists()
 
 
-def test_a_damaged_byte_is_noticed(sphere: Path) -> None:
-    content = bytearray(zipped(coords=GOOD))
-    content[len(content) // 2] ^= 0xFF
-    (sphere / COORDS).write_bytes(content)
-    fault = only_fault(sphere)
-    assert "cannot be read" in fault.problem
-    assert "damaged" in fault.cause
-
-
 def test_plain_npy_any_order_any_byte_order(tmp_path: Path) -> None:
     coords = image_coords()
     for variant in (coords, np.asfortranarray(coords), coords.astype(">f4")):
