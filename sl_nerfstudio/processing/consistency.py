@@ -20,6 +20,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 )
 from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results
+from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.register import include_left_out, with_edges_at_poses, with_relative_pose
 from sl_nerfstudio.registration.result import (
@@ -39,7 +40,6 @@ from sl_nerfstudio.review.agreement import (
     compare_frames,
 )
 
-_FEWEST = 2  # frames of a scan
 _EXCLUSIONS = 4  # times that contradicting frames are taken out of one group
 _MOVES = 3  # times that frames are tried at other places
 _INCLUSIONS = 3  # times that frames left out are placed
@@ -141,7 +141,7 @@ class _Adjuster:
         for _ in range(_EXCLUSIONS):
             index = np.flatnonzero(group.registration.registered).tolist()
             lost = [[index[n] for n in part] for part in agreeing_groups(group.cross)[1:]]
-            if not lost or len(index) - sum(map(len, lost)) < _FEWEST:
+            if not lost or len(index) - sum(map(len, lost)) < FEWEST_FRAMES:
                 break
             names = group.named(k for part in lost for k in part)
             self.log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")

@@ -35,7 +35,7 @@ from sl_nerfstudio.processing.captures import (
     recognise_sequence,
     resolution,
 )
-from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.records import LargeClouds
@@ -365,7 +365,7 @@ def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
     if not isinstance(units, str) or units not in UNITS:
         raise FileError(path, f"units is {units!r}", "an unknown unit", f"give one of {', '.join(UNITS)}")
     given = GivenPoses(T, units)
-    if given.known.sum() < 2:
+    if given.known.sum() < FEWEST_FRAMES:
         raise FileError(
             path,
             "has poses for fewer than two of the captures",
@@ -434,7 +434,8 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     cameras = read_cameras(config, captures)
     require_known_camera(config, cameras)
     projector, stated = read_projector(config, (layout.w, layout.h))
-    masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
+    sizes = {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
+    masks = None if config.masks is None else find_masks(config.masks, sizes)
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
     last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
     devices = cameras.first, projector
@@ -447,10 +448,6 @@ def read_inputs(config: ProcessConfig) -> Inputs:
         None if known is None else frames_by_name(known, names),
         captured.notes,
     )
-
-
-def _sizes_of_frames(captures: Captures) -> dict[str, tuple[int, int]]:
-    return {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
 
 
 def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:

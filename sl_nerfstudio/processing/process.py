@@ -20,7 +20,7 @@ from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
-from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent, registered_only
 from sl_nerfstudio.processing.frames import (
     FrameJob,
@@ -61,7 +61,6 @@ from sl_nerfstudio.storage import NewFolder, write_atomic
 
 # The errors of a run whose frames cannot make a scan: they say what happened to every frame.
 
-FEWEST_FRAMES = 2
 REPORT = "processing.html"
 _LISTED = 20  # frames in a message
 
@@ -207,7 +206,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
         log(sentence)
     frames = _calibrate(config, inputs, make_report, log)
     wrong = _wrong_intrinsics(inputs, frames, log)
-    given = _given_for_clouds(inputs.given, frames.results)
+    given = inputs.given and inputs.given.chosen([result.cloud is not None for result in frames.results])
     frames, registration = _register(config, inputs, frames, given, log)
     _require_registered(config, inputs, frames.results, registration, wrong, make_report)
     frames, consistent = _adjust(config, inputs, frames, registration, log)
@@ -356,8 +355,3 @@ def _require_registered(
         raise too_few_frames(result, usable, make_report)
     if inputs.given is not None:
         require_given_poses(config, inputs.given, results, registration)
-
-
-def _given_for_clouds(given: GivenPoses | None, results: Sequence[FrameStageResult]) -> GivenPoses | None:
-    """The given poses of the frames that have a cloud."""
-    return None if given is None else given.chosen([result.cloud is not None for result in results])

@@ -22,7 +22,7 @@ from sl_nerfstudio.decoding.decoder import Decoded
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.processing.cache import StageStore
-from sl_nerfstudio.processing.config import ProcessConfig, Rig
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig, Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
 from sl_nerfstudio.processing.frames import (
     FrameJob,
@@ -453,7 +453,6 @@ def with_equal_baselines(registration: Registration) -> Registration:
 
 # Whether the stated intrinsics can be right, by the epipolar geometry of all frames: before anything is registered.
 
-_FEWEST = 2  # frames: four constraints on three values
 _DECISIVE = 0.5  # share of the errors that other intrinsics leave: then it is they that made frames look doubtful
 
 
@@ -461,8 +460,8 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     """Which intrinsics the frames contradict, with the values that would agree; "" if none."""
     every = clouds_of(results)
     firm = _firm(every)
-    clouds = firm if len(firm) >= _FEWEST else every
-    if len(clouds) < _FEWEST or len({cloud.camera for cloud in clouds}) > 1:
+    clouds = firm if len(firm) >= FEWEST_FRAMES else every  # of two, four constraints on three values
+    if len(clouds) < FEWEST_FRAMES or len({cloud.camera for cloud in clouds}) > 1:
         return ""
     frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds]
     poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds]
@@ -473,7 +472,7 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     )
     evidence = evidence.allowing(job.stated.either)
     stated_px, best_px = evidence.projector.noise_px
-    decisive = len(firm) >= _FEWEST or best_px < _DECISIVE * stated_px
+    decisive = len(firm) >= FEWEST_FRAMES or best_px < _DECISIVE * stated_px
     return wrong_intrinsics(evidence) if decisive and evidence.contradicts() else ""
 
 
@@ -503,7 +502,7 @@ def place_static(
     Raises UserError, with what was measured and what to add, where the frames do not determine the poses.
     """
     decoded = [result for result in results if result.key]
-    if len(decoded) < _FEWEST:
+    if len(decoded) < FEWEST_FRAMES:
         job = replace(job, last_step="match")
         return CalibratedFrames(job, results, None, _registration((), np.zeros((0, 4, 4)), np.zeros(0)))
     worker, known = FrameWorker(job), stated and not estimate
@@ -567,7 +566,7 @@ def _registration(
     No pairs of surfaces were compared, so there are no edges.
     """
     n = len(names)
-    if n < _FEWEST:
+    if n < FEWEST_FRAMES:
         one = np.full(n, np.nan)
         exclusions = tuple(NoCommonSurface(name) for name in names)
         return Registration(

@@ -32,7 +32,7 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
-from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
+from sl_nerfstudio.review.agreement import CrossFrameAgreement
 from sl_nerfstudio.review.coverage import SurfaceShares
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
@@ -401,14 +401,18 @@ def _with_others(
     if cross is None:
         return tuple(frames)
     found = iter(zip(cross.frames, shares or [SurfaceShares(None, None)] * len(cross.frames), strict=True))
-    return tuple(_agreeing(f, *next(found)) if f.in_scan else f for f in frames)
-
-
-def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shares: SurfaceShares) -> FrameRecord:
-    figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
-               "cross_excess": found.excess}  # fmt: skip
-    known = {key: value for key, value in figures.items() if np.isfinite(value)}
-    return replace(frame, seen_share=found.seen, shared_decoded=shares.decoded, missing_share=shares.missing, **known)
+    out = []
+    for frame in frames:
+        if frame.in_scan:
+            agreement, own = next(found)
+            figures = {"cross_share": agreement.share, "cross_px_median": agreement.px_median,
+                       "cross_px_p95": agreement.px_p95, "cross_excess": agreement.excess}  # fmt: skip
+            known = {key: value for key, value in figures.items() if np.isfinite(value)}
+            frame = replace(
+                frame, seen_share=agreement.seen, shared_decoded=own.decoded, missing_share=own.missing, **known
+            )
+        out.append(frame)
+    return tuple(out)
 
 
 def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:

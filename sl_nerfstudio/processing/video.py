@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.scan.document import FileError, check_file
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.write import encode_json
@@ -120,7 +121,6 @@ _VERSION = 1  # of the choice
 _RECORD = "chosen.json"
 _STEP = 0.04  # of the image's diagonal, between chosen frames
 _MOST = 60  # chosen frames; with more, the step grows
-_FEWEST = 2
 _RELATIVE = 0.6  # of the sharpness of the video's sharp frames: less is blurred by motion
 
 
@@ -201,7 +201,7 @@ def _choose(path: Path, measures: Sequence[FrameMeasure]) -> VideoChoice:
     sharpness = np.array([m.sharpness for m in measures])
     least = max(SHARP, _RELATIVE * float(np.percentile(sharpness, 90)))
     sharp = sharpness >= least
-    if sharp.sum() < _FEWEST:
+    if sharp.sum() < FEWEST_FRAMES:
         raise FileError(
             path,
             f"has no two sharp frames (the sharpest: {sharpness.max():.2f}, at least {SHARP:g} is needed)",
@@ -225,7 +225,7 @@ def _choose(path: Path, measures: Sequence[FrameMeasure]) -> VideoChoice:
         figures = (round(float(sharpness[k]), 4), round(moved, 5))
         chosen.append(ChosenFrame(f"video_{measures[k].number:06d}", measures[k].number, measures[k].time_s, *figures))
         last = float(way[k])
-    if len(chosen) < _FEWEST:
+    if len(chosen) < FEWEST_FRAMES:
         raise FileError(
             path,
             f"moves by {way[-1]:.1%} of the image's diagonal only: {len(chosen)} frame was chosen",
