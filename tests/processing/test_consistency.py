@@ -89,7 +89,6 @@ def moved_by(degrees: float, frame: int = MOVED) -> np.ndarray:
     return T
 
 
-@pytest.mark.slow
 def test_nothing_is_taken_out_of_a_right_scan(clouds):
     log = []
     start = registration_of(RIG.T_world_camera.numpy())
@@ -272,7 +271,6 @@ def stranger_of(cloud):
     return frame_cloud(cloud.name, coords, cloud.camera, cloud.projector, pose)
 
 
-@pytest.mark.slow
 def test_groups_become_components_of_their_own_and_what_was_said_of_them_goes():
     start = replace(
         registration_of(RIG.T_world_camera.numpy()),
@@ -330,7 +328,6 @@ def agreement(share: float, excess: float) -> FrameCrossAgreement:
     return FrameCrossAgreement(100, 1.0, share, 0.1, 0.3, excess)
 
 
-@pytest.mark.slow
 def test_doubtful_are_few_frames_that_agree_less_well_than_most() -> None:
     def doubtful(*frames: FrameCrossAgreement) -> list[int]:
         return _doubtful(CrossFrameAgreement(0.1, 0.97, 0.1, 0.3, frames, ()))

@@ -89,7 +89,6 @@ def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
     assert [frame["decode_rate"] for frame in document["frames"]] == [1.0] * 4
 
 
-@pytest.mark.slow
 def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_time(ramp_scan, tmp_path):
     config, job, captures = ramp_scan.config(tmp_path / "s"), ramp_scan.job(tmp_path / "w"), _found(ramp_scan)
     first = run_frame_stage(config, job, captures)
@@ -107,7 +106,6 @@ def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_tim
     assert {name: frame["status"] for name, frame in frames.items()} == dict.fromkeys(NAMES, "decoded before")
 
 
-@pytest.mark.slow
 def test_a_changed_image_is_decoded_again(copy, tmp_path):
     worker, frame = FrameWorker(copy.job(tmp_path / "w")), _found(copy).frames[0]
     first = worker(frame)
@@ -116,7 +114,6 @@ def test_a_changed_image_is_decoded_again(copy, tmp_path):
     assert again.key != first.key and not again.resumed and worker(frame).resumed
 
 
-@pytest.mark.slow
 def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, tmp_path):
     images = copy.root / "images"
     (images / NAMES[0] / "0.png").write_bytes(b"broken")
@@ -142,7 +139,6 @@ def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, t
     }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
     result = worker(_found(ramp_scan).frames[1])
@@ -192,7 +188,6 @@ def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whol
     assert len(found) == 2 * len(NAMES) + 1 and found == expected
 
 
-@pytest.mark.slow
 def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path))
     clouds = clouds_of([worker(frame) for frame in _found(ramp_scan).frames])

@@ -28,6 +28,8 @@ from sl_nerfstudio.storage import NewFolder
 from tests.processing.conftest import SHORT, register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES
 
+pytestmark = pytest.mark.usefixtures("ramps_registered", "calibrated_before")
+
 ALONE = "no other frame shows any of its surface; capture views in between"
 
 
@@ -83,8 +85,6 @@ def lose(monkeypatch):
     return lose
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     result, log, root = whole
     assert log[0] == "4 frames of 130 x 130 pixels, decoder ramps"
@@ -102,7 +102,6 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     assert angles.max() < 0.3
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
 @pytest.mark.slow
 def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigma_covers_them(
     monkeypatch, whole, ramp_scan, tmp_path
@@ -128,8 +127,6 @@ def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigm
         assert error < 3 * (rough.pose_sigma.camera_translation + np.radians(1.0) * distance)
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, tmp_path):
     lose(NAMES[3])
     result, log = _run(ramp_scan.config(tmp_path / "s"))
@@ -140,8 +137,6 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
     lose(*NAMES[1:])
     config = ramp_scan.config(tmp_path / "s")
@@ -152,8 +147,6 @@ def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_
     assert not config.output.exists() and (config.work_folder / "processing.html").read_text() == "0 of 4"
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 @pytest.mark.parametrize(("given", "usable"), [((0, 1, 2), 1), ((0, 1), 0)])
 def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them(
     monkeypatch, lose, ramp_scan, tmp_path, given, usable
@@ -174,8 +167,6 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
     """Which is said before anything is decoded."""
     turned = ramp_scan.T_world_camera.copy()
@@ -187,8 +178,6 @@ def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
     assert log == []
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_path, monkeypatch):
     T = ramp_scan.T_world_camera.copy()
     T[:3, :3, 3] = (1, 2, 3)
@@ -200,7 +189,6 @@ def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_pa
         inspect.unwrap(require_given_poses)(config, GivenPoses(T, "mm"), results, None)
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
 @pytest.mark.slow
 @pytest.mark.parametrize("units", ["mm", "arbitrary"])
 def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
@@ -213,7 +201,6 @@ def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
     assert (scan.scale.known, result.scale_source) == (units == "mm", source)
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
 @pytest.mark.slow
 def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
@@ -224,8 +211,6 @@ def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     assert baseline == pytest.approx(5, rel=1e-5)
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(monkeypatch, ramp_scan, tmp_path):
     shutil.copytree(ramp_scan.root, tmp_path / "c")
     (tmp_path / "c" / "images" / NAMES[1] / "0.png").write_bytes(b"broken")
@@ -235,8 +220,6 @@ def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(m
         _run(copy.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm"))
 
 
-@pytest.mark.usefixtures("ramps_registered", "calibrated_before")
-@pytest.mark.slow
 def test_frames_of_a_known_length_are_found_by_number_or_name():
     bar = parse_known_length("distance between frame 1 (1, 2) and frame b (3, 4) = 5 mm")
     assert frames_by_name(bar, ["a", "1", "b"]).frames == ("1", "b")  # a name counts before a number

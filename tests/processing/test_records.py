@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sl_nerfstudio.decoding.decoder import Decoded
+from sl_nerfstudio.decoding.decoders import DECODERS
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.processing.records import DecodedStore, Manifest, decode, digest, encode
 
@@ -127,6 +130,14 @@ def test_other_images_or_another_decoder_make_another_key(tmp_path, frame):
     assert DecodedStore(tmp_path, "another").key(frame) != key
     frame.images[0].write_bytes(b"other pixels")
     assert store.key(frame) != key
+
+
+def test_every_pattern_and_every_version_of_a_decoder_has_its_own_key(monkeypatch):
+    gray, grid = DECODERS["graycode"], DECODERS["network"]
+    keys = [gray(GrayCode(32, 24, 2)).key, gray(GrayCode(32, 24, 4)).key]
+    keys += [grid(GridPattern(w=160, h=120)).key, grid(GridPattern(w=160, h=120, seed=1)).key]
+    monkeypatch.setattr(gray, "version", gray.version + 1)
+    assert len({*keys, gray(GrayCode(32, 24, 2)).key}) == 5
 
 
 def test_damaged_files_count_as_not_decoded(tmp_path, frame, decoded):
