@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import (
     CoordinateNoise,
-    DeviceOptions,
     DevicePair,
     PathKind,
     disturb_coords,
@@ -19,7 +19,7 @@ from sl_nerfstudio.synthesis.devices import (
     make_paths,
     pixels,
 )
-from sl_nerfstudio.synthesis.render import RayCaster, visible_centres
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, visible_centres
 from sl_nerfstudio.synthesis.scenes import make_scene
 from sl_nerfstudio.synthesis.synthesise import make_cells
 
@@ -57,13 +57,13 @@ def make_set(options: SetOptions) -> CoordinateSet:
     """Render one set."""
     scene = make_scene(options.scene, 1.0)
     poses = make_paths(scene, options.frames, options.path, np.random.default_rng([options.seed, 1]))
-    devices = make_devices(scene, poses, PATTERN, DeviceOptions(options.resolution))
+    devices = make_devices(scene, poses, PATTERN, SynthConfig(resolution=options.resolution))
     projector, poses = _with_shift(devices.projector, poses, scene.vertices[::20], options)
     devices = DevicePair(devices.camera, projector)
     caster, cells = RayCaster(scene), make_cells(np.zeros(PATTERN[::-1], np.float32), None)
     coords, points = [], []
     for k in range(options.frames):
-        seen = visible_centres(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k])
+        seen = visible_centres(FrameGeometry(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k]))
         shape = devices.camera.h, devices.camera.w
         exact = np.where(seen.lit[:, None], seen.uv_projector, np.nan).astype(np.float32).reshape(*shape, 2)
         rng = np.random.default_rng([options.seed, 2, k])

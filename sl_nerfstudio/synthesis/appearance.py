@@ -22,52 +22,33 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Ranges:
-    """Each property is drawn between two values, once for a scan or once for each frame.
+    """Each property is drawn between two values, once for a scan or once for each frame; the defaults are `realistic`.
 
     Blur of the camera is in pixels of an image 600 pixels wide, and grows with its width.
     """
 
     # of a scan
-    pattern_blur: Range  # sigma of the projected pattern in focus, pattern pixels
-    pattern_defocus: Range  # sigma added in quadrature half the object's size off the focal plane, pattern pixels
-    camera_blur: Range  # sigma in focus, pixels
-    camera_defocus: Range  # sigma added in quadrature half the object's size off the focal plane, pixels
-    brightness: Range  # of the object's material, share of light reflected
-    texture_contrast: Range  # share of light that a layer of texture takes away at most
-    texture_layers: tuple[int, int]  # number on the object, least and most
-    gloss: Range  # strength of the highlight
-    gloss_exponent: Range
-    room_light: Range  # all of it, for a white surface, where the lamp of the projector has 1
-    gamma: Range
-    noise: Range  # times --sensor-noise
-    useless: float  # share of the frames
+    pattern_blur: Range = (0.5, 0.9)  # sigma of the projected pattern in focus, pattern pixels
+    pattern_defocus: Range = (1.0, 2.2)  # added in quadrature half the object's size off the focal plane, the same
+    camera_blur: Range = (0.5, 0.9)  # sigma in focus, pixels
+    camera_defocus: Range = (0.3, 1.1)  # added in quadrature half the object's size off the focal plane, the same
+    brightness: Range = (0.45, 0.85)  # of the object's material, share of light reflected
+    texture_contrast: Range = (0.2, 0.55)  # share of light that a layer of texture takes away at most
+    texture_layers: tuple[int, int] = (1, 2)  # number on the object, least and most
+    gloss: Range = (0.02, 0.2)  # strength of the highlight
+    gloss_exponent: Range = (8.0, 60.0)
+    room_light: Range = (0.06, 0.28)  # all of it, for a white surface, where the lamp of the projector has 1
+    gamma: Range = (1.8, 2.4)
+    noise: Range = (0.8, 1.8)  # times --sensor-noise
+    useless: float = 0.04  # share of the frames
     # of a frame
-    exposure: Range  # times the one that suits the material
-    motion: Range  # length of the path of a point in the image while the shutter is open, pixels
-    jpeg_quality: Range
-    shake: Range  # the same as `motion`, in frames spoiled by it
+    exposure: Range = (0.7, 1.4)  # times the one that suits the material
+    motion: Range = (0.0, 2.2)  # length of the path of a point in the image while the shutter is open, pixels
+    jpeg_quality: Range = (78.0, 95.0)
+    shake: Range = (14.0, 30.0)  # the same as `motion`, in frames spoiled by it
 
 
-REALISTIC = Ranges(
-    pattern_blur=(0.5, 0.9),
-    pattern_defocus=(1.0, 2.2),
-    camera_blur=(0.5, 0.9),
-    camera_defocus=(0.3, 1.1),
-    brightness=(0.45, 0.85),
-    texture_contrast=(0.2, 0.55),
-    texture_layers=(1, 2),
-    gloss=(0.02, 0.2),
-    gloss_exponent=(8.0, 60.0),
-    room_light=(0.06, 0.28),
-    gamma=(1.8, 2.4),
-    noise=(0.8, 1.8),
-    useless=0.04,
-    exposure=(0.7, 1.4),
-    motion=(0.0, 2.2),
-    jpeg_quality=(78.0, 95.0),
-    shake=(14.0, 30.0),
-)
-
+REALISTIC = Ranges()
 HARD = Ranges(
     pattern_blur=(0.6, 1.1),
     pattern_defocus=(1.3, 2.3),

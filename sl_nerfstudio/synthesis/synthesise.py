@@ -28,7 +28,6 @@ from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.devices import (
     DISTANCE,
     CoordinateNoise,
-    DeviceOptions,
     DevicePair,
     ExactMatches,
     NoisyCells,
@@ -134,10 +133,7 @@ def make_setup(config: SynthConfig) -> Setup:
     surroundings = make_surroundings(scene, config.background, random_stream(config.seed, Stream.SURROUNDINGS))
     pattern, layout = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
-    options = DeviceOptions(
-        config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
-    )
-    devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
+    devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), config)
     photography = _make_photography(config, scene, pattern)
     if photography is not None:
         away = [random_stream(config.seed, Stream.AWAY, n) for n in range(config.frames)]

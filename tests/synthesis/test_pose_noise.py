@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import (
-    DeviceOptions,
     ExactMatches,
     PoseNoise,
     disturb_poses,
@@ -33,7 +33,7 @@ def truth(scene):
 @pytest.fixture(scope="module")
 def rig(scene, truth):
     """Devices, and for each frame matches of points scattered over the object's bounding box."""
-    devices = make_devices(scene, truth, (800, 800), DeviceOptions())
+    devices = make_devices(scene, truth, (800, 800), SynthConfig())
     rng = np.random.default_rng(2)
     p = scene.centre + rng.uniform(-1, 1, (150, 3)) * np.ptp(scene.vertices, axis=0) / 2
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
