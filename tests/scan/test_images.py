@@ -1,24 +1,258 @@
-"""Photographs are turned as their tag says, phone pictures are read, raw files and mosaics are refused."""
+"""Paths and image files of a scan, and photographs: read exactly, turned as their tag says, or refused."""
 
+import os
+import struct
 import sys
+import zlib
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pillow_heif
 import pytest
 from PIL import Image, ImageOps
+from sphere_scan import CAMERA, NAMES, edit, only_fault
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.scan import FileError, check_scan
 from sl_nerfstudio.scan.images import (
+    as_grey,
+    encode_png,
     is_mosaic,
     photograph_header,
+    read_header,
+    read_image,
     read_photograph,
     refuse_mosaic,
     turned,
     turned_by_tag,
 )
 
+IMAGE = f"images/{NAMES[1]}.png"
+
+
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [
+        ("/etc/passwd", "is absolute (/etc/passwd)"),
+        ("C:\\scan\\a.png", "is absolute"),
+        ("../scan/images/frame_00001.png", "leaves the scan folder"),
+        ("images/../../scan/images/frame_00001.png", "leaves the scan folder"),
+        ("images\\..\\..\\x.png", "leaves the scan folder"),
+        ("images\\frame_00001.png", "has backslashes"),
+        ("images/a\0b.png", "characters that no file name can have"),
+        ("images/\ud800.png", "characters that no file name can have"),
+        ("images/frame_00000.png/x.png", "cannot be followed"),
+        ("x" * 300, "cannot be followed"),
+    ],
+)
+@pytest.mark.parametrize("key", ["mask_path", "sl_coords_path"])
+def test_paths_that_are_refused(sphere: Path, path: str, problem: str, key: str) -> None:
+    edit(sphere, lambda document: document["frames"][1].update({key: path}))
+    fault = only_fault(sphere)
+    assert (fault.file, fault.frame, fault.field) == ("transforms.json", NAMES[1], key)
+    assert problem in fault.problem
+    assert fault.remedy
+
+
+def test_links(sphere: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside.png"
+    (sphere / IMAGE).rename(outside)
+    (sphere / IMAGE).symlink_to(outside)
+    fault = only_fault(sphere)
+    assert (fault.frame, fault.field) == (NAMES[1], "file_path")
+    assert "is a link out of the scan folder" in fault.problem
+    (sphere / IMAGE).unlink()
+    (sphere / IMAGE).symlink_to(sphere / IMAGE)
+    assert "cannot be followed" in only_fault(sphere).problem
+    (sphere / IMAGE).unlink()
+    outside.rename(sphere / "inside.png")
+    (sphere / IMAGE).symlink_to("../inside.png")
+    assert check_scan(sphere) == []
+    link = tmp_path / "link"
+    link.symlink_to(sphere)
+    assert check_scan(link) == []
+    (sphere / IMAGE).unlink()
+    (sphere / IMAGE).symlink_to("nowhere.png")
+    assert only_fault(sphere).problem == "is missing"
+
+
+@pytest.mark.parametrize("file", ["pattern.png", IMAGE, f"patterns/{NAMES[1]}.png", f"masks/{NAMES[1]}.png"])
+def test_missing_empty_truncated_foreign(sphere: Path, file: str) -> None:
+    content = (sphere / file).read_bytes()
+    frame = None if file == "pattern.png" else NAMES[1]
+    for damaged, problem in (
+        (None, "is missing"),
+        (b"", "is empty (0 bytes)"),
+        (content[: len(content) // 2], "cannot be decoded"),
+        (content[:80], "cannot be decoded"),
+        (content[:20], "is not an image that can be read"),
+        (b"%PDF-1.4 nothing like it", "is not an image that can be read"),
+    ):
+        (sphere / file).unlink()
+        if damaged is not None:
+            (sphere / file).write_bytes(damaged)
+        fault = only_fault(sphere)
+        assert (fault.file, fault.frame) == (file, frame)
+        assert problem in fault.problem, damaged
+        (sphere / file).write_bytes(content)
+    (sphere / file).unlink()
+    (sphere / file).mkdir()
+    assert only_fault(sphere).problem == "is not a file"
+
+
+def test_a_pipe_does_not_hang_the_check(sphere: Path) -> None:
+    (sphere / IMAGE).unlink()
+    os.mkfifo(sphere / IMAGE)
+    assert only_fault(sphere).problem == "is not a file"
+
+
+def save(path: Path, mode: str, size: tuple[int, int] = (CAMERA.w, CAMERA.h), **options: Any) -> None:
+    rows = np.random.default_rng(1).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(rows).convert(mode).save(path, format="PNG", **options)
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind"),
+    [("P", "a colour palette"), ("RGBA", "transparency"), ("LA", "transparency"), ("1", "one bit per pixel")],
+)
+def test_kinds_of_image_that_are_refused(sphere: Path, mode: str, kind: str) -> None:
+    save(sphere / IMAGE, mode)
+    fault = only_fault(sphere)
+    assert fault.problem == f"is of a kind that a scan must not hold ({kind})"
+    assert "grey or RGB" in fault.remedy
+
+
+def test_a_transparent_colour_is_refused_as_transparency_is(sphere: Path) -> None:
+    save(sphere / IMAGE, "L", transparency=3)
+    assert "(transparency)" in only_fault(sphere).problem
+
+
+def test_colour_is_for_images_only(sphere: Path) -> None:
+    with Image.open(sphere / IMAGE) as image:
+        image.convert("RGB").save(sphere / IMAGE)
+    assert check_scan(sphere) == []
+    save(sphere / f"patterns/{NAMES[1]}.png", "RGB")
+    assert only_fault(sphere).problem == "is in colour"
+
+
+@pytest.mark.parametrize(
+    ("size", "cause"), [((60, 72), "swapped"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")]
+)
+@pytest.mark.parametrize("folder", ["images", "patterns", "masks"])
+def test_wrong_size(sphere: Path, size: tuple[int, int], cause: str, folder: str) -> None:
+    Image.new("L", size, 255).save(sphere / folder / f"{NAMES[1]}.png")
+    fault = only_fault(sphere)
+    assert fault.problem == f"is {size[0]} x {size[1]} pixels, but the camera has 72 x 60"
+    assert cause in fault.cause
+
+
+def test_wrong_size_of_the_pattern_and_of_coordinates(sphere: Path) -> None:
+    Image.new("L", (128, 97), 9).save(sphere / "pattern.png")
+    assert only_fault(sphere).problem == "is 128 x 97 pixels, but the projector has 128 x 96"
+    edit(sphere, lambda document: document["projector"].update(h=97))
+    np.savez(sphere / f"coords/{NAMES[0]}.npz", coords=np.zeros((72, 60, 2), np.float32))
+    sizes = {fault.file: fault.problem for fault in check_scan(sphere)}
+    assert sizes[f"coords/{NAMES[0]}.npz"] == "is 60 x 72 pixels, but the camera has 72 x 60"
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_exif_rotation_is_refused(sphere: Path, orientation: int, kind: str) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    image = Image.open(sphere / IMAGE).copy()
+    image.save(sphere / IMAGE, format=kind, exif=exif)
+    fault = only_fault(sphere)
+    assert fault.problem == f"must be rotated before it is shown (EXIF orientation {orientation})"
+
+
+def test_upright_exif_is_fine(sphere: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 1
+    Image.open(sphere / IMAGE).copy().save(sphere / IMAGE, exif=exif)
+    assert check_scan(sphere) == []
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    """A part of a PNG file."""
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def test_exif_rotation_behind_the_pixels_of_a_png(sphere: Path) -> None:
+    content = (sphere / IMAGE).read_bytes()
+    exif = chunk(b"eXIf", b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0")
+    end = content.rindex(b"IEND") - 4
+    (sphere / IMAGE).write_bytes(content[:end] + exif + content[end:])
+    assert "EXIF orientation 6" in only_fault(sphere).problem
+
+
+def png_head(w: int, h: int) -> bytes:
+    head = struct.pack(">IIBBBBB", w, h, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+def test_decompression_bombs_are_not_unpacked(sphere: Path) -> None:
+    (sphere / IMAGE).write_bytes(png_head(60_000, 60_000))
+    fault = only_fault(sphere)
+    assert "is far too large" in fault.problem
+    assert "exhaust memory" in fault.cause
+    (sphere / IMAGE).write_bytes(png_head(9_000, 9_500))  # below Pillow's own limit
+    assert only_fault(sphere).problem == "is 9000 x 9500 pixels, but the camera has 72 x 60"
+
+
+def test_an_animation_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.tiff"
+    Image.new("L", (4, 4)).save(path, save_all=True, append_images=[Image.new("L", (4, 4))])
+    with pytest.raises(FileError, match="holds several images"):
+        read_image(path)
+
+
+def test_formats_beyond_the_list_are_refused(tmp_path: Path) -> None:
+    Image.new("L", (4, 4)).save(tmp_path / "a.png", format="GIF")
+    with pytest.raises(FileError, match="is not an image that can be read"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_pixels_come_back_exactly(tmp_path: Path, suffix: str, dtype: type, channels: tuple[int, ...]) -> None:
+    image = np.random.default_rng(2).integers(0, np.iinfo(dtype).max, (5, 7, *channels), dtype=dtype)
+    path = tmp_path / f"ü{suffix}"
+    path.write_bytes(cv2.imencode(suffix, image[..., ::-1] if channels else image)[1].tobytes())
+    found = read_image(path)
+    assert found.dtype == dtype
+    assert np.array_equal(found, image)
+    header = read_header(path)
+    assert (header.w, header.h, header.mode, header.bits) == (7, 5, "RGB" if channels else "grey", 8 * dtype().itemsize)
+    if suffix == ".png":
+        path.write_bytes(encode_png(image))
+        assert np.array_equal(read_image(path), image)
+
+
+def test_grey_is_a_fraction_of_full_scale() -> None:
+    assert as_grey(np.array([[0, 255]], np.uint8)).tolist() == [[0, 1]]
+    assert as_grey(np.array([[0, 65535]], np.uint16)).tolist() == [[0, 1]]
+    colours = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]], np.uint8)
+    assert np.allclose(as_grey(colours), [[0.299, 0.587, 0.114, 1]])
+
+
+def test_a_png_whose_check_sum_is_wrong(sphere: Path) -> None:
+    """The last bits of the pixels may be changed and still be decoded."""
+    path = sphere / f"patterns/{NAMES[1]}.png"
+    content = bytearray(path.read_bytes())
+    place = content.index(b"IDAT") + 4
+    content[place - 8 + 12 + int.from_bytes(content[place - 8 : place - 4], "big") - 1] ^= 1  # of the sum itself
+    path.write_bytes(bytes(content))
+    fault = only_fault(sphere)
+    assert fault.file == f"patterns/{NAMES[1]}.png" and "the check sum of its part 'IDAT' is wrong" in fault.problem
+
+
 SCENE = cv2.GaussianBlur(np.random.default_rng(0).random((96, 128, 3)).astype(np.float32), (0, 0), 4)
+
+
 SCENE = ((SCENE - SCENE.min()) / np.ptp(SCENE) * 220 + 20).astype(np.uint8)
 
 

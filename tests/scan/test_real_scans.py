@@ -10,7 +10,6 @@ import pytest
 from sphere_scan import edit
 from test_check_conventions import disturbed, undo
 
-from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.check import FolderCheck, check_folder
 from sl_nerfstudio.scan.check_conventions import Interpretation, convention_problems
 
@@ -75,22 +74,3 @@ def test_faults_planted_in_real_captures(tmp_path: Path) -> None:
         ("transforms.json", "frame_00005", "transform_matrix"),
         ("transforms.json", "frame_00007", "file_path"),
     }
-
-
-def test_interpretation_takes_little_memory(tmp_path: Path) -> None:
-    """The check holds one frame at a time: its peak does not grow with the number of frames."""
-    import tracemalloc
-
-    scan = read_scan(folder("elephant"))
-    peaks = []
-    for count in (3, 12):
-        root = tmp_path / str(count)
-        shutil.copytree(scan.root, root)
-        edit(root, lambda document, count=count: document.update(frames=document["frames"][:count]))
-        tracemalloc.start()
-        assert check_folder(root).faults == ()
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    one_frame = 960 * 540 * (8 + 3)
-    assert peaks[1] < peaks[0] + one_frame / 2
-    assert peaks[1] < 12 * one_frame
