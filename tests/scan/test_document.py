@@ -51,7 +51,7 @@ def test_missing_folder_file_for_folder_and_missing_transforms(tmp_path: Path) -
     (tmp_path / "folder" / "transforms.json").mkdir(parents=True)
     assert only_fault(tmp_path / "folder").problem == "is not a file"
     (tmp_path / "a").symlink_to(tmp_path / "a")
-    assert "does not exist" in only_fault(tmp_path / "a").problem
+    assert "is missing" in only_fault(tmp_path / "a").problem  # a link in a circle
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])

@@ -32,6 +32,7 @@ def _usable(root):
     return [frame["usable"] for frame in json.loads((root / "ground_truth/captures.json").read_text())["frames"]]
 
 
+@pytest.mark.slow
 def test_photographs_are_jpegs_in_colour_that_the_truth_shows_too(captures):
     for appearance in ("realistic", "hard"):
         files = sorted((captures / appearance / "images").iterdir())
@@ -44,6 +45,7 @@ def test_photographs_are_jpegs_in_colour_that_the_truth_shows_too(captures):
         assert np.abs(image[..., 0].astype(int) - image[..., 2]).max() > 3, "grey"
 
 
+@pytest.mark.slow
 def test_the_truth_is_that_of_the_plain_scan_except_where_a_frame_looks_away(captures):
     plain = read_scan(captures / "plain/ground_truth")
     assert _usable(captures / "plain") == [True] * 8
@@ -58,6 +60,7 @@ def test_the_truth_is_that_of_the_plain_scan_except_where_a_frame_looks_away(cap
         assert away <= sum(not usable for usable in _usable(captures / appearance))
 
 
+@pytest.mark.slow
 def test_the_pattern_is_where_the_coordinates_say(captures):
     """The pattern, looked up at the coordinates, explains the local contrast of the usable images."""
     pattern = cv2.GaussianBlur(as_grey(read_image(captures / "realistic/pattern.png")), (0, 0), 3.0)
@@ -76,6 +79,7 @@ def test_the_pattern_is_where_the_coordinates_say(captures):
     assert np.median(agreement) > 0.5 and min(agreement) > 0.15
 
 
+@pytest.mark.slow
 def test_same_flags_same_bytes_and_another_seed_another_look(tmp_path, captures):
     config = replace(_CONFIG, appearance="realistic", background="table", frames=8)
     synthesise(config, tmp_path / "again")
