@@ -258,6 +258,7 @@ def _all_end(workers):
     return not any(map(_running, workers))
 
 
+@pytest.mark.slow
 def test_workers_end_when_their_parent_is_killed(busy):
     parent, workers = busy
     parent.kill()
@@ -265,6 +266,7 @@ def test_workers_end_when_their_parent_is_killed(busy):
     assert "Traceback" not in "".join(parent.communicate())  # Python's own tracker may warn of what it released
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "to_all", "status", "said"),
     [(signal.SIGINT, True, 130, "interrupted\n"), (signal.SIGTERM, False, 143, "terminated\n")],
