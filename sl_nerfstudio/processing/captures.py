@@ -69,7 +69,7 @@ class Captures:
         return whole
 
     def with_faults(self, found: dict[str, FileError]) -> "Captures":
-        """With more faults; those of one frame become one."""
+        """Add faults; those of one frame become one."""
         both = {name: [e for e in (self.faults.get(name), found.get(name)) if e] for name in {*self.faults, *found}}
         named = {frame.name: frame for frame in self.frames}
         return replace(self, faults={name: _together(named[name], errors) for name, errors in both.items()})

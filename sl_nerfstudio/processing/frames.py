@@ -153,7 +153,7 @@ class FrameWorker:
         return self.load_with_seen(result)[0]
 
     def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
-        """The same, and where the camera saw the pattern, whatever the user's mask selects."""
+        """Load the maps of a frame, and where the camera saw the pattern, whatever the user's mask selects."""
         stored = self._stored(result, result.matched or result.key)
         return self._selected(result.name, stored), stored.mask
 
@@ -324,7 +324,7 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
 def run_frame_stage_again(
     config: ProcessConfig, job: FrameJob, captures: Captures, before: Sequence[FrameStageResult]
 ) -> list[FrameStageResult]:
-    """The same with another job, for frames that this run has decoded."""
+    """Run the frame stage with another job, on frames that this run has decoded."""
     resumed = {result.name: result.resumed for result in before}
     return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
 

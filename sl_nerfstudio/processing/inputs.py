@@ -107,7 +107,7 @@ class CameraNotes:
     found: CameraEstimate
 
     def sentence(self) -> str:
-        """For the output and the report."""
+        """Describe the camera for the output and the report."""
         camera, (x, y) = self.found.camera, self.found.sigma_centre_px
         return (
             f"camera: focal length {self.start.camera.fl_x:.0f} px ± {100 * self.start.sigma:.0f} % from EXIF "
@@ -117,7 +117,7 @@ class CameraNotes:
         )
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         start, camera = self.start, self.found.camera
         return {
             "source": start.source,
@@ -235,11 +235,11 @@ class CaptureNotes:
     camera: dict[str, Any] | None = None  # figures of a camera that no file describes
 
     def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
-        """With what is known of a camera that no file describes."""
+        """Add what is known of a camera that no file describes."""
         return replace(self, sentences=(*self.sentences, sentence), camera=figures)
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         video = None if self.video is None else self.video.document()
         names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
         return {**names, "video": video, "camera_focal": self.camera}

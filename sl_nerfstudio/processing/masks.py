@@ -126,7 +126,7 @@ class UserMasks:
 
     @property
     def digest(self) -> str:
-        """Of all masks together."""
+        """Digest of all masks together."""
         lines = "\n".join(f"{name} {digest}" for name, digest in sorted(self.digests.items()))
         return hashlib.sha256(lines.encode()).hexdigest()[:24]
 

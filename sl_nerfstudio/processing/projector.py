@@ -229,7 +229,7 @@ class FoundProjector:
         return dict(zip(FIELDS, self.sigma, strict=True))
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         device = self.projector
         return {
             "method": self.method,
@@ -358,7 +358,7 @@ def refine_projector(
 
 
 def _chi_square(calibration: SelfCalibration) -> float:
-    """Of the change of the projector alone that would agree best: about three if nothing is wrong."""
+    """Chi square of the best change of the projector alone: about three if nothing is wrong."""
     step, uncertainty = calibration.of_projector()
     return float(step @ torch.linalg.solve(uncertainty, step))
 
@@ -366,7 +366,7 @@ def _chi_square(calibration: SelfCalibration) -> float:
 def _covariance(
     calibration: SelfCalibration, camera_sigma: Shares, settings: RegisteredFramesSettings
 ) -> Float[Tensor, "3 3"]:
-    """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
+    """Covariance of the projector, by correlated errors of neighbouring pixels and by an uncertain camera."""
     return settings.dependence**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
 
 

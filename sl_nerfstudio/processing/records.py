@@ -134,7 +134,7 @@ def decode(content: bytes, classes: Sequence[type]) -> Any:
 
 
 def with_arrays(value: T, classes: Sequence[type], change: Callable[[Sequence[ndarray]], Sequence[ndarray]]) -> T:
-    """The same value with other arrays in place of its own; `classes` as for `decode`."""
+    """Copy a value with other arrays in place of its own; `classes` as for `decode`."""
     arrays: list[ndarray] = []
     tree = _flat(value, arrays)
     return _built(tree, change(arrays), {kind.__name__: kind for kind in classes})

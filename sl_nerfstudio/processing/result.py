@@ -192,7 +192,7 @@ class ProcessResult:
         return sum(frame.in_scan for frame in self.frames)
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the content of processing.json."""
         return {
             "verdict": self.verdict.band,
             "reasons": list(self.verdict.reasons),
@@ -424,7 +424,7 @@ def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:
-    """None where no point of one frame was seen by another: then there is nothing to compare."""
+    """Both values; None where no point of one frame was seen by another: then there is nothing to compare."""
     return (float(before), float(after)) if np.isfinite([before, after]).all() else None
 
 

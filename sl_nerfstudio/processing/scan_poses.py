@@ -98,7 +98,7 @@ class PlacedGroup:
     frames: tuple[PlacedFrame, ...]
 
     def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
-        """Without the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
+        """Leave out the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
         return replace(
             self, frames=tuple(_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
         )

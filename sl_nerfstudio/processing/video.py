@@ -147,7 +147,7 @@ class VideoChoice:
     chosen: tuple[ChosenFrame, ...]
 
     def sentences(self) -> list[str]:
-        """For the output and the report."""
+        """Describe the choice for the output and the report."""
         numbers = ", ".join(str(frame.number) for frame in self.chosen)
         return [
             f"{self.file}: {len(self.chosen)} of {self.frames_in_video} frames were chosen: numbers {numbers}",
@@ -156,7 +156,7 @@ class VideoChoice:
         ]
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the record as JSON."""
         return asdict(self)
 
 
@@ -274,7 +274,7 @@ def _decoded(path: Path, kind: str) -> Iterator[tuple[int, float, UInt8[ndarray,
 
 
 def _digest(path: Path) -> str:
-    """Of the file and of how frames are chosen."""
+    """Digest of the file and of how frames are chosen."""
     found = hashlib.sha256(f"{_VERSION} {_STEP} {_MOST} {SHARP} {_RELATIVE}".encode())
     with path.open("rb") as stream:
         while part := stream.read(1 << 20):

@@ -240,7 +240,7 @@ class Ambiguity:
 
     @staticmethod
     def of(pattern: Float32[ndarray, "h w"]) -> "Ambiguity":
-        """From the autocorrelation of the whole pattern."""
+        """Find the displacements from the autocorrelation of the whole pattern."""
         h, w = pattern.shape
         alike = _autocorrelation(pattern)
         y, x = np.mgrid[: alike.shape[0], : alike.shape[1]]
@@ -266,7 +266,7 @@ class Ambiguity:
 
 
 def _autocorrelation(pattern: Float32[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
-    """Of displacements up to half the pattern's size, the one of zero in the middle (h // 2, w // 2)."""
+    """Autocorrelation at displacements up to half the pattern's size; zero displacement is at (h // 2, w // 2)."""
     h, w = pattern.shape
     one = np.fft.rfft2(np.ones_like(pattern), (2 * h, 2 * w))
     centred = np.fft.rfft2(pattern - pattern.mean(), (2 * h, 2 * w))

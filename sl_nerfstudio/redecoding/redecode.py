@@ -205,7 +205,7 @@ def _redecode(
     pitch_px: float,
     facts: RedecodedFacts,
 ) -> tuple[Float32[ndarray, "h w 2"], RedecodedFacts]:
-    """The same for a view of which some decoded pixels are usable; `facts` has the numbers before."""
+    """Decode a view again of which some decoded pixels are usable; `facts` has the numbers before."""
     pitch, old = ambiguity.pitch, np.isfinite(decoded).all(-1)
     checked = view.usable & old & _thinned(view.usable & old)
     # A decoded pixel that is as predicted stays as it is: it is measured only to learn from it.

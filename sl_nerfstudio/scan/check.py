@@ -459,7 +459,7 @@ def check_folder(root: Path) -> FolderCheck:
 def _contents(
     frames: Sequence[PartialFrame], partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> Iterator[FrameContent]:
-    """In threads; the faults come in the order of the frames, whichever was done first."""
+    """Check frames in threads; the faults come in the order of the frames, whichever was done first."""
     together = threads()
     for first in range(0, len(frames), together):
         group = frames[first : first + together]

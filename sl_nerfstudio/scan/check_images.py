@@ -116,7 +116,7 @@ class ImagePrediction:
     def correlation(
         self, shown: Float32[ndarray, "h w"], allowed: Bool[ndarray, "h w"], x: int = 0, y: int = 0
     ) -> float:
-        """With an image, moved by (x, y) pixels, where `allowed` is True; 0 where too little is left."""
+        """Correlation with an image, moved by (x, y) pixels, where `allowed` is True; 0 where too little is left."""
         rows, columns = self.rows + y, self.columns + x
         inside = (rows >= 0) & (rows < shown.shape[0]) & (columns >= 0) & (columns < shown.shape[1])
         inside[inside] = allowed[rows[inside], columns[inside]]
@@ -127,7 +127,7 @@ class ImagePrediction:
         return float(np.nan_to_num(found))
 
     def thinned(self, count: int) -> "ImagePrediction":
-        """At about `count` of the pixels, without the memory of the others."""
+        """Copy about `count` of the pixels, without the memory of the others."""
         step = max(1, len(self.rows) // count)
         return ImagePrediction(self.rows[::step].copy(), self.columns[::step].copy(), self.values[::step].copy())
 
@@ -262,7 +262,7 @@ def _is_shifted(match: ImageMatch, usual: float) -> bool:
 def _fitting_others(
     strange: dict[str, ImageMatch], names: Sequence[str], read_shown: Callable[[str], Shown | None]
 ) -> dict[str, tuple[str, float]]:
-    """For each frame, another one whose image its coordinates fit, with the correlation; each image is read once."""
+    """Find for each frame another one whose image its coordinates fit, with the correlation; read each image once."""
     found: dict[str, tuple[str, float]] = {}
     for other in names if strange else ():
         shown = read_shown(other)

@@ -404,7 +404,7 @@ def _last_number(name: str) -> int | None:
 
 
 def _read_bar(section: Fields) -> ScaleBar | None:
-    """None where the scan has no scale bar, or after adding a fault."""
+    """Read the scale bar; None where the scan has none, or after adding a fault."""
     ends, length = section.record.get("distance_between"), section.record.get("length")
     if ends is None and length is None:
         return None

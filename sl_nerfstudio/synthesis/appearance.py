@@ -384,7 +384,7 @@ def make_pattern(
 
 
 def make_lamp(distance: float, rng: np.random.Generator) -> Lamp:
-    """White, warm, cold or tinted."""
+    """Draw a lamp: white, warm, cold or tinted."""
     return Lamp(tint(rng.choice([0.08, 0.3]), rng), rng.uniform(0.02, 0.08), rng.uniform(0.2, 0.5), distance)
 
 

@@ -376,7 +376,7 @@ def _height(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
 
 
 def _half_width(y: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """Of the outline: widest behind the middle, with a drawn-out tip and coarse teeth."""
+    """Half width of the outline: widest behind the middle, with a drawn-out tip and coarse teeth."""
     t = np.clip((y + _LENGTH / 2) / _LENGTH, 0.0, 1.0)
     smooth = 42.0 * np.sqrt(np.clip(np.sin(np.pi * t**0.8), 0, None)) * (1.12 - 0.55 * t)
     return smooth * (1 + 0.05 * np.sin(2 * np.pi * 9 * t))

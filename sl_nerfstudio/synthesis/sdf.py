@@ -228,6 +228,6 @@ def _onto_level(
 
 
 def _gradient(field: Field, p: Float[ndarray, "n 3"], h: float) -> Float[ndarray, "n 3"]:
-    """From the values at the corners of a tetrahedron."""
+    """Gradient from the values at the corners of a tetrahedron."""
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
     return sum((field(p + h * e)[:, None] * e for e in corners), np.zeros_like(p)) / (4 * h)

@@ -176,7 +176,7 @@ def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], Pattern
 
 
 def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarray, "h w"]) -> Photography | None:
-    """None for plain images. A scan must have coordinates in every frame, so only captures have useless ones."""
+    """Look and shots; None for plain images. Scans need coordinates in every frame: only captures have useless ones."""
     if config.appearance == "plain":
         return None
     ranges, distance = RANGES[config.appearance], DISTANCE * scene.size
