@@ -129,7 +129,8 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     straight = directions[..., :2] / -directions[..., 2:]
     bent = (uv - uv.new_tensor([device.cx, device.cy])) / uv.new_tensor([device.fl_x, device.fl_y])
     stretch = (bent.norm(dim=-1) / straight.norm(dim=-1)).nan_to_num(1.0)
-    extreme = [value for value in (float(stretch.min()), float(stretch.max())) if not _plausible(value)]
+    ends = float(stretch.min()), float(stretch.max())
+    extreme = [value for value in ends if not _LEAST_STRETCH <= value <= _MOST_STRETCH]
     if extreme:
         yield (
             "k1",
@@ -139,10 +140,6 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
                 "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
             ),
         )
-
-
-def _plausible(stretch: float) -> bool:
-    return _LEAST_STRETCH <= stretch <= _MOST_STRETCH
 
 
 # The scan.
@@ -471,18 +468,14 @@ def _surface_point(scan: Scan, end: PickedPixel, poses: DevicePoses) -> Float64[
     depth = points.depth_camera.numpy()
     depth = depth[np.isfinite(depth)]
     if not len(depth):
-        raise ScanError([_nothing_near(end)], str(scan.root))
+        nothing = Fault(
+            TRANSFORMS,
+            end.frame,
+            "scale.distance_between",
+            f"has no decoded coordinates within {NEAR_PX:g} pixels of ({end.pixel[0]:g}, {end.pixel[1]:g})",
+            "the pattern was not decoded there",
+            "pick a pixel on the object where coordinates were decoded",
+        )
+        raise ScanError([nothing], str(scan.root))
     origin, direction = pixel_rays(camera, T_camera, torch.tensor([end.pixel], dtype=torch.float64))
     return (origin + float(np.median(depth)) * direction)[0].numpy()
-
-
-def _nothing_near(end: PickedPixel) -> Fault:
-    x, y = end.pixel
-    return Fault(
-        TRANSFORMS,
-        end.frame,
-        "scale.distance_between",
-        f"has no decoded coordinates within {NEAR_PX:g} pixels of ({x:g}, {y:g})",
-        "the pattern was not decoded there",
-        "pick a pixel on the object where coordinates were decoded",
-    )

@@ -198,6 +198,8 @@ def _matches(frame: FrameGeometry) -> ExactMatches:
     return ExactMatches(uv[seen.lit], seen.uv_projector[seen.lit], seen.p_world[seen.lit])
 
 
+# Frames, rendered a few at a time, and the folders that hold them.
+
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
 GAIN = 1.05  # exposure: a surface of mean albedo that faces the lamp in full light has 0.82 of full scale
 _WINDOW = 0.8  # of local normalisation, in periods of the pattern
@@ -308,7 +310,10 @@ def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
 def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolder) -> ScanWriter:
     extra: dict[str, Any] = {}
     if config.pose_sigma and setup.sigma is not None:
-        extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
+        factor = MILLIMETRES[config.units]
+        extra["sl_pose_sigma"] = {
+            key: value * (factor if "translation" in key else 1) for key, value in sigma_fields(setup.sigma).items()
+        }
     scale = Scale(True, "baseline of frame 0", _frame_name(0)) if config.scale_known else Scale(False)
     return ScanWriter(
         root,
@@ -319,14 +324,6 @@ def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolde
         camera=setup.devices.camera,
         extra=extra,
         within=folder,
-    )
-
-
-def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
-    return replace(
-        sigma,
-        camera_translation=sigma.camera_translation * factor,
-        relative_translation=sigma.relative_translation * factor,
     )
 
 

@@ -134,8 +134,6 @@ def test_distances_to_other_clouds_are_exact(seed: int, count: int) -> None:
             assert others.distance(cloud, index) == pytest.approx(expected)
 
 
-
-
 def gradient() -> np.ndarray:
     y, x = np.mgrid[: CAMERA.h, : CAMERA.w]
     return np.stack([x, y, x + y], -1).astype(np.uint8)
