@@ -201,7 +201,7 @@ class SLModel(Model):
         if c.renders_poses:
             rig = constrained(c.refine_poses, rig)
         self.device_poses.rebase(rig.T_world_camera, rig.T_world_projector)
-        said.append(departed_message(departed_frames(self.scan, self.poses())))
+        said.append(departed_message(departed_frames(self.scan, self.poses(), c.prior.frame_rotation_deg)))
         return "\n".join(filter(None, said))
 
     def measure_noise(self, samples: Any) -> None:

@@ -20,6 +20,7 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
 from sl_nerfstudio.bundle_adjustment.parameters import (
     INTRINSICS_SIGMA,
     UNKNOWNS,
+    USUAL_FRAME_ROTATION_DEG,
     PosePrior,
     RefinePoses,
     SelfCalibration,
@@ -46,7 +47,7 @@ _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly;
 class PriorConfig:
     """1 sigma of intrinsics, and of starting poses if the scan does not state it in `sl_pose_sigma`."""
 
-    frame_rotation_deg: float = 2.0
+    frame_rotation_deg: float = USUAL_FRAME_ROTATION_DEG
     """Orientation of a frame in the world, in degrees."""
     frame_translation: float = 0.1
     """Position of a frame's part of the surface, as a share of the object's radius."""
