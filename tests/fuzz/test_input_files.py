@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.processing.inputs import read_given_poses
 from tests.fuzz.damage import IMPOSSIBLE, damaged, places, removed, replaced
 
@@ -32,7 +30,7 @@ SPHERE = Mesh(
 few = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
 
-def storage(path: Path) -> bytes:
+def storage(path):
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for key, value in (
         ("image_width", 640),
@@ -51,30 +49,30 @@ POINTS = np.random.default_rng(0).normal(size=(100, 3))
 FRAMES = [{"file_path": f"a/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in "abc"]
 
 
-def mesh(path: Path) -> bytes:
+def mesh(path):
     write_mesh(path, SPHERE)
     return path.read_bytes()
 
 
-def points(path: Path) -> bytes:
+def points(path):
     np.savez_compressed(path, xyz=POINTS)
     return path.read_bytes()
 
 
-def device(path: Path) -> bool:
+def device(path):
     """The numbers are those of a possible camera."""
     d = read_device_file(path, "camera", SIZE)
     possible = 64 <= d.fl_x <= 64000 and 64 <= d.fl_y <= 64000 and bool(np.isfinite([d.cx, d.k1]).all())
     return (d.w, d.h) == SIZE and possible
 
 
-def grid(path: Path) -> bool:
+def grid(path):
     """Any change of a symbol is found; only lengths may be other possible ones."""
     read = read_layout(path)
     return isinstance(read, GridPattern) and np.array_equal(read.codes, np.asarray(LAYOUTS[0].codes))
 
 
-def surface(path: Path) -> bool:
+def surface(path):
     found = read_mesh(path)
     inside = len(found.faces) and found.faces.min() >= 0 and found.faces.max() < len(found.vertices)
     return bool(inside) and bool(np.isfinite(found.vertices).all())
@@ -92,7 +90,7 @@ FILES: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], bool]]] = {
 }
 
 
-def accepted(path: Path, read: Callable[[Path], bool]) -> bool:
+def accepted(path, read):
     """Whether a file is read, and then holds what it may; else it is refused by its name."""
     try:
         assert read(path)
@@ -105,7 +103,7 @@ def accepted(path: Path, read: Callable[[Path], bool]) -> bool:
 @pytest.mark.parametrize("name", FILES)
 @few
 @given(data=st.data())
-def test_damaged_files(tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject) -> None:
+def test_damaged_files(tmp_path_factory, name, data):
     path, (write, read) = tmp_path_factory.getbasetemp() / name, FILES[name]
     path.write_bytes(data.draw(damaged(write(path))))
     accepted(path, read)
@@ -113,7 +111,7 @@ def test_damaged_files(tmp_path_factory: pytest.TempPathFactory, name: str, data
 
 @few
 @given(data=st.data())
-def test_impossible_intrinsics(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_impossible_intrinsics(tmp_path_factory, data):
     document = {"camera": CAMERA}
     place = data.draw(st.sampled_from([p for p in places(document) if p[-1] not in ("k1", "k2")]))
     value = data.draw(st.sampled_from([v for v in IMPOSSIBLE if v != -1]))
@@ -122,7 +120,7 @@ def test_impossible_intrinsics(tmp_path_factory: pytest.TempPathFactory, data: s
     assert not accepted(path, device), f"{place} = {value!r:.60} was accepted"
 
 
-def changed(document: dict[str, Any], data: st.DataObject, free: tuple[str, ...] = ()) -> str:
+def changed(document, data, free=()):
     """The document with an impossible value at some place, or without it; keys in `free` are for people."""
     place = data.draw(st.sampled_from([p for p in places(document) if p[0] not in free]))
     value = data.draw(st.sampled_from(["gone", *IMPOSSIBLE]))
@@ -132,9 +130,7 @@ def changed(document: dict[str, Any], data: st.DataObject, free: tuple[str, ...]
 @pytest.mark.parametrize("layout", LAYOUTS, ids=["grid", "gray"])
 @few
 @given(data=st.data())
-def test_impossible_patterns(
-    tmp_path_factory: pytest.TempPathFactory, layout: PatternLayout, data: st.DataObject
-) -> None:
+def test_impossible_patterns(tmp_path_factory, layout, data):
     path = tmp_path_factory.getbasetemp() / "impossible_pattern.json"
     path.write_text(changed(json.loads(layout.encode()), data, ("image", "symbols", "window")))
     accepted(path, lambda path: read_layout(path).encode() == layout.encode())
@@ -142,7 +138,7 @@ def test_impossible_patterns(
 
 @few
 @given(data=st.data())
-def test_impossible_poses(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_impossible_poses(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "poses.json"
     path.write_text(changed({"units": "mm", "frames": FRAMES}, data))
     accepted(path, lambda path: bool(read_given_poses(path, ["a", "b", "c"]).known.sum() >= 2))

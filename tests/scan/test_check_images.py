@@ -1,14 +1,11 @@
 """Coordinates that are not those of their image are named; pictures without the pattern."""
 
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 from sphere_scan import (
     CAMERA,
@@ -36,7 +33,7 @@ NAME = NAMES[1]
 PATTERN = pattern_image().astype(np.float32) / 255
 
 
-def noise(coords: ndarray) -> ndarray:
+def noise(coords):
     values = np.random.default_rng(0).uniform(0, 90, coords.shape)
     return np.where(np.isfinite(coords), values, np.nan).astype(np.float32)
 
@@ -50,14 +47,14 @@ def noise(coords: ndarray) -> ndarray:
         (noise, "is noise"),
     ],
 )
-def test_coordinates_of_another_place_are_named(sphere: Path, change: Callable[[ndarray], ndarray], words: str) -> None:
+def test_coordinates_of_another_place_are_named(sphere, change, words):
     edit_coords(sphere, NAME, change)
     fault = only_fault(sphere)
     assert fault.frame == NAME and words in fault.problem
 
 
 @pytest.mark.parametrize("without_pattern_images", [False, True])
-def test_coordinates_of_another_frame_are_named_with_that_frame(sphere: Path, without_pattern_images: bool) -> None:
+def test_coordinates_of_another_frame_are_named_with_that_frame(sphere, without_pattern_images):
     if without_pattern_images:
         edit(sphere, lambda document: [frame.pop("sl_pattern_path") for frame in document["frames"]])
     shutil.copy(sphere / "coords" / f"{NAMES[2]}.npz", sphere / "coords" / f"{NAME}.npz")
@@ -66,13 +63,13 @@ def test_coordinates_of_another_frame_are_named_with_that_frame(sphere: Path, wi
     assert f"fits the image of frame {NAMES[2]} instead" in fault.problem
 
 
-def test_an_image_of_another_frame_is_named(sphere: Path) -> None:
+def test_an_image_of_another_frame_is_named(sphere):
     shutil.copy(sphere / "images" / f"{NAMES[3]}.png", sphere / "images" / f"{NAME}.png")
     fault = only_fault(sphere)
     assert fault.frame == NAME and "does not fit the image" in fault.problem
 
 
-def test_two_frames_whose_coordinates_were_exchanged(tmp_path: Path) -> None:
+def test_two_frames_whose_coordinates_were_exchanged(tmp_path):
     root = write_sphere(tmp_path / "scan", frames=2)
     one, two = (root / "coords" / f"{name}.npz" for name in NAMES[:2])
     content = one.read_bytes()
@@ -84,14 +81,14 @@ def test_two_frames_whose_coordinates_were_exchanged(tmp_path: Path) -> None:
 fields = st.integers(0, 2**31 - 1)
 
 
-def smooth_coords(seed: int) -> ndarray:
+def smooth_coords(seed):
     """Smooth coordinates over the whole pattern, (60, 80, 2)."""
     field = gaussian_filter(np.random.default_rng(seed).normal(size=(60, 80, 2)), (9, 9, 0))
     size = (PATTERN.shape[1], PATTERN.shape[0])
     return ((field - field.min((0, 1))) / np.ptp(field, (0, 1)) * size).astype(np.float32)
 
 
-def shown_at(coords: ndarray) -> ndarray:
+def shown_at(coords):
     """The pattern at the coordinates, by nearest neighbour."""
     x, y = np.clip(coords.astype(int), 0, (PATTERN.shape[1] - 1, PATTERN.shape[0] - 1)).transpose(2, 0, 1)
     return PATTERN[y, x]
@@ -99,7 +96,7 @@ def shown_at(coords: ndarray) -> ndarray:
 
 @settings(max_examples=25)
 @given(fields, st.integers(-20, 20), st.integers(-20, 20))
-def test_any_move_is_measured(seed: int, x: int, y: int) -> None:
+def test_any_move_is_measured(seed, x, y):
     coords = smooth_coords(seed)
     everywhere = np.ones(coords.shape[:2], dtype=bool)
     moved = np.roll(coords, (-y, -x), (0, 1))
@@ -110,7 +107,7 @@ def test_any_move_is_measured(seed: int, x: int, y: int) -> None:
 
 @settings(max_examples=25)
 @given(fields, st.floats(0, 0.5))
-def test_right_coordinates_need_no_move(seed: int, missing: float) -> None:
+def test_right_coordinates_need_no_move(seed, missing):
     coords = smooth_coords(seed)
     where = np.random.default_rng(seed).random(coords.shape[:2]) >= missing
     match = match_image(coords, where, PATTERN, 0.3 + 0.2 * shown_at(coords), np.ones(where.shape, dtype=bool))
@@ -120,7 +117,7 @@ def test_right_coordinates_need_no_move(seed: int, missing: float) -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**31 - 1), st.integers(2, 9))
-def test_distances_to_other_clouds_are_exact(seed: int, count: int) -> None:
+def test_distances_to_other_clouds_are_exact(seed, count):
     """Against a search through all points."""
     rng = np.random.default_rng(seed)
     clouds = [rng.normal(size=(int(rng.integers(0, 30)), 3)) for _ in range(count)]
@@ -134,12 +131,12 @@ def test_distances_to_other_clouds_are_exact(seed: int, count: int) -> None:
             assert others.distance(cloud, index) == pytest.approx(expected)
 
 
-def gradient() -> np.ndarray:
+def gradient():
     y, x = np.mgrid[: CAMERA.h, : CAMERA.w]
     return np.stack([x, y, x + y], -1).astype(np.uint8)
 
 
-def put(root: Path, picture: np.ndarray, path: str = "color/one.png") -> None:
+def put(root, picture, path="color/one.png"):
     (root / path).parent.mkdir(exist_ok=True)
     (root / path).write_bytes(encode_png(picture))
     edit(root, lambda document: document["frames"][1].update(sl_color_path=path))

@@ -4,8 +4,6 @@ import os
 import struct
 import sys
 import zlib
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -48,7 +46,7 @@ IMAGE = f"images/{NAMES[1]}.png"
     ],
 )
 @pytest.mark.parametrize("key", ["mask_path", "sl_coords_path"])
-def test_paths_that_are_refused(sphere: Path, path: str, problem: str, key: str) -> None:
+def test_paths_that_are_refused(sphere, path, problem, key):
     edit(sphere, lambda document: document["frames"][1].update({key: path}))
     fault = only_fault(sphere)
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", NAMES[1], key)
@@ -56,7 +54,7 @@ def test_paths_that_are_refused(sphere: Path, path: str, problem: str, key: str)
     assert fault.remedy
 
 
-def test_links(sphere: Path, tmp_path: Path) -> None:
+def test_links(sphere, tmp_path):
     outside = tmp_path / "outside.png"
     (sphere / IMAGE).rename(outside)
     (sphere / IMAGE).symlink_to(outside)
@@ -79,7 +77,7 @@ def test_links(sphere: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["pattern.png", IMAGE, f"patterns/{NAMES[1]}.png", f"masks/{NAMES[1]}.png"])
-def test_missing_empty_truncated_foreign(sphere: Path, file: str) -> None:
+def test_missing_empty_truncated_foreign(sphere, file):
     content = (sphere / file).read_bytes()
     frame = None if file == "pattern.png" else NAMES[1]
     for damaged, problem in (
@@ -102,13 +100,13 @@ def test_missing_empty_truncated_foreign(sphere: Path, file: str) -> None:
     assert only_fault(sphere).problem == "is not a file"
 
 
-def test_a_pipe_does_not_hang_the_check(sphere: Path) -> None:
+def test_a_pipe_does_not_hang_the_check(sphere):
     (sphere / IMAGE).unlink()
     os.mkfifo(sphere / IMAGE)
     assert only_fault(sphere).problem == "is not a file"
 
 
-def save(path: Path, mode: str, size: tuple[int, int] = (CAMERA.w, CAMERA.h), **options: Any) -> None:
+def save(path, mode, size=(CAMERA.w, CAMERA.h), **options):
     rows = np.random.default_rng(1).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     Image.fromarray(rows).convert(mode).save(path, format="PNG", **options)
 
@@ -117,19 +115,19 @@ def save(path: Path, mode: str, size: tuple[int, int] = (CAMERA.w, CAMERA.h), **
     ("mode", "kind"),
     [("P", "a colour palette"), ("RGBA", "transparency"), ("LA", "transparency"), ("1", "one bit per pixel")],
 )
-def test_kinds_of_image_that_are_refused(sphere: Path, mode: str, kind: str) -> None:
+def test_kinds_of_image_that_are_refused(sphere, mode, kind):
     save(sphere / IMAGE, mode)
     fault = only_fault(sphere)
     assert fault.problem == f"is of a kind that a scan must not hold ({kind})"
     assert "grey or RGB" in fault.remedy
 
 
-def test_a_transparent_colour_is_refused_as_transparency_is(sphere: Path) -> None:
+def test_a_transparent_colour_is_refused_as_transparency_is(sphere):
     save(sphere / IMAGE, "L", transparency=3)
     assert "(transparency)" in only_fault(sphere).problem
 
 
-def test_colour_is_for_images_only(sphere: Path) -> None:
+def test_colour_is_for_images_only(sphere):
     with Image.open(sphere / IMAGE) as image:
         image.convert("RGB").save(sphere / IMAGE)
     assert check_scan(sphere) == []
@@ -141,14 +139,14 @@ def test_colour_is_for_images_only(sphere: Path) -> None:
     ("size", "cause"), [((60, 72), "swapped"), ((36, 30), "resized"), ((72, 59), "cropped"), ((144, 120), "resized")]
 )
 @pytest.mark.parametrize("folder", ["images", "patterns", "masks"])
-def test_wrong_size(sphere: Path, size: tuple[int, int], cause: str, folder: str) -> None:
+def test_wrong_size(sphere, size, cause, folder):
     Image.new("L", size, 255).save(sphere / folder / f"{NAMES[1]}.png")
     fault = only_fault(sphere)
     assert fault.problem == f"is {size[0]} x {size[1]} pixels, but the camera has 72 x 60"
     assert cause in fault.cause
 
 
-def test_wrong_size_of_the_pattern_and_of_coordinates(sphere: Path) -> None:
+def test_wrong_size_of_the_pattern_and_of_coordinates(sphere):
     Image.new("L", (128, 97), 9).save(sphere / "pattern.png")
     assert only_fault(sphere).problem == "is 128 x 97 pixels, but the projector has 128 x 96"
     edit(sphere, lambda document: document["projector"].update(h=97))
@@ -159,7 +157,7 @@ def test_wrong_size_of_the_pattern_and_of_coordinates(sphere: Path) -> None:
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
-def test_exif_rotation_is_refused(sphere: Path, orientation: int, kind: str) -> None:
+def test_exif_rotation_is_refused(sphere, orientation, kind):
     exif = Image.Exif()
     exif[0x0112] = orientation
     image = Image.open(sphere / IMAGE).copy()
@@ -168,19 +166,19 @@ def test_exif_rotation_is_refused(sphere: Path, orientation: int, kind: str) -> 
     assert fault.problem == f"must be rotated before it is shown (EXIF orientation {orientation})"
 
 
-def test_upright_exif_is_fine(sphere: Path) -> None:
+def test_upright_exif_is_fine(sphere):
     exif = Image.Exif()
     exif[0x0112] = 1
     Image.open(sphere / IMAGE).copy().save(sphere / IMAGE, exif=exif)
     assert check_scan(sphere) == []
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
+def chunk(kind, data):
     """A part of a PNG file."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def test_exif_rotation_behind_the_pixels_of_a_png(sphere: Path) -> None:
+def test_exif_rotation_behind_the_pixels_of_a_png(sphere):
     content = (sphere / IMAGE).read_bytes()
     exif = chunk(b"eXIf", b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0")
     end = content.rindex(b"IEND") - 4
@@ -188,12 +186,12 @@ def test_exif_rotation_behind_the_pixels_of_a_png(sphere: Path) -> None:
     assert "EXIF orientation 6" in only_fault(sphere).problem
 
 
-def png_head(w: int, h: int) -> bytes:
+def png_head(w, h):
     head = struct.pack(">IIBBBBB", w, h, 8, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
 
 
-def test_decompression_bombs_are_not_unpacked(sphere: Path) -> None:
+def test_decompression_bombs_are_not_unpacked(sphere):
     (sphere / IMAGE).write_bytes(png_head(60_000, 60_000))
     fault = only_fault(sphere)
     assert "is far too large" in fault.problem
@@ -202,14 +200,14 @@ def test_decompression_bombs_are_not_unpacked(sphere: Path) -> None:
     assert only_fault(sphere).problem == "is 9000 x 9500 pixels, but the camera has 72 x 60"
 
 
-def test_an_animation_is_refused(tmp_path: Path) -> None:
+def test_an_animation_is_refused(tmp_path):
     path = tmp_path / "a.tiff"
     Image.new("L", (4, 4)).save(path, save_all=True, append_images=[Image.new("L", (4, 4))])
     with pytest.raises(FileError, match="holds several images"):
         read_image(path)
 
 
-def test_formats_beyond_the_list_are_refused(tmp_path: Path) -> None:
+def test_formats_beyond_the_list_are_refused(tmp_path):
     Image.new("L", (4, 4)).save(tmp_path / "a.png", format="GIF")
     with pytest.raises(FileError, match="is not an image that can be read"):
         read_image(tmp_path / "a.png")
@@ -218,7 +216,7 @@ def test_formats_beyond_the_list_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [(), (3,)])
-def test_pixels_come_back_exactly(tmp_path: Path, suffix: str, dtype: type, channels: tuple[int, ...]) -> None:
+def test_pixels_come_back_exactly(tmp_path, suffix, dtype, channels):
     image = np.random.default_rng(2).integers(0, np.iinfo(dtype).max, (5, 7, *channels), dtype=dtype)
     path = tmp_path / f"ü{suffix}"
     path.write_bytes(cv2.imencode(suffix, image[..., ::-1] if channels else image)[1].tobytes())
@@ -232,14 +230,14 @@ def test_pixels_come_back_exactly(tmp_path: Path, suffix: str, dtype: type, chan
         assert np.array_equal(read_image(path), image)
 
 
-def test_grey_is_a_fraction_of_full_scale() -> None:
+def test_grey_is_a_fraction_of_full_scale():
     assert as_grey(np.array([[0, 255]], np.uint8)).tolist() == [[0, 1]]
     assert as_grey(np.array([[0, 65535]], np.uint16)).tolist() == [[0, 1]]
     colours = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]], np.uint8)
     assert np.allclose(as_grey(colours), [[0.299, 0.587, 0.114, 1]])
 
 
-def test_a_png_whose_check_sum_is_wrong(sphere: Path) -> None:
+def test_a_png_whose_check_sum_is_wrong(sphere):
     """The last bits of the pixels may be changed and still be decoded."""
     path = sphere / f"patterns/{NAMES[1]}.png"
     content = bytearray(path.read_bytes())

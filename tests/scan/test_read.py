@@ -1,15 +1,12 @@
 """Poses, intrinsics, paths and keys, one by one; how poses fit together is in test_check_conventions.py."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, look_up, only_fault, pattern_image, write_sphere
@@ -23,23 +20,21 @@ from sl_nerfstudio.scan.read import pose_problem
 from sl_nerfstudio.scan.types import device_problems
 
 
-def change_pose(
-    root: Path, change: Callable[[ndarray], ndarray], key: str = "transform_matrix", frame: int = 1
-) -> None:
-    def apply(document: dict[str, Any]) -> None:
+def change_pose(root, change, key="transform_matrix", frame=1):
+    def apply(document):
         record = document["frames"][frame]
         record[key] = change(np.array(record[key])).tolist()
 
     edit(root, apply)
 
 
-def sheared(T: ndarray) -> ndarray:
+def sheared(T):
     T[0, 1] += 0.01
     return T
 
 
-def last_row(*row: float) -> Callable[[ndarray], ndarray]:
-    def change(T: ndarray) -> ndarray:
+def last_row(*row):
+    def change(T):
         T[3] = row
         return T
 
@@ -70,9 +65,7 @@ def last_row(*row: float) -> Callable[[ndarray], ndarray]:
         (lambda T: T * 1e200, "has the last row", "rigid motion"),
     ],
 )
-def test_matrices_that_are_no_poses(
-    sphere: Path, key: str, change: Callable[[ndarray], ndarray], problem: str, words: str
-) -> None:
+def test_matrices_that_are_no_poses(sphere, key, change, problem, words):
     change_pose(sphere, change, key)
     fault = only_fault(sphere)
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", NAMES[1], key)
@@ -80,15 +73,15 @@ def test_matrices_that_are_no_poses(
     assert words in fault.cause + fault.remedy
 
 
-def test_five_digits_are_enough(sphere: Path) -> None:
+def test_five_digits_are_enough(sphere):
     for frame in range(len(NAMES)):
         for key in ("transform_matrix", "projector_transform_matrix"):
             change_pose(sphere, lambda T: np.round(T, 5), key, frame)
     assert check_scan(sphere) == []
 
 
-def test_projector_in_the_camera_s_place(sphere: Path) -> None:
-    def copy(document: dict[str, Any]) -> None:
+def test_projector_in_the_camera_s_place(sphere):
+    def copy(document):
         record = document["frames"][1]
         for row in range(3):
             record["projector_transform_matrix"][row][3] = record["transform_matrix"][row][3]
@@ -99,8 +92,8 @@ def test_projector_in_the_camera_s_place(sphere: Path) -> None:
     assert faults[0].problem == "has exactly the position of the camera"
 
 
-def test_all_poses_equal(sphere: Path) -> None:
-    def equal(document: dict[str, Any]) -> None:
+def test_all_poses_equal(sphere):
+    def equal(document):
         for record in document["frames"]:
             for key in ("transform_matrix", "projector_transform_matrix"):
                 record[key] = document["frames"][0][key]
@@ -125,7 +118,7 @@ def test_all_poses_equal(sphere: Path) -> None:
         (Device(100_000, 60_000, 60.0, 60.0, 36.0, 30.0), "w", "is 6000000000 pixels"),
     ],
 )
-def test_devices_that_cannot_be(device: Device, key: str, words: str) -> None:
+def test_devices_that_cannot_be(device, key, words):
     problems = list(device_problems(device))
     assert [k for k, _ in problems] == [key]
     assert words in "times h " + problems[0][1].problem
@@ -143,13 +136,13 @@ def test_devices_that_cannot_be(device: Device, key: str, words: str) -> None:
         Device(800, 800, 300.0, 300.0, 400.0, 400.0, model="DOE"),  # corners beyond 90 degrees: unused
     ],
 )
-def test_devices_that_can(device: Device) -> None:
+def test_devices_that_can(device):
     assert list(device_problems(device)) == []
 
 
 @pytest.mark.parametrize(("key", "value"), [("fl_x", 0), ("cx", 1e6), ("projector.fl_y", -1), ("projector.cy", -1e9)])
-def test_faulty_intrinsics_have_a_place(sphere: Path, key: str, value: float) -> None:
-    def change(document: dict[str, Any]) -> None:
+def test_faulty_intrinsics_have_a_place(sphere, key, value):
+    def change(document):
         place = document["projector"] if key.startswith("projector.") else document
         place[key.removeprefix("projector.")] = value
 
@@ -158,7 +151,7 @@ def test_faulty_intrinsics_have_a_place(sphere: Path, key: str, value: float) ->
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, key)
 
 
-def test_intrinsics_of_another_resolution(sphere: Path) -> None:
+def test_intrinsics_of_another_resolution(sphere):
     edit(sphere, lambda document: document.update(w=144, h=120))
     faults = check_scan(sphere)
     assert len(faults) == 4 * len(NAMES)  # image, pattern image, mask and coordinates of each frame
@@ -166,10 +159,10 @@ def test_intrinsics_of_another_resolution(sphere: Path) -> None:
     assert all("resized, or the intrinsics are those of another resolution" in fault.cause for fault in faults)
 
 
-def test_each_frame_with_a_camera_of_its_own(tmp_path: Path) -> None:
+def test_each_frame_with_a_camera_of_its_own(tmp_path):
     root = write_sphere(tmp_path / "scan")
 
-    def own(document: dict[str, Any]) -> None:
+    def own(document):
         keys = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
         common = {key: document.pop(key) for key in keys}
         for record in document["frames"]:
@@ -185,7 +178,7 @@ def test_each_frame_with_a_camera_of_its_own(tmp_path: Path) -> None:
     assert (fault.frame, fault.field, fault.problem) == (NAMES[1], "cy", "is missing")
 
 
-def test_part_common_part_own(sphere: Path) -> None:
+def test_part_common_part_own(sphere):
     edit(sphere, lambda document: [r.update(fl_x=150.0 + i) for i, r in enumerate(document["frames"])])
     faults = check_scan(sphere)
     assert {(fault.frame, fault.field) for fault in faults} == {(name, "fl_x") for name in NAMES[1:]}
@@ -202,7 +195,7 @@ SIGMA = {
 }
 
 
-def test_stated_uncertainty_of_poses(sphere: Path) -> None:
+def test_stated_uncertainty_of_poses(sphere):
     assert read_scan(sphere).frames[0].pose_sigma is None
     edit(sphere, lambda document: document.update(sl_pose_sigma=SIGMA))
     edit(sphere, lambda document: document["frames"][2].update(sl_pose_sigma={**SIGMA, "camera_translation": 9}))
@@ -213,7 +206,7 @@ def test_stated_uncertainty_of_poses(sphere: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [0, -1, 1e308])
-def test_an_uncertainty_is_above_zero_and_bounded(sphere: Path, value: float) -> None:
+def test_an_uncertainty_is_above_zero_and_bounded(sphere, value):
     edit(sphere, lambda document: document["frames"][2].update(sl_pose_sigma={**SIGMA, "relative_rotation_deg": value}))
     fault = only_fault(sphere)
     assert (fault.frame, fault.field) == (NAMES[2], "sl_pose_sigma.relative_rotation_deg")
@@ -226,19 +219,19 @@ rotations = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x 
 positions = st.tuples(*[st.floats(-1e6, 1e6)] * 3)
 
 
-def pose_of(quaternion: tuple[float, ...], position: tuple[float, ...]) -> np.ndarray:
+def pose_of(quaternion, position):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return T
 
 
 @given(rotations, positions)
-def test_every_rigid_motion_is_a_pose(quaternion, position) -> None:
+def test_every_rigid_motion_is_a_pose(quaternion, position):
     assert pose_problem(pose_of(quaternion, position)) is None
 
 
 @given(rotations, positions, st.floats(1e-4, 1e4).filter(lambda s: abs(s - 1) > 1e-3), st.booleans())
-def test_no_similarity_and_no_reflection_is_a_pose(quaternion, position, scale, reflected) -> None:
+def test_no_similarity_and_no_reflection_is_a_pose(quaternion, position, scale, reflected):
     T = pose_of(quaternion, position)
     T[:3, :3] *= -1.0 if reflected else 1.0
     if reflected:
@@ -254,7 +247,7 @@ names = st.text(st.characters(exclude_categories=()), min_size=1, max_size=12)
 
 
 @given(st.lists(names, min_size=1, max_size=4).map("/".join))
-def test_a_path_is_inside_the_folder_or_refused(text: str) -> None:
+def test_a_path_is_inside_the_folder_or_refused(text):
     root = Path("/nowhere/a scan")
     found = resolve_inside(root, text)
     if isinstance(found, Problem):
@@ -271,7 +264,7 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_no_value_of_a_key_is_misread_or_crashes(value) -> None:
+def test_no_value_of_a_key_is_misread_or_crashes(value):
     """Each reader returns what is there, or None with a fault; numbers that are not finite are listed elsewhere."""
     for read, kind in (
         (Fields.read_number, float),
@@ -295,7 +288,7 @@ shifts = st.tuples(st.floats(-0.8, 0.8), st.floats(-0.8, 0.8))
 
 
 @given(shifts)
-def test_the_shift_of_coordinates_is_measured_in_the_pattern(shift) -> None:
+def test_the_shift_of_coordinates_is_measured_in_the_pattern(shift):
     pattern = pattern_image()
     x, y = np.meshgrid(np.linspace(8, PROJECTOR.w - 8, 70), np.linspace(8, PROJECTOR.h - 8, 60))
     true = np.stack([x, y], -1).astype(np.float32)
@@ -307,7 +300,7 @@ def test_the_shift_of_coordinates_is_measured_in_the_pattern(shift) -> None:
     np.testing.assert_allclose(found, shift, atol=0.12)
 
 
-def test_half_a_pixel_is_reported_with_its_direction_and_nothing_else() -> None:
+def test_half_a_pixel_is_reported_with_its_direction_and_nothing_else():
     half, none = np.array([0.5, 0.5]), np.zeros(2)
     assert [p.remedy for p in shift_problems([half] * 4)] == ["add 0.5 to both coordinates everywhere"]
     assert [p.remedy for p in shift_problems([-half] * 4)] == ["subtract 0.5 from both coordinates everywhere"]
@@ -316,7 +309,7 @@ def test_half_a_pixel_is_reported_with_its_direction_and_nothing_else() -> None:
 
 
 @given(st.integers(0, 2**31 - 1), st.floats(0, 0.6))
-def test_honest_coordinates_have_no_problem(seed: int, missing: float) -> None:
+def test_honest_coordinates_have_no_problem(seed, missing):
     """Any smooth coordinates inside the pattern, with any share of undecoded pixels."""
     rng = np.random.default_rng(seed)
     smooth = gaussian_filter(rng.normal(size=(30, 40, 2)), (4, 4, 0))

@@ -10,31 +10,31 @@ import pytest
 from sphere_scan import edit
 from test_check_conventions import disturbed, undo
 
-from sl_nerfstudio.scan.check import FolderCheck, check_folder
+from sl_nerfstudio.scan.check import check_folder
 from sl_nerfstudio.scan.check_conventions import Interpretation, convention_problems
 
 DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
-def folder(name: str) -> Path:
+def folder(name):
     if not (DATA / name / "transforms.json").exists():
         pytest.skip(f"real captures not found: {DATA / name} (set SL_REAL_DATA to their folder)")
     return DATA / name
 
 
 @pytest.fixture(scope="module", params=["elephant", "house"])
-def examined(request: pytest.FixtureRequest) -> FolderCheck:
+def examined(request):
     return check_folder(folder(request.param))
 
 
-def test_real_captures_are_clean(examined: FolderCheck) -> None:
+def test_real_captures_are_clean(examined):
     assert examined.faults == ()
     assert examined.fit is not None and examined.scan is not None
     assert examined.fit.typical_px < 0.3
     assert examined.fit.typical_spread < 0.05
 
 
-def test_real_captures_with_rough_poses_are_clean(examined: FolderCheck) -> None:
+def test_real_captures_with_rough_poses_are_clean(examined):
     assert examined.scan is not None
     frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
     size = 30.0 if examined.scan.units == "mm" else 0.3
@@ -44,7 +44,7 @@ def test_real_captures_with_rough_poses_are_clean(examined: FolderCheck) -> None
 
 
 @pytest.mark.parametrize("how", ["inverted", "OpenCV axes", "inverted, OpenCV axes"])
-def test_mixed_up_real_captures_are_named(examined: FolderCheck, how: str) -> None:
+def test_mixed_up_real_captures_are_named(examined, how):
     assert examined.scan is not None
     frames = [content.correspondences for content in examined.contents if content.correspondences is not None]
     interpretation = Interpretation(camera=how, projector=how)  # type: ignore[arg-type]
@@ -57,7 +57,7 @@ def test_mixed_up_real_captures_are_named(examined: FolderCheck, how: str) -> No
         assert found[0][2].cause.startswith("camera and projector matrices ")
 
 
-def test_faults_planted_in_real_captures(tmp_path: Path) -> None:
+def test_faults_planted_in_real_captures(tmp_path):
     root = Path(shutil.copytree(folder("elephant"), tmp_path / "scan"))
     (root / "images" / "frame_00003.png").write_bytes((root / "images" / "frame_00003.png").read_bytes()[:5000])
     (root / "coords" / "frame_00004.npz").unlink()

@@ -1,8 +1,6 @@
 """Scans and other poses are written as they are and read again; nothing half-written stays."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,11 +23,11 @@ from sl_nerfstudio.scan.write import read_devices, write_transforms
 from sl_nerfstudio.storage import LOCK
 
 
-def files(root: Path) -> set[str]:
+def files(root):
     return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
 
 
-def settings(**changes: Any) -> dict[str, Any]:
+def settings(**changes):
     return {
         "units": "mm",
         "scale": Scale(True, "measured with a ruler"),
@@ -40,7 +38,7 @@ def settings(**changes: Any) -> dict[str, Any]:
     }
 
 
-def frame(index: int = 0, **changes: Any) -> dict[str, Any]:
+def frame(index=0, **changes):
     T_world_camera, T_world_projector = poses()[index]
     return {
         "image": np.zeros((CAMERA.h, CAMERA.w), np.uint8),
@@ -51,7 +49,7 @@ def frame(index: int = 0, **changes: Any) -> dict[str, Any]:
     }
 
 
-def test_everything_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_everything_comes_back_as_it_was(tmp_path):
     random = np.random.default_rng(0)
     shape = (CAMERA.h, CAMERA.w)
     image = random.integers(0, 65536, (*shape, 3), dtype=np.uint16)
@@ -87,12 +85,12 @@ def test_everything_comes_back_as_it_was(tmp_path: Path) -> None:
     assert read_ground_truth(scan).mesh_path == tmp_path / "ä" / "scan" / "ground_truth" / "mesh.ply"
 
 
-def test_the_same_scan_is_written_as_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_scan_is_written_as_the_same_bytes(tmp_path):
     a, b = write_sphere(tmp_path / "a", frames=2), write_sphere(tmp_path / "b", frames=2)
     assert all((a / name).read_bytes() == (b / name).read_bytes() for name in files(a))
 
 
-def test_captures_without_coordinates(tmp_path: Path) -> None:
+def test_captures_without_coordinates(tmp_path):
     with ScanWriter(tmp_path / "scan", **settings()) as writer:
         for index in range(2):
             writer.add_frame(f"f{index}", **frame(index, coords=None))
@@ -105,7 +103,7 @@ def test_captures_without_coordinates(tmp_path: Path) -> None:
     assert not scan.frames[0].read_mask().any()
 
 
-def test_true_poses_go_to_ground_truth(tmp_path: Path) -> None:
+def test_true_poses_go_to_ground_truth(tmp_path):
     true = [(camera + 0.0, projector + 0.0) for camera, projector in poses()]
     for camera, _ in true:
         camera[0, 3] += 1
@@ -122,7 +120,7 @@ def test_true_poses_go_to_ground_truth(tmp_path: Path) -> None:
     assert "sl_pose_sigma" not in (tmp_path / "scan/ground_truth/transforms.json").read_text()
 
 
-def test_nothing_stays_of_a_scan_that_failed(tmp_path: Path) -> None:
+def test_nothing_stays_of_a_scan_that_failed(tmp_path):
     root = tmp_path / "new" / "scan"
     with pytest.raises(ZeroDivisionError), ScanWriter(root, **settings()) as writer:
         writer.add_frame("f0", **frame())
@@ -131,7 +129,7 @@ def test_nothing_stays_of_a_scan_that_failed(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scan_without_frames_is_not_written(tmp_path: Path) -> None:
+def test_a_scan_without_frames_is_not_written(tmp_path):
     with pytest.raises(UserError, match="no frame was written"), ScanWriter(tmp_path / "scan", **settings()):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -145,7 +143,7 @@ def test_a_scan_without_frames_is_not_written(tmp_path: Path) -> None:
         ({"camera": Device(72, 60, 1.0, 1.0, 1.0, 1.0, model="DOE")}, "a camera cannot be a DOE"),
     ],
 )
-def test_faulty_settings(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_faulty_settings(tmp_path, changes, message):
     with pytest.raises(ValueError) as error:
         ScanWriter(tmp_path / "scan", **settings(**changes))
     assert str(error.value) == message
@@ -166,7 +164,7 @@ def test_faulty_settings(tmp_path: Path, changes: dict[str, Any], message: str) 
         ("f1", {"extra": {"quality": float("nan")}}, "not JSON compliant"),
     ],
 )
-def test_faulty_frames(tmp_path: Path, name: str, changes: dict[str, Any], message: str) -> None:
+def test_faulty_frames(tmp_path, name, changes, message):
     with pytest.raises(ValueError) as error, ScanWriter(tmp_path / "scan", **settings()) as writer:
         writer.add_frame("f0", **frame())
         writer.add_frame(name, **frame(1, **changes))
@@ -174,7 +172,7 @@ def test_faulty_frames(tmp_path: Path, name: str, changes: dict[str, Any], messa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_may_not_leave_the_folder(tmp_path: Path) -> None:
+def test_files_may_not_leave_the_folder(tmp_path):
     for path in ("../x", "/tmp/x", "a/../../x"):
         with (
             pytest.raises(ValueError, match="leaves the scan folder"),
@@ -184,19 +182,19 @@ def test_files_may_not_leave_the_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_frame_needs_intrinsics(tmp_path: Path) -> None:
+def test_a_frame_needs_intrinsics(tmp_path):
     with pytest.raises(ValueError, match="a frame needs its own camera"):  # noqa: SIM117
         with ScanWriter(tmp_path / "scan", **settings(camera=None)) as writer:
             writer.add_frame("f0", **frame())
 
 
-def moved(T: np.ndarray) -> np.ndarray:
+def moved(T):
     out = T.copy()
     out[:, :3, 3] += [1.0, 2.0, 3.0]
     return out
 
 
-def test_refined_poses_keep_everything_else(sphere: Path) -> None:
+def test_refined_poses_keep_everything_else(sphere):
     edit(sphere, lambda document: document.update(applied_scale=2.0, sl_pose_sigma={"camera_translation": 1.0}))
     edit(sphere, lambda document: document["frames"][1].update(exposure=7))
     edit(sphere, lambda document: document["sl_pose_sigma"].update(
@@ -225,8 +223,8 @@ CHANGE = IntrinsicsChange.of((0.01, -0.002, 0.003, -0.008, 0.004, 0.001))
 
 
 @pytest.mark.parametrize("own_cameras", [False, True])
-def test_changed_intrinsics_are_written_and_read_beside_the_scans_own(sphere: Path, own_cameras: bool) -> None:
-    def give_every_frame_its_own(document: dict[str, Any]) -> None:
+def test_changed_intrinsics_are_written_and_read_beside_the_scans_own(sphere, own_cameras):
+    def give_every_frame_its_own(document):
         common = {key: document.pop(key) for key in ("fl_x", "fl_y", "cx")}
         for index, record in enumerate(document["frames"]):
             record.update(common | {"fl_x": common["fl_x"] + index})
@@ -255,7 +253,7 @@ def test_changed_intrinsics_are_written_and_read_beside_the_scans_own(sphere: Pa
     assert [frame.camera for frame in read_scan(sphere).frames] == [frame.camera for frame in changed.frames]
 
 
-def test_a_file_of_poses_may_say_nothing_of_devices_but_nothing_false(sphere: Path, tmp_path: Path) -> None:
+def test_a_file_of_poses_may_say_nothing_of_devices_but_nothing_false(sphere, tmp_path):
     scan = read_scan(sphere)
     document = json.loads((sphere / "transforms.json").read_text())
     frames = [{"file_path": record["file_path"]} for record in document["frames"]]
@@ -270,7 +268,7 @@ def test_a_file_of_poses_may_say_nothing_of_devices_but_nothing_false(sphere: Pa
     assert "poses.json" in str(error.value)
 
 
-def test_wrong_numbers_of_poses_are_refused(sphere: Path) -> None:
+def test_wrong_numbers_of_poses_are_refused(sphere):
     scan = read_scan(sphere)
     with pytest.raises(ValueError, match="4 frames, but poses of 3 and 4 sets of fields"):
         write_transforms(sphere / "x.json", scan, scan.poses[:3])
@@ -285,7 +283,7 @@ def test_wrong_numbers_of_poses_are_refused(sphere: Path) -> None:
     assert not (sphere / "x.json").exists()
 
 
-def test_poses_of_another_file_are_matched_by_name(sphere: Path, tmp_path: Path) -> None:
+def test_poses_of_another_file_are_matched_by_name(sphere, tmp_path):
     scan = read_scan(sphere)
     document = json.loads((sphere / "transforms.json").read_text())
     document["frames"].reverse()
@@ -318,7 +316,7 @@ def test_poses_of_another_file_are_matched_by_name(sphere: Path, tmp_path: Path)
         read_poses(path, scan)
 
 
-def test_faulty_truth_is_a_fault_of_the_scan(sphere: Path) -> None:
+def test_faulty_truth_is_a_fault_of_the_scan(sphere):
     (sphere / "ground_truth").mkdir()
     document = json.loads((sphere / "transforms.json").read_text())
     document["frames"][2]["transform_matrix"][3][3] = 0
