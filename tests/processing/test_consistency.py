@@ -356,7 +356,7 @@ def test_of_what_looks_the_same_from_several_sides_no_frame_is_moved(monkeypatch
         names, T, baseline, np.full(n, True), np.zeros(n, dtype=np.int64), np.full(n, 0.95), (), (), ()
     )
     asked: list[bool] = []
-    monkeypatch.setattr(consistency, "_moved_elsewhere", lambda *_: asked.append(True))
+    monkeypatch.setattr(consistency._Adjuster, "with_moved", lambda _, group: asked.append(True) or group)
     adjust_consistent(clouds, replace(start, turns_deg=(60.0,)), lambda _: None)
     assert not asked
     adjust_consistent(clouds, start, lambda _: None)
