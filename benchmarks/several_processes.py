@@ -6,37 +6,19 @@
 that its surface can be compared. Time is that of the steps, as the command prints it.
 """
 
-import argparse
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.whole_runs import run, train_and_score
+from benchmarks.common.measuring import Rows, options
+from benchmarks.common.runs import run, train_and_score
 
 _PIXELS = 1024
 _SECONDS = re.compile(r"^train .*\((?:(\d+) min )?(\d+) s\)$", re.MULTILINE)
-
-
-@dataclass(frozen=True)
-class Kind:
-    """How a training is divided."""
-
-    name: str
-    processes: int
-    pixels: int  # that each process draws a step
-
-    def options(self, steps: int) -> tuple[str, ...]:
-        """Flags of ns-train."""
-        return (
-            *("--machine.device-type", "cpu", "--machine.num-devices", str(self.processes)),
-            *("--max-num-iterations", str(steps), "--pipeline.datamanager.train-num-rays-per-batch", str(self.pixels)),
-        )
 
 
 @dataclass(frozen=True)
@@ -49,54 +31,36 @@ class Row:
     camera_mm: float
 
 
-KINDS = (Kind("one", 1, _PIXELS), Kind("both", 1, 2 * _PIXELS), Kind("two", 2, _PIXELS))
+KINDS = (("one", 1, _PIXELS), ("both", 1, 2 * _PIXELS), ("two", 2, _PIXELS))  # processes; pixels of each in a step
 
 
-def measure(scan: Path, folder: Path, kinds: Sequence[Kind], steps: int) -> list[Row]:
+def measure(scan: Path, folder: Path, steps: int, rows: Rows[Row]) -> None:
     """Train and score each kind on as many cores as it has processes."""
-    rows = []
-    for kind in kinds:
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: kind.processes])
-        score = train_and_score(scan, folder, kind.name, kind.options(steps))
-        seconds = _training_seconds(scan, folder, kind, steps)
-        pixels = kind.processes * kind.pixels * steps / seconds
-        row = Row(kind.name, pixels, score.rigid_rmse, score.camera_translation_rmse)
-        print(f"{row.name:6} {pixels:8.0f} pixels/s  surface {row.surface_rmse:.4f} mm", flush=True)
-        rows.append(row)
+    for name, processes, pixels in KINDS:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:processes])
+        flags = (
+            *("--machine.device-type", "cpu", "--machine.num-devices", str(processes)),
+            *("--max-num-iterations", str(steps), "--pipeline.datamanager.train-num-rays-per-batch", str(pixels)),
+        )
+        score = train_and_score(scan, folder, name, flags)
+        program, again = Path(sys.executable).parent / "ns-train", f"{name}-timed"  # once more, without its start
+        words = (program, "sl-neus", "--data", str(scan), "--output-dir", str(folder), "--timestamp", again)
+        done = subprocess.run([*words, *flags], capture_output=True, text=True, check=True)
+        found = _SECONDS.search(done.stdout)
+        assert found is not None, done.stdout
+        seconds = 60 * int(found[1] or 0) + int(found[2])
+        rate = processes * pixels * steps / seconds
+        rows.add(Row(name, rate, score.rigid_rmse, score.camera_translation_rmse))
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    return rows
-
-
-def _training_seconds(scan: Path, folder: Path, kind: Kind, steps: int) -> float:
-    """Of the same training once more, without its start."""
-    words = (
-        "ns-train",
-        "sl-neus",
-        "--data",
-        str(scan),
-        "--output-dir",
-        str(folder),
-        "--timestamp",
-        f"{kind.name}-timed",
-    )
-    program = Path(sys.executable).parent / words[0]
-    done = subprocess.run([program, *words[1:], *kind.options(steps)], capture_output=True, text=True, check=True)
-    found = _SECONDS.search(done.stdout)
-    assert found is not None, done.stdout
-    return 60 * int(found[1] or 0) + int(found[2])
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=500, help="steps of each training")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/several_processes.json"))
-    options = parser.parse_args()
+    given = options(__doc__, steps=500, output=Path("benchmarks/results/several_processes.json"))
     with tempfile.TemporaryDirectory() as temporary:
         scan = Path(temporary) / "scan"
-        run("sl-synth", "--output", str(scan))
-        rows = measure(scan, Path(temporary), KINDS, options.steps)
-    write_rows(options.output, rows, steps=options.steps)
+        run("sl-synth", "--output", scan)
+        measure(scan, Path(temporary), given.steps, Rows(given.output, steps=given.steps))
 
 
 if __name__ == "__main__":

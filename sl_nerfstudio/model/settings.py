@@ -8,7 +8,7 @@ import torch
 from nerfstudio.models.base_model import ModelConfig
 
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.field.field import FieldConfig
 from sl_nerfstudio.model.pose_refinement import PriorConfig
 from sl_nerfstudio.rendering.losses import AnnealingConfig, LossConfig, SamplingConfig

@@ -33,9 +33,10 @@ from sl_nerfstudio.registration.result import (
 )
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.review.agreement import (
+    GOOD_EXCESS,
+    GOOD_SHARE,
     CrossFrameAgreement,
     FrameCrossAgreement,
-    VerdictSettings,
     agreeing_groups,
     compare_frames,
 )
@@ -82,14 +83,12 @@ def adjust_consistent(
     return ConsistentFrames(group.registration, group.minimum.with_other_minima(), group.cross)
 
 
-def registered_only(
-    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
-) -> ConsistentFrames:
+def registered_only(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
     """All registered frames where registration put them; they are compared within the uncertainty of that.
 
     Raises UserError if fewer than two frames are registered.
     """
-    kept = keep_registered(clouds, registration, settings)
+    kept = keep_registered(clouds, registration)
     return ConsistentFrames(registration, kept, compare_registered(clouds, registration, kept, exact=False))
 
 
@@ -115,8 +114,8 @@ class _Group:
 
     def agrees_well(self, frame: int) -> bool:
         """Whether a frame agrees with the others as well as frames of a good scan do."""
-        limits, found = VerdictSettings(), self.agreement(frame)
-        return found.excess <= limits.good_excess and found.share >= limits.good_share
+        found = self.agreement(frame)
+        return found.excess <= GOOD_EXCESS and found.share >= GOOD_SHARE
 
     def named(self, frames: Iterable[int]) -> str:
         """Names of frames, for a sentence."""

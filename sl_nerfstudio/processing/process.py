@@ -285,7 +285,7 @@ def _adjust(
     clouds, found = clouds_of(frames.results), frames.found
     settings = adjustment_settings(config.rig, found)
     if config.no_adjust:
-        consistent = registered_only(clouds, registration, settings)
+        consistent = registered_only(clouds, registration)
     else:
         consistent = StageStore(frames.job.work, log).kept(
             "adjustment",

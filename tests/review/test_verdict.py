@@ -1,0 +1,139 @@
+"""What facts lead to which verdict, in which words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
+from tests.review.cases import ring
+
+N = 12
+NAMES = [f"f{k:02d}" for k in range(N)]
+GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decode_rate=0.9, own_share=0.95) for name in NAMES)
+CHAIN = tuple(PairFacts((NAMES[k], NAMES[(k + gap) % N]), True) for gap in (1, 2) for k in range(N))
+
+
+def scan(changes=None, **others):
+    """A good scan in which some frames are other than good."""
+    frames = tuple(replace(f, **(changes or {}).get(k, {})) for k, f in enumerate(GOOD))
+    inside = sum(f.in_scan for f in frames)
+    return ScanFacts(frames, **{"pairs": CHAIN, "cross": ring(np.ones((inside, inside))), **others})
+
+
+def test_a_scan_without_any_doubt_is_good():
+    verdict = judge_scan(scan())
+    assert verdict.band == "good" and verdict.reasons == ()
+    assert judge_scan(ScanFacts(GOOD)).band == "good"  # what is not known is not judged
+    background = {k: {"decode_rate": 0.2, "shared_decoded": 0.8} for k in range(N)}  # that no frame decodes
+    assert judge_scan(scan(background)).band == "good"
+
+
+@pytest.mark.parametrize(
+    ("change", "fact"),
+    [
+        ({"undecided": True}, "the pose is undecided"),
+        ({"sigma_rotation_deg": 5.0}, "to 5 degrees"),
+        ({"decode_rate": 0.2}, "only 20% of the visible pattern"),
+        ({"decode_rate": 0.9, "shared_decoded": 0.3}, "only 30% of the surface that other frames show"),
+        ({"decode_rate": 0.0}, "only 0% of the visible pattern"),
+        ({"missing_share": 0.07}, "saw nothing of the pattern"),
+        ({"missing_share": 0.2}, "(20% of it in the worst of them; at most 5%)"),
+        ({"own_share": 0.1}, "only 10% of the decoded pixels"),
+        ({"in_scan": False, "component": None}, "1 of 12 frames were left out"),
+        ({"in_scan": False, "component": 1}, "stands alone"),
+    ],
+)
+def test_one_frame_is_enough_and_many_make_it_poor(change, fact):
+    verdict = judge_scan(scan({3: change}))
+    assert verdict.band == ("poor" if "sigma_rotation_deg" in change else "acceptable")
+    assert any("f03" in reason and fact in reason for reason in verdict.reasons)
+    assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
+
+
+@pytest.mark.parametrize("frames", [1, N])
+def test_rotations_known_to_a_degree_are_acceptable_however_many(frames):
+    verdict = judge_scan(scan({k: {"sigma_rotation_deg": 1.3 + 0.1 * k} for k in range(frames)}))
+    assert verdict.band == "acceptable" and len(verdict.reasons) == 1
+    assert f"{1.3 + 0.1 * (frames - 1):.2g} degrees" in verdict.reasons[0] and "at most 1)" in verdict.reasons[0]
+
+
+def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
+    verdict = judge_scan(scan({3: {"sigma_rotation_deg": 5.0}, 4: {"sigma_rotation_deg": 1.3}}))
+    lost, loose = verdict.reasons[:2]
+    assert lost.startswith("f03:") and "at most 3)" in lost and loose.startswith("f04:") and "at most 1)" in loose
+
+
+def test_the_usual_uncertainty_of_a_registration_is_no_fault_of_its_frames():
+    rough = {k: {"sigma_rotation_deg": 1.3} for k in range(N)}
+    verdict = judge_scan(scan(rough, adjusted=False))
+    assert verdict.band == "acceptable"
+    assert [r for r in verdict.reasons if "known only" in r] == []
+    assert judge_scan(scan(rough | {3: {"sigma_rotation_deg": 5.0}}, adjusted=False)).band == "poor"
+
+
+def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
+    verdict = judge_scan(scan(turns_deg=(60.0, 119.8)))
+    assert verdict.band == "poor"
+    assert "the same after a turn by 60, 120 degrees" in verdict.reasons[0]
+    ordered = judge_scan(scan(turns_deg=(60.0, 119.8), by_order=True))
+    assert ordered.band == "poor" and "in steps of less than 30 degrees" in ordered.reasons[0]
+    alone = judge_scan(scan(by_order=True))
+    assert alone.band == "acceptable" and "placed by the order of capture" in alone.reasons[0]
+
+
+def test_a_group_of_its_own_is_named():
+    verdict = judge_scan(scan({k: {"in_scan": False, "component": 1} for k in (2, 3, 4)}))
+    assert verdict.band == "acceptable"
+    assert verdict.reasons[0].startswith("f02, f03, f04: form a group of their own")
+
+
+def test_pairs_that_contradict_others_and_pairs_on_which_everything_hangs():
+    rejected = tuple(replace(p, used=False) if "f05" in p.frames else p for p in CHAIN)
+    verdict = judge_scan(scan(pairs=rejected))
+    assert "f05: most pairs with other frames contradict the pose found" in verdict.reasons
+    line = [(k, k + 1) for k in range(N - 1)] + [(k, k + 2) for k in range(N - 2) if k not in (4, 5)]
+    verdict = judge_scan(scan(pairs=tuple(PairFacts((NAMES[a], NAMES[b]), True) for a, b in line)))
+    assert verdict.band == "acceptable"
+    assert any("only the pair f05 and f06 connects" in r and "no other pair confirms it" in r for r in verdict.reasons)
+
+
+@pytest.mark.parametrize(("rejected", "doubtful"), [(7, False), (9, True)])
+def test_pairs_that_contradict_count_by_how_well_they_fit(rejected, doubtful):
+    """Four pairs of f05 are used. Frames from the other side of an object fit it half as well, and say nothing true."""
+    others = [k for k in range(N) if k != 5]
+    false = tuple(PairFacts((NAMES[5], NAMES[k]), False, 0.5) for k in others[:rejected])
+    found = judge_scan(scan(pairs=(*CHAIN, *false))).reasons
+    assert any("most pairs with other frames" in reason for reason in found) == doubtful
+
+
+def test_frames_that_agree_less_well_and_parts_that_share_nothing():
+    cross = ring(np.ones((N, N)))
+    frames = tuple(replace(f, excess=2.2 if k == 4 else 1.0) for k, f in enumerate(cross.frames))
+    verdict = judge_scan(scan(cross=replace(cross, frames=frames)))
+    assert verdict.band == "acceptable"
+    assert verdict.reasons[0].startswith("f04: agrees less well") and "2.2 times" in verdict.reasons[0]
+    parts = np.where(np.arange(N)[:, None] // 6 == np.arange(N)[None] // 6, 1.0, np.nan)
+    verdict = judge_scan(scan(cross=ring(parts)))
+    assert verdict.band == "poor" and "no surface in common with the other frames" in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("share", "band"), [(0.96, "good"), (0.9, "acceptable"), (0.5, "poor")])
+def test_points_that_do_not_agree_count_even_if_they_are_spread_over_all_frames(share, band):
+    verdict = judge_scan(scan(cross=replace(ring(np.ones((N, N))), share=share)))
+    assert verdict.band == band
+    assert band == "good" or f"of all points that two frames saw, {share:.0%} agree" in verdict.reasons[0]
+
+
+def test_too_few_frames_wrong_intrinsics_and_weak_poses():
+    lost = {k: {"in_scan": False} for k in range(1, N)}
+    assert judge_scan(scan(lost)).reasons == ("only 1 of 12 frames could be used",)
+    assert judge_scan(scan(wrong_intrinsics=True)).band == "acceptable"
+    assert judge_scan(scan({0: {"degeneracies": ("flat",)}})).band == "good"  # the other frames determine it
+    assert judge_scan(scan({k: {"degeneracies": ("flat",)} for k in range(5)})).band == "acceptable"
+
+
+def test_the_worst_reason_comes_first():
+    verdict = worst([Reason("good", "a"), Reason("acceptable", "b"), Reason("poor", "c"), Reason("acceptable", "d")])
+    assert (verdict.band, verdict.reasons) == ("poor", ("c", "b", "d"))
+    assert listed(list("abcdefgh")) == "a, b, c, d, e, f and 2 more"
