@@ -87,7 +87,7 @@ def test_other_devices_match_again(job, frame, result, monkeypatch):
 
 def test_nothing_is_matched_before_the_camera_is_known(job, frame, result, monkeypatch):
     calls = counted(monkeypatch)
-    unknown = FrameWorker(replace(job, camera_known=False))(frame)
+    unknown = FrameWorker(replace(job, last_step="calibrate"))(frame)
     assert unknown.matched == "" and not calls and unknown.key == result.key and unknown.cloud is not None
     assert FrameWorker(job).calibrate(unknown).matched == result.matched
 

@@ -1,14 +1,19 @@
 """A stage is computed once, and again whenever anything that it follows from has changed."""
 
+import shutil
+import subprocess
+import sys
 import types
 import typing
 from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import sl_nerfstudio
 from sl_nerfstudio.processing import cache
-from sl_nerfstudio.processing.cache import FOLDER, KEPT, StageStore
+from sl_nerfstudio.processing.cache import FOLDER, KEPT, VERSIONS, StageStore, stage_key
 from sl_nerfstudio.processing.consistency import ConsistentFrames
 from sl_nerfstudio.processing.records import encode
 from sl_nerfstudio.registration.result import NoCommonSurface
@@ -27,7 +32,7 @@ class Foreign:
 
 
 class Counted:
-    """A computation that says how often it was done."""
+    """A computation that counts how often it was done."""
 
     def __init__(self):
         self.times = 0
@@ -42,7 +47,7 @@ def compute():
     return Counted()
 
 
-def test_a_second_run_reads_what_the_first_computed_and_says_so(tmp_path, compute):
+def test_a_second_run_reads_what_the_first_computed_and_logs_it(tmp_path, compute):
     log = []
     first = StageStore(tmp_path, log.append).kept("registration", (1, "a"), compute)
     assert log == []
@@ -51,24 +56,43 @@ def test_a_second_run_reads_what_the_first_computed_and_says_so(tmp_path, comput
     assert first[0] == second[0] == NoCommonSurface("frame") and (first[1] == second[1]).all()
 
 
-def test_other_inputs_other_code_and_other_versions_are_computed_again(tmp_path, compute, monkeypatch):
-    store = StageStore(tmp_path, print)
-    inputs = np.zeros(3)
-    store.kept("registration", inputs, compute)
-    store.kept("registration", inputs + 1e-300, compute)
-    assert compute.times == 2
-    for name, change in (("version", lambda name: "9.9"), ("_PACKAGES", ())):
-        monkeypatch.setattr(cache, name, change)
-        cache.surroundings.cache_clear()
-        store.kept("registration", inputs + 1e-300, compute)
-    assert compute.times == 4
-    (tmp_path / "package").mkdir()
-    (tmp_path / "package" / "__init__.py").write_text("")
-    monkeypatch.setattr(cache.sl_nerfstudio, "__file__", str(tmp_path / "package" / "__init__.py"))
-    cache.surroundings.cache_clear()
-    store.kept("registration", inputs + 1e-300, compute)
-    cache.surroundings.cache_clear()
-    assert compute.times == 5
+def test_other_inputs_stage_versions_and_libraries_are_computed_again(tmp_path, compute, monkeypatch):
+    store, inputs, expected = StageStore(tmp_path, print), np.zeros(3), 0
+
+    def kept(inputs, stage="registration"):
+        """Computed once, not twice."""
+        nonlocal expected
+        expected += 1
+        for _ in range(2):
+            store.kept(stage, inputs, compute)
+            assert compute.times == expected
+
+    kept(inputs)
+    kept(inputs + 1e-300)
+    kept(inputs, "adjustment")
+    for stage in ("registration", "adjustment"):
+        monkeypatch.setitem(VERSIONS, stage, VERSIONS[stage] + 1)
+        kept(inputs, stage)
+    monkeypatch.setattr(cache, "version", lambda _: "9.9")
+    cache._computer.cache_clear()
+    kept(inputs)
+    cache._computer.cache_clear()
+    with pytest.raises(KeyError):
+        store.kept("a stage without a version", inputs, compute)
+
+
+@pytest.mark.slow
+def test_an_edited_source_file_discards_nothing(tmp_path):
+    """The keys of every stage in a copy of the package in which every file was edited."""
+    shutil.copytree(Path(sl_nerfstudio.__file__).parent, tmp_path / "sl_nerfstudio")
+    for path in (tmp_path / "sl_nerfstudio").rglob("*.py"):
+        path.write_text(path.read_text() + "\n\nEDITED = True\n")
+    script = (
+        "import numpy as np, sl_nerfstudio\nfrom sl_nerfstudio.processing.cache import VERSIONS, stage_key\n"
+        "assert sl_nerfstudio.EDITED\nprint([stage_key(stage, (1, np.arange(3.0))) for stage in VERSIONS])"
+    )
+    found = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == str([stage_key(stage, (1, np.arange(3.0))) for stage in VERSIONS])
 
 
 def test_a_damaged_result_is_computed_again(tmp_path, compute):

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,21 +26,21 @@ BAR = ScaleBar((PickedPixel(NAMES[1], (30.25, 20.0)), PickedPixel(NAMES[3], (40.
 BASELINE = Scale(True, "a ruler", baseline_of=NAMES[2])
 
 
-def with_scale(scale: dict[str, Any]) -> Any:
+def with_scale(scale):
     return lambda document: document.update(scale=scale)
 
 
-def remove(*names: str) -> Any:
+def remove(*names):
     """The frames are removed from transforms.json, as a user would do it by hand."""
 
-    def change(document: dict[str, Any]) -> None:
+    def change(document):
         document["frames"] = [f for f in document["frames"] if Path(f["file_path"]).stem not in names]
 
     return change
 
 
 @pytest.mark.parametrize("scale", [Scale(False), Scale(True, "given"), BASELINE, Scale(True, "", bar=BAR)])
-def test_both_kinds_of_known_length_come_back_as_they_were_written(tmp_path: Path, scale: Scale) -> None:
+def test_both_kinds_of_known_length_come_back_as_they_were_written(tmp_path, scale):
     root = write_sphere(tmp_path / "scan", scale=scale)
     assert check_scan(root) == []
     scan = read_scan(root)
@@ -53,15 +52,12 @@ def test_both_kinds_of_known_length_come_back_as_they_were_written(tmp_path: Pat
     assert read_scan(root).scale == scale
 
 
-def test_the_file_states_names_pixels_and_length(tmp_path: Path) -> None:
+def test_the_file_states_names_pixels_and_length(tmp_path):
     root = write_sphere(tmp_path / "bar", scale=Scale(True, "two marks", bar=BAR))
     assert json.loads((root / "transforms.json").read_text())["scale"] == {
         "known": True,
         "source": "two marks",
-        "distance_between": [
-            {"frame": NAMES[1], "pixel": [30.25, 20.0]},
-            {"frame": NAMES[3], "pixel": [40.5, 33.5]},
-        ],
+        "distance_between": [{"frame": NAMES[1], "pixel": [30.25, 20.0]}, {"frame": NAMES[3], "pixel": [40.5, 33.5]}],
         "length": 51.5,
     }
     root = write_sphere(tmp_path / "baseline", scale=BASELINE)
@@ -69,13 +65,13 @@ def test_the_file_states_names_pixels_and_length(tmp_path: Path) -> None:
     assert stated == {"known": True, "source": "a ruler", "baseline_of": NAMES[2]}
 
 
-def test_a_known_length_in_a_frame_that_is_not_written_is_refused(tmp_path: Path) -> None:
+def test_a_known_length_in_a_frame_that_is_not_written_is_refused(tmp_path):
     with pytest.raises(ValueError, match="the known length was measured in 'another', which was not written"):
         write_sphere(tmp_path / "scan", scale=Scale(True, baseline_of="another"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_removing_an_earlier_frame_keeps_the_frame_with_the_known_baseline(tmp_path: Path) -> None:
+def test_removing_an_earlier_frame_keeps_the_frame_with_the_known_baseline(tmp_path):
     root = write_sphere(tmp_path / "scan", scale=BASELINE)
     edit(root, remove(NAMES[0]))
     scan = read_scan(root)
@@ -86,7 +82,7 @@ def test_removing_an_earlier_frame_keeps_the_frame_with_the_known_baseline(tmp_p
 
 
 @pytest.mark.parametrize("scale, key", [(BASELINE, "baseline_of"), (Scale(True, bar=BAR), "distance_between")])
-def test_removing_the_frame_with_the_known_length_is_a_fault(tmp_path: Path, scale: Scale, key: str) -> None:
+def test_removing_the_frame_with_the_known_length_is_a_fault(tmp_path, scale, key):
     root = write_sphere(tmp_path / "scan", scale=scale)
     edit(root, remove(scale.frames[0]))
     fault = only_fault(root)
@@ -108,14 +104,14 @@ def test_removing_the_frame_with_the_known_length_is_a_fault(tmp_path: Path, sca
         ("", None),
     ],
 )
-def test_scans_with_a_sentence_only_keep_their_meaning(sphere: Path, source: str, frame: str | None) -> None:
+def test_scans_with_a_sentence_only_keep_their_meaning(sphere, source, frame):
     edit(sphere, with_scale({"known": True, "source": source}))
     assert check_scan(sphere) == []
     assert read_scan(sphere).scale == Scale(True, source, baseline_of=frame)
 
 
 @pytest.mark.parametrize("number", [0, 4])
-def test_a_number_alone_is_refused_once_frames_were_removed(sphere: Path, number: int) -> None:
+def test_a_number_alone_is_refused_once_frames_were_removed(sphere, number):
     """Without frame 0, number 0 would be frame 1; whoever removes only baseline_of is left with such a sentence."""
     edit(sphere, with_scale({"known": True, "source": f"baseline of frame {number}"}))
     if number == 0:
@@ -126,17 +122,14 @@ def test_a_number_alone_is_refused_once_frames_were_removed(sphere: Path, number
     assert f"names frame number {number}" in fault.problem and "removed" in fault.cause
 
 
-def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere: Path) -> None:
+def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere):
     edit(sphere, with_scale({"known": True, "source": f"baseline of frame 1 ({NAMES[1]})"}))
     edit(sphere, remove(NAMES[1]))
     fault = only_fault(sphere)
-    assert (fault.field, fault.problem) == (
-        "scale.baseline_of",
-        f"names frame {NAMES[1]!r}, which is not in the scan",
-    )
+    assert (fault.field, fault.problem) == ("scale.baseline_of", f"names frame {NAMES[1]!r}, which is not in the scan")
 
 
-def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sphere: Path) -> None:
+def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sphere):
     edit(sphere, with_scale({"known": True, "source": "baseline of frame 1", "baseline_of": NAMES[0]}))
     assert read_scan(sphere).scale.baseline_of == NAMES[0]
     edit(sphere, with_scale({"known": False, "source": "baseline of frame 1"}))
@@ -178,7 +171,7 @@ OTHER = {"frame": NAMES[1], "pixel": [30.0, 30.0]}
         ({"baseline_off": NAMES[0]}, "baseline_off", "is not a key of a scan"),
     ],
 )
-def test_a_faulty_known_length_is_named(sphere: Path, scale: dict[str, Any], field: str, problem: str) -> None:
+def test_a_faulty_known_length_is_named(sphere, scale, field, problem):
     edit(sphere, with_scale({"known": True, **scale}))
     fault = only_fault(sphere)
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, f"scale.{field}")
@@ -186,7 +179,7 @@ def test_a_faulty_known_length_is_named(sphere: Path, scale: dict[str, Any], fie
     assert fault.cause and fault.remedy
 
 
-def test_a_bar_where_nothing_was_decoded_is_found_by_the_full_check(sphere: Path) -> None:
+def test_a_bar_where_nothing_was_decoded_is_found_by_the_full_check(sphere):
     ends = [END, {"frame": NAMES[1], "pixel": [1.5, 2.5]}]
     edit(sphere, with_scale({"known": True, "distance_between": ends, "length": 5}))
     fault = only_fault(sphere)
@@ -198,7 +191,7 @@ def test_a_bar_where_nothing_was_decoded_is_found_by_the_full_check(sphere: Path
         measured_length(scan, scan.scale.bar, scan.poses)
 
 
-def on_sphere(index: int, pixel: tuple[float, float]) -> np.ndarray:
+def on_sphere(index, pixel):
     """Where the ray of a pixel meets the sphere, by formula."""
     T = poses()[index][0]
     direction = np.array([(pixel[0] - CAMERA.cx) / CAMERA.fl_x, -(pixel[1] - CAMERA.cy) / CAMERA.fl_y, -1.0])
@@ -208,7 +201,7 @@ def on_sphere(index: int, pixel: tuple[float, float]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(tmp_path_factory):
     return write_sphere(tmp_path_factory.mktemp("scale") / "scan")
 
 
@@ -216,7 +209,7 @@ PIXEL = st.tuples(st.floats(-6, 6), st.floats(-6, 6))
 
 
 @given(st.sampled_from(range(4)), PIXEL, st.sampled_from(range(4)), PIXEL)
-def test_the_length_of_a_bar_is_that_between_the_points_on_the_surface(root, first, a, second, b) -> None:
+def test_the_length_of_a_bar_is_that_between_the_points_on_the_surface(root, first, a, second, b):
     """Pixels well inside the sphere; within 3 pixels its depth varies by little, and evenly to either side."""
     scan, ends = read_scan(root), []
     for index, (dx, dy) in ((first, a), (second, b)):
@@ -227,7 +220,7 @@ def test_the_length_of_a_bar_is_that_between_the_points_on_the_surface(root, fir
     assert measured_length(scan, bar, scan.poses) == pytest.approx(true, abs=1.0)  # of a sphere of radius 40
 
 
-def test_the_length_grows_with_the_poses_and_does_not_depend_on_the_world(root: Path) -> None:
+def test_the_length_grows_with_the_poses_and_does_not_depend_on_the_world(root):
     scan = read_scan(root)
     length = measured_length(scan, BAR, scan.poses)
     S = Similarity(2.5, np.diag([-1.0, -1.0, 1.0]), np.array([30.0, -500.0, 7.0]))

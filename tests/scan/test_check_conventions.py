@@ -1,22 +1,17 @@
 """Mixed-up conventions are found and named; honest rough scans are left alone."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
 
 from sl_nerfstudio.scan import check_scan
 from sl_nerfstudio.scan.check_conventions import (
     Correspondences,
-    Interpretation,
     apply_interpretation,
     convention_problems,
-    fit_geometry,
     other_interpretations,
     sample_pixels,
 )
@@ -27,7 +22,7 @@ OPENCV = np.diag([1.0, -1, -1, 1])
 KEYS = ("transform_matrix", "projector_transform_matrix")
 
 
-def frames_of(pairs: list[tuple[ndarray, ndarray]]) -> list[Correspondences]:
+def frames_of(pairs):
     """Correspondences of the sphere under these poses, with noise and 5 % wrong decodings."""
     random = np.random.default_rng(3)
     out = []
@@ -40,7 +35,7 @@ def frames_of(pairs: list[tuple[ndarray, ndarray]]) -> list[Correspondences]:
     return out
 
 
-def rigid_rig(count: int = 6) -> list[tuple[ndarray, ndarray]]:
+def rigid_rig(count=6):
     """A projector beside the camera, parallel to it: the case in which rays meet in OpenCV axes too."""
     out = []
     for index in range(count):
@@ -52,13 +47,11 @@ def rigid_rig(count: int = 6) -> list[tuple[ndarray, ndarray]]:
     return out
 
 
-def disturbed(
-    frames: list[Correspondences], degrees: float, mm: float, relative: float, seed: int
-) -> list[Correspondences]:
+def disturbed(frames, degrees, mm, relative, seed):
     """Frames as registration and auto-calibration leave them: RMS errors about the camera or the object."""
     random = np.random.default_rng(seed)
 
-    def motion(degrees: float, mm: float) -> ndarray:
+    def motion(degrees, mm):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec(random.normal(size=3) * np.radians(degrees) / 3**0.5).as_matrix()
         T[:3, 3] = random.normal(size=3) * mm / 3**0.5
@@ -79,7 +72,7 @@ def disturbed(
     return out
 
 
-def undo(interpretation: Interpretation, frame: Correspondences) -> Correspondences:
+def undo(interpretation, frame):
     """The frame as a user with that mistake would have written it."""
     mixed = {
         "as given": lambda T: T,
@@ -99,7 +92,7 @@ def undo(interpretation: Interpretation, frame: Correspondences) -> Corresponden
     )
 
 
-def test_interpretations_undo_what_users_do() -> None:
+def test_interpretations_undo_what_users_do():
     frame = frames_of(poses())[1]
     interpretations = list(other_interpretations())
     assert len(interpretations) == len(set(interpretations)) == 15 + 7 + 2
@@ -112,7 +105,7 @@ def test_interpretations_undo_what_users_do() -> None:
 
 @pytest.mark.parametrize("scene", [poses, rigid_rig])
 @pytest.mark.parametrize(("degrees", "mm", "relative"), [(0, 0, 0), (10, 30, 0.3)])
-def test_every_known_mistake_is_named(scene: Any, degrees: float, mm: float, relative: float) -> None:
+def test_every_known_mistake_is_named(scene, degrees, mm, relative):
     honest = disturbed(frames_of(scene()), degrees, mm, relative, seed=1)
     assert list(convention_problems(honest, PROJECTOR, 1e-3)) == []
     for interpretation in other_interpretations():
@@ -137,7 +130,7 @@ def test_every_known_mistake_is_named(scene: Any, degrees: float, mm: float, rel
 
 @pytest.mark.parametrize("count", [2, 3, 7])
 @pytest.mark.parametrize("relative", [0.3, 2.0])
-def test_honest_rough_scans_are_left_alone(count: int, relative: float) -> None:
+def test_honest_rough_scans_are_left_alone(count, relative):
     for seed in range(8):
         scene = rigid_rig(count) if seed % 2 else poses(count)
         rough = disturbed(frames_of(scene), 10, 30, relative, seed)
@@ -145,7 +138,7 @@ def test_honest_rough_scans_are_left_alone(count: int, relative: float) -> None:
 
 
 @pytest.mark.parametrize("how", [np.linalg.inv, lambda T: T @ OPENCV])
-def test_one_frame_with_other_conventions_than_the_rest(how: Any) -> None:
+def test_one_frame_with_other_conventions_than_the_rest(how):
     frames = frames_of(rigid_rig())
     one = frames[2]
     frames[2] = replace(one, T_world_camera=how(one.T_world_camera), T_world_projector=how(one.T_world_projector))
@@ -154,7 +147,7 @@ def test_one_frame_with_other_conventions_than_the_rest(how: Any) -> None:
     assert "does not fit the coordinates in this frame" in found[0][2].problem
 
 
-def test_poses_that_no_known_mistake_explains() -> None:
+def test_poses_that_no_known_mistake_explains():
     frames = frames_of(poses())
     random = Rotation.random(len(frames), random_state=np.random.RandomState(4)).as_matrix()
     lost = []
@@ -171,28 +164,14 @@ def test_poses_that_no_known_mistake_explains() -> None:
 @pytest.mark.parametrize(
     ("metres", "words"), [(1.0, "would put the object 2"), (1e-6, "would put the object 0.0002"), (None, "")]
 )
-def test_units_that_cannot_be(metres: float | None, words: str) -> None:
+def test_units_that_cannot_be(metres, words):
     found = list(convention_problems(frames_of(poses()), PROJECTOR, metres))
     assert [key for _, key, _ in found] == (["units"] if words else [])
     assert all(words in problem.problem and "m and mm mixed up" in problem.cause for _, _, problem in found)
 
 
-def test_spread_is_the_distance_between_the_frames_surfaces() -> None:
-    frames = frames_of(poses())
-    fit = fit_geometry(frames, PROJECTOR)
-    assert fit.typical_px < 0.5
-    assert np.median(np.linalg.norm(fit.clouds[0], axis=1)) == pytest.approx(40, abs=0.5)
-    apart = [
-        replace(f, T_world_camera=f.T_world_camera.copy(), T_world_projector=f.T_world_projector.copy()) for f in frames
-    ]
-    for index, frame in enumerate(apart):
-        frame.T_world_camera[0, 3] += 1e4 * index
-        frame.T_world_projector[0, 3] += 1e4 * index
-    assert np.allclose(fit_geometry(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
-
-
-def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:
-    def invert(document: dict[str, Any]) -> None:
+def test_world_to_camera_in_a_folder_tells_what_to_do(sphere):
+    def invert(document):
         for record in document["frames"]:
             for key in KEYS:
                 record[key] = np.linalg.inv(record[key]).tolist()
@@ -207,7 +186,7 @@ def test_world_to_camera_in_a_folder_tells_what_to_do(sphere: Path) -> None:
     assert fault.remedy == "store device to world in OpenGL axes (camera and projector matrices: invert them)"
 
 
-def test_metres_in_a_folder_of_millimetres(sphere: Path) -> None:
+def test_metres_in_a_folder_of_millimetres(sphere):
     edit(sphere, lambda document: document.update(units="m"))
     fault = only_fault(sphere)
     assert (fault.field, fault.problem) == ("units", "would put the object 270 m from the camera")
@@ -215,7 +194,7 @@ def test_metres_in_a_folder_of_millimetres(sphere: Path) -> None:
     assert check_scan(sphere) == []
 
 
-def test_coordinates_upside_down_in_a_folder(sphere: Path) -> None:
+def test_coordinates_upside_down_in_a_folder(sphere):
     for name in NAMES:
         path = sphere / "coords" / f"{name}.npz"
         coords = np.load(path)["coords"]

@@ -1,21 +1,25 @@
-"""The frame stage with a third decoder: decoding, resuming, and frames that fail."""
+"""The frame stage: decoding, resuming, frames that fail, and workers that end with their parent."""
 
 import io
 import json
 import mmap
 import os
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
+import time
 import weakref
 from contextlib import redirect_stdout
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing import records
+from sl_nerfstudio.processing import frames, records
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frames import FrameWorker, clouds_of, describe_frame_stage, run_frame_stage, run_frames
 from sl_nerfstudio.processing.records import digest
@@ -25,8 +29,6 @@ from sl_nerfstudio.storage import in_file
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
-
-pytestmark = pytest.mark.slow
 
 
 class KilledDecoder(RampsDecoder):
@@ -43,7 +45,7 @@ def copy(ramp_scan, tmp_path):
     return RampScan(tmp_path / "c", *list(vars(ramp_scan).values())[1:])
 
 
-def _captures(scan):
+def _found(scan):
     return find_captures(scan.root / "images", True)
 
 
@@ -68,6 +70,7 @@ def whole(ramp_scan, tmp_path_factory):
     return out, said
 
 
+@pytest.mark.slow
 def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
     out, said = whole
     assert "decoder ramps" in said
@@ -86,18 +89,8 @@ def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
     assert [frame["decode_rate"] for frame in document["frames"]] == [1.0] * 4
 
 
-def test_the_default_decoder_of_a_pattern_can_be_named_and_another_is_refused(
-    monkeypatch, ramps_registered, ramp_scan, tmp_path, capsys
-):
-    monkeypatch.setattr(sys, "argv", ["sl-process", *ramp_scan.flags(tmp_path / "s"), "--decoder", "network"])
-    with pytest.raises(SystemExit):
-        main()
-    assert "describes a pair of ramps, which --decoder network does not read" in capsys.readouterr().err
-    assert not (tmp_path / "s").exists()
-
-
 def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_time(ramp_scan, tmp_path):
-    config, job, captures = ramp_scan.config(tmp_path / "s"), ramp_scan.job(tmp_path / "w"), _captures(ramp_scan)
+    config, job, captures = ramp_scan.config(tmp_path / "s"), ramp_scan.job(tmp_path / "w"), _found(ramp_scan)
     first = run_frame_stage(config, job, captures)
     second = run_frame_stage(config, job, captures)
     assert [r.name for r in first] == [r.name for r in second] == list(NAMES)
@@ -114,7 +107,7 @@ def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_tim
 
 
 def test_a_changed_image_is_decoded_again(copy, tmp_path):
-    worker, frame = FrameWorker(copy.job(tmp_path / "w")), _captures(copy).frames[0]
+    worker, frame = FrameWorker(copy.job(tmp_path / "w")), _found(copy).frames[0]
     first = worker(frame)
     frame.images[0].write_bytes(frame.images[0].read_bytes() + b" ")
     again = worker(frame)
@@ -130,7 +123,7 @@ def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, t
     speckled[60:63, 60:64] = 30000
     (images / NAMES[3] / "0.png").write_bytes(encode_png(speckled))
     job = copy.job(tmp_path / "w")
-    results = run_frame_stage(copy.config(tmp_path / "s"), job, _captures(copy))
+    results = run_frame_stage(copy.config(tmp_path / "s"), job, _found(copy))
     assert [r.stage for r in results] == ["reading", "decoding", "decoding", "calibrating"]
     assert clouds_of(results) == []
     assert f"{NAMES[0]}/0.png: is not an image that can be read" in results[0].reason
@@ -146,24 +139,18 @@ def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, t
     }  # fmt: skip
 
 
-def test_an_image_that_breaks_after_it_was_found_is_a_failure_of_its_frame(copy, tmp_path):
-    frame = _captures(copy).frames[0]
-    frame.images[1].write_bytes(b"")
-    result = FrameWorker(copy.job(tmp_path / "w"))(frame)
-    assert result.stage == "reading" and "1.png: is empty" in result.reason and result.cloud is None
-
-
 def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
-    result = worker(_captures(ramp_scan).frames[1])
+    result = worker(_found(ramp_scan).frames[1])
     assert worker.load(result).rate == 1
     shutil.rmtree(tmp_path / "w")
     with pytest.raises(UserError, match=f"the decoded frame {NAMES[1]} is missing\n.*cause:.*\n.*remedy: start again"):
         worker.load(result)
 
 
+@pytest.mark.slow
 def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ramp_scan, tmp_path):
-    captures = _captures(ramp_scan)
+    captures = _found(ramp_scan)
     results = {r.name: r for r in run_frames(ramp_scan.job(tmp_path / "two"), captures.frames, 2)}
     alone = FrameWorker(ramp_scan.job(tmp_path / "one"))
     for frame in captures.frames:
@@ -176,10 +163,11 @@ def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ram
         list(run_frames(killed, captures.frames, 2))
 
 
+@pytest.mark.slow
 def test_results_of_other_processes_do_not_stay_in_memory(ramp_scan, tmp_path):
     """The caller moves clouds to a file once they are many: then nobody else may hold them."""
     gone = []
-    for result in run_frames(ramp_scan.job(tmp_path), _captures(ramp_scan).frames, 2):
+    for result in run_frames(ramp_scan.job(tmp_path), _found(ramp_scan).frames, 2):
         assert all(earlier() is None for earlier in gone[:-1])  # the last one waits in its future for the next
         gone.append(weakref.ref(result.cloud))
         del result
@@ -192,6 +180,7 @@ def _bytes_of(folder):
     return {name: content for name, content in found.items() if name.startswith(("coords", "mask", "transforms"))}
 
 
+@pytest.mark.slow
 def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whole, ramp_scan, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert _run_command(ramp_scan, tmp_path / "scan", 0)[1]
@@ -201,7 +190,7 @@ def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whol
 
 def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path))
-    clouds = clouds_of([worker(frame) for frame in _captures(ramp_scan).frames])
+    clouds = clouds_of([worker(frame) for frame in _found(ramp_scan).frames])
     size = sum(array.nbytes for array in (clouds[0].points, clouds[0].coords))
     kept = records.LargeClouds(6 * size)
     same = [kept.kept(cloud) for cloud in clouds]
@@ -213,3 +202,89 @@ def _mapped(array):
     while array is not None and not isinstance(array, mmap.mmap):
         array = getattr(array, "base", None)
     return array is not None
+
+
+_PARENT = """
+import os, time
+from concurrent.futures import as_completed
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.processing.frames import no_interrupts, worker_pool
+
+def begin(word):
+    print(word, os.getpid(), flush=True)
+
+def work(_):
+    time.sleep(120)
+
+def main():
+    with worker_pool(2, begin, "worker") as pool:
+        with no_interrupts():
+            futures = [pool.submit(work, k) for k in range(5)]
+        for future in as_completed(futures):
+            future.result()
+
+if __name__ == "__main__":
+    run(main)
+"""
+
+
+@pytest.fixture
+def busy(tmp_path):
+    """A parent with two workers at work, in a process group of their own, and the numbers of the workers."""
+    script = tmp_path / "parent.py"
+    script.write_text(_PARENT)
+    process = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    workers = [int(process.stdout.readline().split()[1]) for _ in range(2)]
+    yield process, workers
+    process.kill()
+    process.communicate()
+
+
+def _running(process):
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _all_end(workers):
+    end = time.monotonic() + 60
+    while any(map(_running, workers)) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not any(map(_running, workers))
+
+
+@pytest.mark.slow
+def test_workers_end_when_their_parent_is_killed(busy):
+    parent, workers = busy
+    parent.kill()
+    assert _all_end(workers)
+    assert "Traceback" not in "".join(parent.communicate())  # Python's own tracker may warn of what it released
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "to_all", "status", "said"),
+    [(signal.SIGINT, True, 130, "interrupted\n"), (signal.SIGTERM, False, 143, "terminated\n")],
+)
+def test_a_signal_ends_the_workers_and_only_the_parent_speaks(busy, number, to_all, status, said):
+    """Control-C in a terminal reaches the workers, too."""
+    parent, workers = busy
+    (os.killpg if to_all else os.kill)(parent.pid, number)
+    assert parent.communicate(timeout=100) == ("", said) and parent.returncode == status
+    assert _all_end(workers)
+
+
+@pytest.mark.parametrize(
+    "megapixels, gigabytes, expected",
+    [(0.36, 64, 16), (0.36, 8, 3), (12.2, 16, 3), (12.2, 64, 13), (24, 32, 4), (0.36, 2, 1), (50, 4, 1)],
+)
+def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, megapixels, gigabytes, expected):
+    monkeypatch.setattr(frames, "cores", lambda: 16)
+    found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
+    assert found == expected
+    assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes
