@@ -13,9 +13,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.field.backend import FieldState, Pulled
-from sl_nerfstudio.field.hash_grid import GridLayout
+from sl_nerfstudio.field.hash_grid import FEATURES, GridLayout
 from sl_nerfstudio.field.numba_grid import FIRST, POINTS, GridArrays, clamped, encode, inside, scatter_level
-from sl_nerfstudio.field.simd import FEATURES, contract, kernel, multiply, part
+from sl_nerfstudio.field.simd import contract, kernel, multiply, part
 from sl_nerfstudio.parallel import parallel, split, threads
 
 # The MLP in numba, on one chunk of encoded points at a time.
@@ -381,7 +381,6 @@ def pack_grid(layout: GridLayout, state: FieldState) -> GridArrays:
         offsets=np.array(layout.offsets, np.int64),
         sizes=np.array(layout.sizes, np.int64),
         hashed=np.array(layout.hashed, np.bool_),
-        smooth=layout.smooth,
     )
 
 

@@ -22,12 +22,12 @@ from sl_nerfstudio.console import Phase, paragraph, phase
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.field import numba_backend
 from sl_nerfstudio.field.backend import TableGradient
-from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.field import MIN_RESOLUTION, FieldConfig, SDFField
 from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.simd import needs_compiling
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.model.optimisers import make_recordable
-from sl_nerfstudio.model.processes import greatest, several, share_state, shared_optimizers
+from sl_nerfstudio.model.processes import SharedOptimizers, greatest, several, share_state
 from sl_nerfstudio.model.run_files import (
     INTERRUPTION,
     PARTIAL,
@@ -78,7 +78,7 @@ def finish() -> None:
 def compile_step() -> None:
     """Call every loop of a step, and of evaluation, with a tiny field."""
     torch.set_num_threads(1)
-    field = SDFField(FieldConfig(levels=1, min_resolution=2, max_resolution=2, hidden=16, backend="numba"))
+    field = SDFField(FieldConfig(levels=1, max_resolution=MIN_RESOLUTION, hidden=16, backend="numba"))
     table = field.encoding.table
     p = torch.zeros(8, 3)
     value, gradient = field.sdf_and_gradient(p)
@@ -211,7 +211,9 @@ class DeviceRates:
                 group["lr"] = number
 
 
-LEAST_STEPS = 100  # between two checkpoints that are written because of the time
+# Between two checkpoints that are written because of the time.
+SECONDS_PER_SAVE = 60.0
+LEAST_STEPS = 100
 _STEPS_PER_AGREEMENT = 10  # of several processes on whether to stop: each agreement waits for all of them
 
 
@@ -220,7 +222,7 @@ class SLTrainer(Trainer):
 
     - Poses are adjusted before the first step, whose time would otherwise include it, and saved.
     - Each phase prints one line, with a bar or the time left while it runs; nerfstudio itself is quiet.
-    - A checkpoint is also written when `seconds_per_save` seconds and 100 steps have passed, and on SIGINT and SIGTERM,
+    - A checkpoint is also written when 60 seconds and 100 steps have passed, and on SIGINT and SIGTERM,
       which then end the process with status 130 or 143.
     - A checkpoint is complete or not there. Files in its folder that are no checkpoints are left alone.
     - A checkpoint that does not fit the model gives a message.
@@ -240,8 +242,10 @@ class SLTrainer(Trainer):
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         quiet_nerfstudio(not config.verbose)  # also in the processes of several GPUs
         super().__init__(config, local_rank, world_size)
-        if several() and comms.is_main_process():
-            INTERRUPTION.install()  # a process alone did so when it checked its settings
+        if several():  # a process alone did so when it checked its settings
+            INTERRUPTION.install(patient=True)
+            if config.machine.device_type == "cuda":
+                torch.cuda.set_device(local_rank)
         self._phases = ExitStack()
         self._training = Phase("train")
 
@@ -258,7 +262,7 @@ class SLTrainer(Trainer):
     def setup_optimizers(self) -> Optimizers:
         """Make the optimisers; see nerfstudio's Trainer."""
         if several():
-            return shared_optimizers(self.config.optimizers, self.pipeline.get_param_groups())
+            return SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
         return super().setup_optimizers()
 
     def train(self) -> None:
@@ -366,7 +370,7 @@ class SLTrainer(Trainer):
         self._training.update(step + 1, self._start_step + self.config.max_num_iterations, self._fit())
         saved, when = self._saved
         since = step - (self._start_step - 1 if saved is None else saved)
-        if since >= LEAST_STEPS and time.monotonic() - when >= self.config.seconds_per_save:
+        if since >= LEAST_STEPS and time.monotonic() - when >= SECONDS_PER_SAVE:
             self.save_checkpoint(step)
         if not several():
             INTERRUPTION.release()

@@ -39,24 +39,21 @@ from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
 
 _STEP = 1e-5  # scene units and radian, of central differences
+# 1 sigma of starting poses if the scan does not state it in `sl_pose_sigma`.
+FRAME_ROTATION_DEG = 2.0  # orientation of a frame in the world
+FRAME_TRANSLATION = 0.1  # position of a frame's part of the surface, as a share of the object's radius
+RELATIVE_ROTATION_DEG = 0.3  # orientation of the projector relative to the camera
+RELATIVE_TRANSLATION = 0.05  # position of the projector relative to the camera, as a share of the baseline
 _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable
 
 
 @dataclass
 class PriorConfig:
-    """1 sigma of intrinsics, and of starting poses if the scan does not state it in `sl_pose_sigma`."""
+    """How well the intrinsics are known."""
 
-    frame_rotation_deg: float = 2.0
-    """Orientation of a frame in the world, in degrees."""
-    frame_translation: float = 0.1
-    """Position of a frame's part of the surface, as a share of the object's radius."""
-    relative_rotation_deg: float = 0.3
-    """Orientation of the projector relative to the camera, in degrees."""
-    relative_translation: float = 0.05
-    """Position of the projector relative to the camera, as a share of the baseline."""
     intrinsics: float = INTRINSICS_SIGMA
-    """Focal lengths and principal points of both devices, as a share of the focal length; they increase the stated
-    uncertainty of the poses."""
+    """1 sigma of focal lengths and principal points of both devices, as a share of the focal length; it increases the
+    stated uncertainty of the poses."""
 
 
 @dataclass(frozen=True)
@@ -84,27 +81,16 @@ def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
     """Uncertainty of each frame's starting pose, as stated or else by default; in scene units and radian."""
-    rows = []
-    for frame, length in zip(scan.frames, scan.poses.baseline * S_scene_world.scale, strict=True):
+    scale, rows = S_scene_world.scale, []
+    for frame, length in zip(scan.frames, scan.poses.baseline * scale, strict=True):
         stated = frame.pose_sigma
         if stated is None:
-            rows.append(
-                (
-                    config.frame_translation,
-                    np.radians(config.frame_rotation_deg),
-                    config.relative_translation * length,
-                    np.radians(config.relative_rotation_deg),
-                )
-            )
+            frame_sigma, relative_sigma = FRAME_TRANSLATION, RELATIVE_TRANSLATION * length
+            angles = FRAME_ROTATION_DEG, RELATIVE_ROTATION_DEG
         else:
-            rows.append(
-                (
-                    stated.camera_translation * S_scene_world.scale,
-                    np.radians(stated.camera_rotation_deg),
-                    stated.relative_translation * S_scene_world.scale,
-                    np.radians(stated.relative_rotation_deg),
-                )
-            )
+            frame_sigma, relative_sigma = stated.camera_translation * scale, stated.relative_translation * scale
+            angles = stated.camera_rotation_deg, stated.relative_rotation_deg
+        rows.append((frame_sigma, np.radians(angles[0]), relative_sigma, np.radians(angles[1])))
     sigma = torch.tensor(np.maximum(np.array(rows), _LEAST_SIGMA), dtype=torch.float64)
     a, b, c, d = sigma.unbind(1)
     return PosePrior(a, b, c, d, config.intrinsics, scan.intrinsics_change)
