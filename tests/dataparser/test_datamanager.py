@@ -9,8 +9,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
-from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
-from sl_nerfstudio.errors import ScanError, UserError
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import (
     UNCHANGED,
     Device,
@@ -90,15 +90,6 @@ def test_training_and_evaluation_pixels_are_disjoint(datamanager: SLDataManager)
     assert of_frames == {(i, *p) for i, item in enumerate(items) for p in item[..., 0].nonzero().tolist()}
 
 
-def test_held_out_batch_is_thinned_evenly(datamanager: SLDataManager) -> None:
-    for frame in range(3):
-        everything = datamanager.held_out_batch(frame, 10**6)[1]["indices"]
-        few = datamanager.held_out_batch(frame, 5)[1]["indices"]
-        assert len(few) == min(5, len(everything))
-        if len(everything) > 5:
-            assert few[0].tolist() == everything[0].tolist() and few[-1].tolist() == everything[-1].tolist()
-
-
 def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
     one, other = manager(tiny_root), manager(tiny_root)
     for step in range(3):
@@ -108,24 +99,6 @@ def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
     assert not torch.equal(other.next_train(7)[1]["indices"], one.next_train(8)[1]["indices"])
     first = one.next_train(9)[1]["indices"]
     assert not torch.equal(first, one.next_train(9)[1]["indices"])
-
-
-def test_exporters_set_the_number_of_rays_from_outside(tiny_root: Path) -> None:
-    m = manager(tiny_root)
-    m.train_pixel_sampler.num_rays_per_batch = 5000  # more than there are pixels in a frame
-    assert m.get_train_rays_per_batch() == 5000
-    assert len(m.next_train(0)[0]) == 5000
-
-
-def test_every_split_holds_all_frames_with_their_numbers(datamanager: SLDataManager) -> None:
-    for dataset in (datamanager.train_dataset, datamanager.eval_dataset):
-        assert dataset.cameras.metadata is not None
-        assert dataset.cameras.metadata["sl_view"].tolist() == [[0], [1], [2]]
-        assert len(dataset) == 3
-    for i, (camera, batch) in enumerate(datamanager.fixed_indices_eval_dataloader):
-        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
-        assert (rays.metadata["sl_view"] == i).all() and rays.metadata["sl_view"].shape == (40, 48, 1)
-        assert batch["image_idx"] == i
 
 
 def test_whole_frames(datamanager: SLDataManager) -> None:
@@ -274,17 +247,7 @@ def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, 
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
 
 
-def test_data_may_be_the_transforms_json_itself(tiny_root: Path) -> None:
-    assert sl_data.config.__class__ is SLDataParserConfig
-    assert len(manager(tiny_root / "transforms.json").train_dataset) == 3
-
-
 def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
     config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
     with pytest.raises(UserError, match="does not describe a projector"):
         config.setup(device="cpu")
-
-
-def test_a_folder_that_is_not_a_scan(tmp_path: Path) -> None:
-    with pytest.raises(ScanError, match=r"transforms\.json"):
-        manager(tmp_path)

@@ -23,6 +23,7 @@ def samples(scan: Scan) -> PixelSamples:
 
 
 def test_every_masked_pixel_occurs_once_with_its_own_values(scan: Scan, samples: PixelSamples) -> None:
+    assert samples.records.is_contiguous() and samples.records.nbytes == 20 * len(samples)  # bytes a pixel
     assert samples.first.tolist() == np.cumsum([0, *(f.read_mask().sum() for f in scan.frames)]).tolist()
     for number, frame in enumerate(scan.frames):
         pixels = samples.at(torch.arange(int(samples.first[number]), int(samples.first[number + 1])))
@@ -37,24 +38,10 @@ def test_every_masked_pixel_occurs_once_with_its_own_values(scan: Scan, samples:
         np.testing.assert_array_equal(pixels.decoded.numpy(), ~np.isnan(frame.read_coords()[row, column]).any(-1))
 
 
-def test_memory_is_20_bytes_a_pixel_that_lie_together(samples: PixelSamples) -> None:
-    assert samples.records.is_contiguous() and samples.records.nbytes == 20 * len(samples)
-    columns = (samples.frame, samples.row, samples.column, samples.coords, samples.pattern, samples.held_out)
-    storage = samples.records.untyped_storage()
-    assert all(c.untyped_storage().data_ptr() == storage.data_ptr() for c in columns)  # none is a copy
-
-
 def test_the_decoded_share_is_that_of_all_pixels(samples: PixelSamples, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sl_nerfstudio.dataparser.dataparser._AT_ONCE", 7)
     assert 0 < samples.decoded_share < 1
     assert samples.decoded_share == pytest.approx(float(samples.coords[:, 0].isfinite().double().mean()), rel=1e-12)
-
-
-def test_the_first_frames_alone_are_a_table(samples: PixelSamples) -> None:
-    some = samples.first_frames(2)
-    assert len(some) == int(samples.first[2]) and some.frame.unique().tolist() == [0, 1]
-    assert torch.equal(some.held_out_index, some.held_out.nonzero()[:, 0])
-    assert torch.equal(some.held_out_of(1), samples.held_out_of(1))
 
 
 def test_training_draws_never_touch_held_out_pixels_and_reach_all_others(samples: PixelSamples) -> None:
@@ -78,11 +65,6 @@ def test_held_out_draws_and_held_out_of_a_frame(samples: PixelSamples) -> None:
     assert torch.equal(torch.cat(parts), samples.held_out.nonzero()[:, 0])
     for number, part in enumerate(parts):
         assert (samples.frame[part] == number).all()
-
-
-def test_same_generator_same_draw(samples: PixelSamples) -> None:
-    draws = [samples.draw(100, torch.Generator().manual_seed(7)) for _ in range(2)]
-    assert torch.equal(*draws)
 
 
 def test_without_mask_files_the_decoded_pixels_count(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_pixel_table_that_does_not_fit_is_copied_batch_by_batch(begin, monkeyp
         training.step()
         with gpu.counting() as seen:
             training.step()
-        assert seen.waits and all("samples.py" in place for place in seen.waits), dict(seen.waits)
+        assert seen.waits and all("dataparser.py" in place for place in seen.waits), dict(seen.waits)
 
 
 def test_the_pretended_gpu_finds_what_a_gpu_refuses_or_waits_for():

@@ -19,8 +19,8 @@ from sl_nerfstudio.rendering.direct_losses import (
     direct_losses,
     field_losses,
 )
-from sl_nerfstudio.rendering.losses import LossConfig, SamplingConfig, coordinate_loss, pattern_loss
-from sl_nerfstudio.rendering.renderer import Renderer
+from sl_nerfstudio.rendering.losses import LossConfig, coordinate_loss, pattern_loss
+from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
 from sl_nerfstudio.rendering.warp_step import (
     Current,
     Devices,
@@ -175,7 +175,7 @@ class Settings:
 
 
 def sampling(strategy: str) -> SamplingConfig:
-    return SamplingConfig(strategy, samples=SAMPLES, render_rays=RENDERED, eikonal_points=OTHERS)
+    return SamplingConfig(strategy=strategy, samples=SAMPLES, render_rays=RENDERED, eikonal_points=OTHERS)
 
 
 PAPER = LossConfig(coordinates=0.0, coordinates_per_pixel=0.02, pattern=0.05, eikonal=0.01, surface=0.0, free_space=0.0)

@@ -33,12 +33,6 @@ def test_intervals_end_on_the_sphere(radius):
     assert (near >= 0).all() and (far > near).logical_or(~meets).all()
 
 
-def test_a_sphere_behind_is_not_met_and_stays_finite():
-    o, d = torch.tensor([[0.0, 0.0, 3.0]]), torch.tensor([[0.0, 0.0, 1.0]])
-    near, far, meets = sphere_interval(o, d)
-    assert not meets.any() and near.isfinite().all() and (far > near).all()
-
-
 def test_samples_are_ascending_one_in_each_stratum():
     near, far = torch.tensor([1.0, 0.0]), torch.tensor([3.0, 0.5])
     middles = uniform_samples(near, far, 4, jitter=False)
