@@ -109,7 +109,7 @@ def _structures() -> list[Case]:
         "hidden: 10**9": lambda text: re.sub(r"hidden: \d+", "hidden: 1000000000", text),
         "log2_table_size: 60": lambda text: re.sub(r"log2_table_size: \d+", "log2_table_size: 60", text),
         "levels: -1": lambda text: re.sub(r"levels: \d+", "levels: -1", text),
-        "kappa_end: .nan": lambda text: re.sub(r"kappa_end: \S+", "kappa_end: .nan", text),
+        "eikonal: .nan": lambda text: re.sub(r"eikonal: \S+", "eikonal: .nan", text),
     }
     found = []
     for title, change in changes.items():
@@ -282,7 +282,7 @@ def _mixed_up() -> list[Case]:
 
     for old, new in (
         (r"seed: 42", "seed: 43"),
-        (r"kappa_end: \S+", "kappa_end: 300.0"),
+        (r"eikonal: \S+", "eikonal: 0.3"),
         (r"scan_fingerprint: \w", "scan_fingerprint: 0x"),
         (r"settings_fingerprint: \w{4}", "settings_fingerprint: abcd"),
         (r"schedule_iterations: 20", "schedule_iterations: 40"),

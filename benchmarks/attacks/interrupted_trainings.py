@@ -31,7 +31,7 @@ _MOMENTS: dict[str, tuple[str, str, int]] = {
     "reading the scan": ("sl_nerfstudio.model.trainer", "load_scan", 1),
     "taking the folder": ("sl_nerfstudio.model.trainer", "RunFolder", 0),
     "writing config.yml": ("sl_nerfstudio.model.trainer", "write_atomic", 0),
-    "making the model": ("sl_nerfstudio.model.model", "make_pose_parameters", 0),
+    "making the model": ("sl_nerfstudio.model.model", "PoseParameters", 0),
     "the adjustment": ("sl_nerfstudio.model.model", "adjust_scan", 0),
     "storing the adjusted poses": ("sl_nerfstudio.model.model", "measure_decoding", 0),
     "the first checkpoint": ("torch", "save", 0),

@@ -1,4 +1,4 @@
-"""Checks before training starts: faults are found before anything is written."""
+"""What `ns-train` is asked for, and what is checked before it starts: faults are found before anything is written."""
 
 import shlex
 import sys
@@ -66,7 +66,12 @@ class SLTrainerConfig(TrainerConfig):
             quiet_nerfstudio(not self.verbose)
 
     def set_timestamp(self) -> None:
-        """Check the run and take its folder; nerfstudio calls this first, before it writes anything.
+        """Prepare the run: nerfstudio calls this first, before it writes anything, and has no other place for it."""
+        super().set_timestamp()
+        self.prepare_run()
+
+    def prepare_run(self) -> None:
+        """Check everything that can be wrong, complete the settings, and take the run's folder.
 
         An error that the user can fix is printed without a traceback and ends the process with status 1.
         """
@@ -75,9 +80,7 @@ class SLTrainerConfig(TrainerConfig):
         if self.machine.num_devices * self.machine.num_machines == 1:
             INTERRUPTION.install()
         try:
-            begun = self._continue() if self.last_step is not None else self.prepare()
-            super().set_timestamp()
-            self._take_folder(begun)
+            self._take_folder(self._continue() if self.last_step is not None else self.prepare())
         except UserError as error:
             INTERRUPTION.remove()
             print(f"error: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What a run's folder holds, without running anything from it: for runs from elsewhere, and before an export."""
+"""A trained run: its config.yml, read without running anything from it, its checkpoint, and its model."""
 
 import enum
 import json
@@ -54,6 +54,13 @@ def read_config(path: Path) -> SLTrainerConfig:
             raise ValueError(f"it has {path.stat().st_size / 1e6:.0f} MB")
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
     except _NotExpected as error:
+        if error.earlier:
+            raise UserError(
+                f"{path}, line {error.line}: this run was trained by an earlier version of this package\n"
+                f"    cause:  {error.problem}\n"
+                "    remedy: train again with this version, which reads the scan folder as before, or open the run with "
+                "the one that trained it"
+            ) from error
         raise UserError(
             f"{path}, line {error.line}: {error.problem}\n"
             "    cause:  it is not a run of sl-neus or sl-neus-paper, is of another version of this package, or "
@@ -89,6 +96,13 @@ class _NotExpected(Exception):
 
     def __init__(self, node: yaml.Node, problem: str) -> None:
         self.line, self.problem = node.start_mark.line + 1, problem
+        self.earlier = False  # whether it is a class or a setting that this package no longer has
+
+
+def _no_longer(node: yaml.Node, problem: str) -> _NotExpected:
+    found = _NotExpected(node, problem)
+    found.earlier = True
+    return found
 
 
 @dataclass(frozen=True)
@@ -118,6 +132,10 @@ def _name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__name__}"
 
 
+def _is_ours(name: str) -> bool:
+    return name.startswith(f"{__name__.partition('.')[0]}.")
+
+
 def _parts(value: Any) -> Iterator[Any]:
     yield value
     if is_dataclass(value) and not isinstance(value, type):
@@ -142,6 +160,8 @@ class _ConfigLoader(yaml.SafeLoader):
 
     def settings(self, name: str, node: yaml.Node) -> Any:
         """An instance of an expected class, with exactly its fields and with values of their types."""
+        if _is_ours(name) and name not in _expected().settings:
+            raise _no_longer(node, f"there is no class {name} of settings any more")
         if name not in _expected().settings or not isinstance(node, yaml.MappingNode):
             raise _NotExpected(node, f"{name} is not a class of settings that is expected here")
         kind = type(_expected().settings[name])
@@ -149,7 +169,9 @@ class _ConfigLoader(yaml.SafeLoader):
         names, hints = [field.name for field in fields(kind)], _hints(name)
         for key, item in node.value:
             if key.value not in names:
-                raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}")
+                raise (_no_longer if _is_ours(name) else _NotExpected)(
+                    key, f"{kind.__name__} has no setting {key.value!r}"
+                )
             if not _fits(values[key.value], hints[key.value]):
                 raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
         missing = [name for name in names if name not in values]
@@ -171,6 +193,8 @@ class _ConfigLoader(yaml.SafeLoader):
 
     def named(self, name: str, node: yaml.Node) -> type:
         """One of the classes that settings are for."""
+        if _is_ours(name) and name not in _expected().targets:
+            raise _no_longer(node, f"there is no class {name} any more")
         if name not in _expected().targets:
             raise _NotExpected(node, f"{name} is not a class that is expected here")
         return _expected().targets[name]

@@ -89,7 +89,7 @@ def edited(copy: Path, change: Callable[[object], None]) -> Path:
 
 
 def test_settings_that_were_edited_are_refused(copy):
-    edited(copy, lambda config: setattr(config.pipeline.model.annealing, "kappa_end", 300.0))
+    edited(copy, lambda config: setattr(config.pipeline.model.losses, "eikonal", 0.3))
     with pytest.raises(UserError, match=r"its settings are not those that the run was started with"):
         load_run(copy)
     with pytest.raises(UserError, match=r"its settings are not those that the run was started with"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.methods import sl_neus_paper
 from sl_nerfstudio.model.run_files import LOCK, RunFolder
 from tests.model.training.small_runs import (
     child,
@@ -53,16 +53,6 @@ def test_a_folder_that_a_killed_process_left_empty_is_used(scan_root, tmp_path):
     (folder / ".checkpoint.partial").write_text("half")
     train(settings(scan_root, tmp_path, steps=1))
     assert not list(folder.glob("*.partial")) and last_state(folder)["step"] == 0
-
-
-def test_a_run_is_trained_further_in_its_own_folder(scan_root, tmp_path):
-    """The README's command. Both halves together are the run that was not split."""
-    train(settings(scan_root, tmp_path, "whole", steps=8))
-    train(settings(scan_root, tmp_path, "split", steps=4, schedule_iterations=8))
-    folder = folder_of(tmp_path, "split")
-    further = settings(scan_root, tmp_path, "split", steps=4, load_dir=folder / "nerfstudio_models")
-    train(further)
-    require_equal(last_state(folder), last_state(folder_of(tmp_path, "whole")))
 
 
 def test_a_run_whose_schedule_has_ended_is_trained_further_as_if_it_had_not_stopped(scan_root, finished, tmp_path):
@@ -172,7 +162,3 @@ def test_numbers_and_names_that_no_training_can_have(scan_root, tmp_path, capfd,
 def test_a_place_that_cannot_be_written(place):
     with pytest.raises(UserError, match=r"cannot be written \((.|\n)*--output-dir"):
         RunFolder(Path(place))
-
-
-def test_the_viewer_listens_on_this_machine_only():
-    assert {method.config.viewer.websocket_host for method in (sl_neus, sl_neus_paper)} == {"127.0.0.1"}
