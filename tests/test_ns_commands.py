@@ -284,11 +284,7 @@ def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
-        call(
-            ns_export.entrypoint,
-            monkeypatch,
-            *("marching-cubes", "--load-config", config, "--output-dir", tmp_path),
-        )
+        call(ns_export.entrypoint, monkeypatch, *("marching-cubes", "--load-config", config, "--output-dir", tmp_path))
     err = capfd.readouterr().err
     assert end.value.code == 1 and len(err.splitlines()) == 1
     assert err.startswith("error: ns-export marching-cubes needs a GPU") and "sl-export --load-config" in err

@@ -354,10 +354,7 @@ class _Merged(torch.autograd.Function):
 
 
 def value(
-    backend: FieldBackend | MergedBackend,
-    buffer: TableGradient | None,
-    state: FieldState,
-    p: Float[Tensor, "n 3"],
+    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n"]:
     """Values at `p`, differentiable with respect to parameters and points.
 
@@ -369,10 +366,7 @@ def value(
 
 
 def value_and_gradient(
-    backend: FieldBackend | MergedBackend,
-    buffer: TableGradient | None,
-    state: FieldState,
-    p: Float[Tensor, "n 3"],
+    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
     if isinstance(backend, MergedBackend):

@@ -15,10 +15,8 @@ from sl_nerfstudio.field.simd import gather, gather_jacobian, kernel, part, pref
 # The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features per level.
 #
 # A chunk of points is encoded into `e` [POINTS, depth]: columns 0..2 the point, 3 the constant 1 (it carries the
-# first
-# layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS, 3,
-# depth]
-# holds the derivatives of the level columns with respect to the three coordinates.
+# first layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS,
+# 3, depth] holds the derivatives of the level columns with respect to the three coordinates.
 
 POINTS = 128
 """Points per chunk: its activations stay in the core's own cache."""

@@ -48,9 +48,8 @@ if TYPE_CHECKING:
 
 # The loops of a training step, compiled by another process while this one reads the scan and adjusts the poses.
 #
-# Machine code is kept on disk, so this is done once. It takes a quarter of a minute, and half of that Python's
-# lock: a
-# thread of this process would gain little.
+# Machine code is kept on disk, so this is done once. It takes a quarter of a minute, and half of that Python's lock:
+# a thread of this process would gain little.
 
 _LONGEST = 120  # seconds that `finish` waits; what is missing then is compiled here, when it is used
 _CODE = f"from {__name__} import compile_step; compile_step()"
@@ -97,12 +96,10 @@ def compile_step() -> None:
 
 # Training steps recorded as a CUDA graph: one launch a step in place of thousands.
 #
-# A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step
-# to
+# A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step to
 # step must therefore be in tensors that are written before: sharpness, widths and level weights (the model's
-# buffers),
-# learning rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new graph is
-# recorded.
+# buffers), learning rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new
+# graph is recorded.
 
 WARM_UP = 3  # steps before a recording, so that libraries and constants are there
 

@@ -58,20 +58,20 @@ class PriorConfig:
 
 @dataclass(frozen=True)
 class ScanAdjustment:
-    """Adjusted poses in the scene frame, or the starting ones if adjusting did not help."""
+    """Adjusted poses in the scene frame and the scan's gauge, or the starting ones if adjusting did not help."""
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
     factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
-    cross_validation: CrossValidation
     noise_px: float
-    intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
-    unplaced: tuple[int, ...] = ()  # frames that do not agree with the others
+    intrinsics: SelfCalibration | None  # None where nothing was adjusted
+    unplaced: tuple[int, ...]  # frames that do not agree with the others
+    cross_validation: CrossValidation | None = None  # None before it was done
 
     @property
     def adjusted(self) -> bool:
         """Whether `rig` is the adjusted one."""
-        return self.cross_validation.better
+        return self.cross_validation is None or self.cross_validation.better
 
 
 def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
@@ -111,27 +111,13 @@ def adjust_scan(
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
     if decision.better:
-        return ScanAdjustment(
-            found.rig, found.sigma, found.factor, decision, found.noise_px, found.intrinsics, found.unplaced
-        )
+        return replace(found, cross_validation=decision)
     nothing_learnt = decision.worse or refine == "off"
     sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
-    return ScanAdjustment(start, sigma, factor, decision, found.noise_px, found.intrinsics, found.unplaced)
+    return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision)
 
 
-@dataclass(frozen=True)
-class Found:
-    """An adjustment in the scan's gauge, before cross-validation."""
-
-    rig: Rig
-    sigma: Float[Tensor, "frames 12"]
-    factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
-    noise_px: float
-    intrinsics: SelfCalibration | None
-    unplaced: tuple[int, ...]  # frames that do not agree with the others
-
-
-def _known_by_both(start: Rig, found: Found) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
+def _known_by_both(start: Rig, found: ScanAdjustment) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
     """Uncertainty of starting poses with which the captures agree as well as with the adjusted ones.
 
     They may be wrong by as much as the adjusted ones, and by as much as the two differ.
@@ -151,8 +137,8 @@ def adjusted(
     refine: RefinePoses,
     prior: PosePrior,
     settings: AdjustmentSettings,
-) -> Found:
-    """Adjust the scan's poses from `start`, and restore the scan's lengths."""
+) -> ScanAdjustment:
+    """Adjust the scan's poses from `start`, and restore the scan's lengths; not cross-validated."""
     begin = constrained(refine, start)
     found: Adjustment = adjust(begin, maps, prior, refine, settings)
     # a frame whose starting pose proved to be wrong must not turn or stretch the scene
@@ -162,7 +148,7 @@ def adjusted(
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(_motion(found.rig, rig)).factor)
     known = known_length(scan, S_scene_world, refine, rig, prior)
-    return Found(
+    return ScanAdjustment(
         rig, found.sigma, with_known_length(factor, rig, known), found.noise_px, found.intrinsics, found.unplaced
     )
 

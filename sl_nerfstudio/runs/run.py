@@ -9,28 +9,24 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path, PosixPath
-from typing import Any, Literal, Protocol, Union, cast, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 import yaml
-from jaxtyping import Float
-from numpy import ndarray
-from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import scan_fingerprint, scan_root
 from sl_nerfstudio.errors import UserError, first_line, last_line
-from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.late_imports import compiler_on_demand, shapes_without_symbols
 from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
+from sl_nerfstudio.model.outputs import TrainedModel
 from sl_nerfstudio.model.pipeline import SLPipelineConfig, require_together
 from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.scan import Scan, read_scan
+from sl_nerfstudio.scan import read_scan
 
 # config.yml of a run, read without running anything from it: only the settings of this package's runs are made.
 #
@@ -58,7 +54,7 @@ def read_config(path: Path) -> SLTrainerConfig:
             raise UserError(
                 f"{path}, line {error.line}: this run was trained by an earlier version of this package\n"
                 f"    cause:  {error.problem}\n"
-                "    remedy: train again with this version, which reads the scan folder as before, or open the run with "
+                "    remedy: train again with this version, which reads the scan folder as before, or open it with "
                 "the one that trained it"
             ) from error
         raise UserError(
@@ -247,52 +243,6 @@ def _fits(value: Any, hint: Any) -> bool:
 # A finished training run, loaded for export on the GPU if there is one, else on the CPU.
 
 _SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
-
-
-@runtime_checkable
-class TrainedModel(Protocol):
-    """What an export needs from a model; poses are in the scan's world and unit, the field is in the scene frame."""
-
-    scan: Scan
-    S_scene_world: Similarity
-
-    @property
-    def cell(self) -> float:
-        """Length of the field's finest cells, in the scan's unit."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Where the field is evaluated."""
-        ...
-
-    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Signed distance in scene units."""
-        ...
-
-    def poses(self) -> DevicePoses:
-        """Poses of cameras and projectors."""
-        ...
-
-    def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
-        """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
-        ...
-
-    def joint_covariance(self) -> JointCovariance | None:
-        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
-        ...
-
-    def unplaced(self) -> list[bool]:
-        """Of each frame, whether it does not agree with the others."""
-        ...
-
-    def self_calibration(self) -> SelfCalibration | None:
-        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
-        ...
-
-    def history(self) -> dict[str, list[float]]:
-        """Convergence curves, with the steps under `step`."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,7 @@ from PIL import Image
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import (
-    UNCHANGED,
-    Device,
-    Intrinsics,
-    IntrinsicsChange,
-    project,
-    unproject,
-)
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
 from sl_nerfstudio.geometry.lie import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 

@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.dataparser.dataparser import (
-    BLOCK,
-    FRACTION,
-    block_hash,
-    held_out_pixels,
-)
+from sl_nerfstudio.dataparser.dataparser import BLOCK, FRACTION, block_hash, held_out_pixels
 
 
 def test_share_of_held_out_pixels_over_many_frames() -> None:

@@ -10,13 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.dataparser.dataparser import (
-    build_samples,
-    enclosing_sphere,
-    normalisation,
-    upright,
-    without_lonely,
-)
+from sl_nerfstudio.dataparser.dataparser import build_samples, enclosing_sphere, normalisation, upright, without_lonely
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.scan import Scan, read_scan

@@ -22,8 +22,8 @@ from sl_nerfstudio.methods import sl_neus
 from sl_nerfstudio.model import messages
 from sl_nerfstudio.model.messages import RefinedIntrinsics, poses_message, refine_intrinsics, refined_intrinsics_message
 from sl_nerfstudio.model.pose_refinement import (
-    Found,
     PriorConfig,
+    ScanAdjustment,
     adjust_scan,
     adjusted,
     known_length,
@@ -33,16 +33,7 @@ from sl_nerfstudio.model.pose_refinement import (
 )
 from sl_nerfstudio.model.run_files import as_tensor
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.scan import (
-    PickedPixel,
-    PoseSigma,
-    Scale,
-    ScaleBar,
-    Scan,
-    ScanWriter,
-    measured_length,
-    read_scan,
-)
+from sl_nerfstudio.scan import PickedPixel, PoseSigma, Scale, ScaleBar, Scan, ScanWriter, measured_length, read_scan
 
 from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, images_of, rig_of
 
@@ -108,7 +99,7 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
     assert (apart[0] - apart[1]).abs().max() < 0.5 * (apart[2] - apart[1]).abs().max()
 
 
-def adjusted_poses(scan: Scan, samples: PixelSamples) -> Found:
+def adjusted_poses(scan: Scan, samples: PixelSamples) -> ScanAdjustment:
     """The result of the adjustment without cross-validation."""
     maps, _ = maps_and_held_out(scan, samples, QUICK)
     prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
@@ -116,8 +107,7 @@ def adjusted_poses(scan: Scan, samples: PixelSamples) -> Found:
 
 
 @pytest.mark.parametrize(
-    "scale, size",
-    [(Scale(True, "given camera poses"), 1.0), (Scale(True, "a ruler", baseline_of="frame_00001"), 1.02)],
+    "scale, size", [(Scale(True, "given camera poses"), 1.0), (Scale(True, "a ruler", baseline_of="frame_00001"), 1.02)]
 )
 def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
     """Camera positions are stated correctly; all baselines are stated 2 % longer than they are."""
@@ -131,7 +121,7 @@ def test_the_scan_says_which_lengths_are_trusted(scan, true, scale, size):
     assert float(apart[0] / apart[1]) == pytest.approx(size, abs=5e-3)
 
 
-def in_world(found: Found) -> DevicePoses:
+def in_world(found: ScanAdjustment) -> DevicePoses:
     """The adjusted poses in the scan's world and unit."""
     return found.rig.poses(S_SCENE_WORLD.inverse())
 
@@ -199,7 +189,7 @@ def stated_with(scan: Scan, change: IntrinsicsChange) -> LoadedScan:
     return LoadedScan(wrong, build_samples(scan), S_SCENE_WORLD)
 
 
-def relative_error(found: Found, true: Rig) -> float:
+def relative_error(found: ScanAdjustment, true: Rig) -> float:
     return float((found.rig.T_camera_projector - true.T_camera_projector).abs().max())
 
 

@@ -25,7 +25,7 @@ def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
     rig = scene_rig(scan, S_scene_world)
     prior = pose_prior(scan, S_scene_world, prior)
     decision = CrossValidation(0.1, 0.05, -0.01, 0.001, 3.0, 0.01)
-    return ScanAdjustment(rig, prior.sigma, joint_of_prior(prior, rig), decision, 0.1, None, (1,))
+    return ScanAdjustment(rig, prior.sigma, joint_of_prior(prior, rig), 0.1, None, (1,), decision)
 
 
 @pytest.mark.parametrize(

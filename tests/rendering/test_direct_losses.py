@@ -7,12 +7,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import (
-    exp_se3,
-    inverse,
-    pose,
-    transform,
-)
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, pose, transform
 from sl_nerfstudio.rendering.direct_losses import (
     DecodingNoise,
     MeasuredRays,

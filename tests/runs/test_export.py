@@ -8,13 +8,7 @@ import pytest
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.runs.export import export_run, training_record
 from sl_nerfstudio.runs.export_settings import ExportSettings
-from sl_nerfstudio.scan import (
-    PoseSigma,
-    Scan,
-    read_pose_sigmas,
-    read_poses,
-    read_unplaced,
-)
+from sl_nerfstudio.scan import PoseSigma, Scan, read_pose_sigmas, read_poses, read_unplaced
 
 from .ball_run import CENTRE, RADIUS, ball_scan, run_of
 
