@@ -137,6 +137,7 @@ def test_bad_settings_do_not_start(
     assert expected in refused(tmp_path, monkeypatch, capfd, scan, **settings)
 
 
+@pytest.mark.slow
 def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
     """The installed ns-train, in a separate process."""
     root = TinyScan(frames=2).write(tmp_path / "scan")

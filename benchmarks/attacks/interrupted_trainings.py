@@ -18,8 +18,7 @@ from benchmarks.attacks.expect import accepted, refused
 STEPS = 12
 SMALL = (
     *("--max-num-iterations", str(STEPS), "--steps-per-save", "4", "--steps-per-eval-batch", "3"),
-    *("--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.model.sdf.log2-table-size", "10"),
-    *("--pipeline.model.sdf.max-resolution", "64", "--pipeline.model.sdf.hidden", "16"),
+    *("--pipeline.datamanager.train-num-rays-per-batch", "64", "--pipeline.model.sdf.max-resolution", "16"),
 )
 TRAIN = ("ns-train", "sl-neus", "--data", "scan", "--output-dir", "out", "--timestamp", "first", *SMALL)
 FIRST = Path("out/scan/sl-neus/first")

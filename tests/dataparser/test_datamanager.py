@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
@@ -136,14 +135,6 @@ def test_downscaled_frames_keep_the_coordinates_of_their_pixels(tiny_root: Path)
     assert int(m.next_train(0)[1]["indices"][:, 2].max()) > 24
 
 
-def test_nerfstudios_transform_restores_world_coordinates(datamanager: SLDataManager) -> None:
-    loaded = datamanager.dataparser.loaded
-    poses = datamanager.train_dataparser_outputs.transform_poses_to_original_space(
-        datamanager.train_dataset.cameras.camera_to_worlds, camera_convention="opengl"
-    )
-    np.testing.assert_allclose(poses.numpy(), loaded.scan.poses.T_world_camera[:, :3], atol=1e-3)
-
-
 def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
     m = manager(tiny_root)
     before, _ = m.next_train(0)
@@ -238,9 +229,3 @@ def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, 
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
-
-
-def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
-    config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
-    with pytest.raises(UserError, match="does not describe a projector"):
-        config.setup(device="cpu")

@@ -4,7 +4,6 @@ import copy
 import os
 import random
 import signal
-import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -19,7 +18,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel
-from sl_nerfstudio.model.run_files import Interrupted, Interruption, checkpoints_in
+from sl_nerfstudio.model.run_files import Interruption, checkpoints_in
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.runs.run import load_run
 from tests.model.training.small_runs import (
@@ -128,12 +127,6 @@ def test_checkpoints_are_written_when_time_and_steps_have_passed(scan_root, tmp_
     assert saved == [-1, 11]
 
 
-def test_a_signal_ends_a_training_that_is_paused_in_the_viewer(scan_root, tmp_path):
-    timer = threading.Timer(1.0, send, [signal.SIGTERM])
-    timer.start()
-    assert status(train, settings(scan_root, tmp_path, start_paused=True)) == 143
-
-
 def test_control_c_in_the_viewer_of_a_finished_training_is_its_normal_end(scan_root, tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: send(signal.SIGINT))
     train(settings(scan_root, tmp_path, steps=1))
@@ -152,20 +145,6 @@ def test_a_second_signal_ends_the_process_at_once(first, second):
 
     _, result = os.waitpid(child(work), 0)
     assert os.waitstatus_to_exitcode(result) == SIGNALS[second]
-
-
-def test_an_ignored_signal_stays_ignored():
-    """As for a job that a script starts in the background."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    interruption = Interruption()
-    interruption.install()
-    try:
-        send(signal.SIGINT)
-        with pytest.raises(Interrupted):
-            send(signal.SIGTERM)
-    finally:
-        interruption.remove()
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_a_killed_training_goes_on_or_starts_again(scan_root, finished, tmp_path):

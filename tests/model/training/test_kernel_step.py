@@ -62,6 +62,7 @@ def training(method: str, backend: str, scan_root: Path, folder: Path) -> Traini
     return Training(config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["sl-neus", "sl-neus-paper"])
 def test_a_training_by_kernels_goes_as_one_by_plain_operations(method: str, scan_root: Path, tmp_path: Path) -> None:
     """Other random numbers, but the same start and the same pixels: after 25 steps, losses are alike."""
