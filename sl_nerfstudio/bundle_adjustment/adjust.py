@@ -30,11 +30,12 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
 )
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import frame_medians, observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import anchors_at, frame_medians, in_front_of, observe, partners
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
     FreeParameters,
     PosePrior,
+    PriorTerm,
     RefinePoses,
     SelfCalibration,
     alignment,
@@ -53,7 +54,6 @@ from sl_nerfstudio.bundle_adjustment.search import (
     frame_support,
     kernel_of,
     problem_of,
-    rows_of_all,
     run_stage,
     search,
     unplaced_frames,
@@ -73,8 +73,7 @@ from sl_nerfstudio.relative_pose.estimation import RelativePoseError, relative_p
 # frames.
 #
 # Look-ups compare coordinates at one place and lead a frame home from about its own details away. Each frame alone
-# shows
-# a surface, too, from its coordinates and the pose of its projector, and surfaces can be registered from much
+# shows a surface, too, from its coordinates and the pose of its projector, and surfaces can be registered from much
 # farther.
 
 _FEWEST = 2  # frames that a registration may join
@@ -152,13 +151,72 @@ def _device(intrinsics: Intrinsics, w: int, h: int) -> Device:
     return Device(w, h, **values, model=intrinsics.model)
 
 
-# After rough starts: a search is begun again beside its end, and goes on from wherever more is explained.
+# Which of two ends of searches is more probable: the whole posterior, of the look-ups that exist at both.
 #
-# From starting poses that are off by several degrees some frames end in a minimum of their own, where two or three
-# of
+# What exists at one end alone says nothing by itself: frames that are turned onto one side of a round object see each
+# other more than they do where they belong, and agree as far as the object is round. So both ends are asked the same:
+# an anchor is the same pixel of the same frame, at the depth that each end gives it, and the same frames look it up.
+
+_HIDDEN = 2.0  # widths of the kernel from which on a nearer surface is another one, which hides the anchor
+
+
+def log_odds(problem: SearchProblem, end: SearchProgress, other: SearchProgress) -> float:
+    """Logarithm of how many times as probable one end is as another, in nats: below zero if it is less probable.
+
+    A contradiction costs a fixed amount, however far off it is. A camera that sees another surface in front of the
+    anchor says nothing. Look-ups of a frame are correlated: together they count as `independent_residuals`, however
+    many they are. The prior counts in full, so an end far from the starting poses must explain far better what both
+    explain.
+    """
+    s, (one, two) = problem.settings, (end.state.rig, other.state.rig)
+    generator = torch.Generator().manual_seed(s.seed)
+    drawn = problem.maps.draw(torch.arange(one.frames), s.hops.anchors_per_frame, generator)
+    (mine, good), (theirs, as_good) = (
+        anchors_at(rig, problem.maps, drawn.frame, drawn.uv_camera) for rig in (one, two)
+    )
+    ends = [(one, mine.chosen(good & as_good)), (two, theirs.chosen(good & as_good))]
+    rows = _common(problem, ends, generator)
+    found = [residuals_of(rig, anchors, rows, problem.maps) for rig, anchors in ends]
+    width, frames = s.hops.width_noises * min(end.noise, other.noise), one.frames
+    common = found[0].cross_valid & found[1].cross_valid
+    for (rig, anchors), r in zip(ends, found, strict=True):
+        far = r.cross.norm(dim=-1) > _HIDDEN * width
+        common &= ~(far & in_front_of(rig, anchors, rows, problem.maps))
+    cost, cost_other = (
+        float(geman_mcclure_cost((torch.cat([r.own, r.cross[common]]) / width).square().sum(-1)).sum()) for r in found
+    )
+    nats = s.hops.width_noises**2 / 2  # of a look-up that contradicts
+    share = min(s.independent_residuals * frames / max(int(common.sum()), 1), 1.0)
+    prior = PriorTerm(problem.prior, problem.start, 0.5)
+    return nats * share * (cost_other - cost) + prior.energy(two) - prior.energy(one)
+
+
+def _common(problem: SearchProblem, ends: list[tuple[Rig, Anchors]], generator: torch.Generator) -> Observations:
+    """Anchors in frames that see them at both ends; a random choice of these if there are too many."""
+    s = problem.settings
+    allowed = torch.stack([partners(*end, problem.maps, s.partners, s.least_cosine, generator) for end in ends]).any(0)
+    first, second = (_numbers(problem, *end, allowed, generator) for end in ends)
+    common = first[torch.isin(first, second)]
+    most = s.relocalisation.frames_per_anchor * len(ends[0][1].frame)
+    chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
+    frames = ends[0][0].frames
+    return Observations(chosen // frames, chosen % frames)
+
+
+def _numbers(
+    problem: SearchProblem, rig: Rig, anchors: Anchors, allowed: Tensor, generator: torch.Generator
+) -> Int[Tensor, "rows"]:
+    """Every look-up of an end as one number: of its anchor, then of the frame that looks it up."""
+    least = problem.settings.least_cosine
+    rows = observe(rig, anchors, problem.maps, rig.frames, float("inf"), least, generator, allowed)
+    return rows.anchor * rig.frames + rows.frame
+
+
+# After rough starts: a search is begun again beside its end, and goes on from wherever is more probable.
+#
+# From starting poses that are off by several degrees some frames end in a minimum of their own, where two or three of
 # them agree with each other and well enough with the rest. Poses drawn about that end let them out again, while the
-# frames that are right return. (Basin hopping: Wales and Doye, J. Phys. Chem. A, 1997; only what is better is
-# kept.)
+# frames that are right return. (Basin hopping: Wales and Doye, J. Phys. Chem. A, 1997; only what is better is kept.)
 
 _HALF = 0.5  # share of the frames that every second hop moves
 
@@ -197,9 +255,7 @@ def hopped(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -
         if end is None:
             continue
         other = end[0]
-        width = s.width_noises * min(best.noise, other.noise)
-        now, then = (_explained(p.state.rig, problem.maps, width, problem.settings) for p in (other, best))
-        if now > (1 + s.least_gain) * then:
+        if log_odds(problem, other, best) > s.least_gain:
             best, others = other, []
         elif _leads_back(with_frames_of(other.state.rig, best.state.rig, unplaced), best.state.rig, problem):
             return Hopped(best, tuple(others), True)
@@ -228,16 +284,6 @@ def _moved(rig: Rig, prior: PosePrior, size: float, share: float, generator: tor
     draw = torch.randn(rig.frames, 6, generator=generator, dtype=torch.float64)
     delta = torch.where(chosen, size * draw * prior.sigma[:, :6], torch.zeros_like(draw))
     return rig.moved(delta, torch.zeros_like(delta))
-
-
-def _explained(rig: Rig, maps: CoordinateMaps, width_px: float, settings: AdjustmentSettings) -> float:
-    """Look-ups of an anchor that agree, about: a large residual counts little, a look-up that fails nothing."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    anchors = place_anchors(rig, maps, settings.hops.anchors_per_frame, generator)
-    rows = rows_of_all(rig, anchors, maps, settings, generator)
-    r = residuals_of(rig, anchors, rows, maps)
-    share = (r.cross[r.cross_valid] / width_px).square().sum(-1)
-    return float((1 - geman_mcclure_cost(share)).sum()) / max(len(anchors.frame), 1)
 
 
 # Frames that agree with no others after a search: their surfaces may show where they belong, however far that is.
@@ -451,10 +497,8 @@ def _unmoved(start: Rig, prior: PosePrior, free: FreeParameters, settings: Adjus
 # Are adjusted poses better? Pixels that took no part in the adjustment decide, by a paired comparison.
 #
 # Each held-out pixel has the same residuals under both sets of poses. So the mean of their differences is compared
-# with
-# zero, rather than two means with each other. Residuals within a small block of an image depend on each other:
-# blocks are
-# the independent samples from which the standard error follows.
+# with zero, rather than two means with each other. Residuals within a small block of an image depend on each other:
+# blocks are the independent samples from which the standard error follows.
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
     uniform,
     words_of,
 )
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array, pixels_of_rows
 from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 from sl_nerfstudio.geometry.devices import unproject, view_of
 from sl_nerfstudio.geometry.lie import moved, rotate, transform
@@ -125,7 +125,14 @@ _LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
     """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
     drawn = maps.draw(torch.arange(rig.frames), per_frame, generator)
-    frame, uv = drawn.frame, drawn.uv_camera
+    anchors, good = anchors_at(rig, maps, drawn.frame, drawn.uv_camera)
+    return anchors.chosen(good)
+
+
+def anchors_at(
+    rig: Rig, maps: CoordinateMaps, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]
+) -> tuple[Anchors, Bool[Tensor, "n"]]:
+    """Anchors at decoded pixels; whether the neighbourhood is smooth and the rays meet in front of both devices."""
     seen = maps.look_up(frame, uv)
     p, good = _meet(rig, frame, uv, seen.uv_projector)
     edges = []
@@ -135,7 +142,15 @@ def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: tor
     normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
     normal = -normal * (normal * p).sum(-1, keepdim=True).sign()
     depth = p.norm(dim=-1)
-    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal).chosen(seen.valid & good)
+    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal), seen.valid & good
+
+
+def in_front_of(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:
+    """Whether the surface that a camera sees where it looks an anchor up is nearer to it than the anchor is."""
+    uv, _ = pixels_of_rows(rig, anchors, rows)
+    seen, _ = _meet(rig, rows.frame, uv, maps.look_up(rows.frame, uv, rows.memory).uv_projector)
+    p_world = transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)[rows.anchor]
+    return seen.norm(dim=-1) < (p_world - rig.T_world_camera[rows.frame, :3, 3]).norm(dim=-1)
 
 
 def _meet(

@@ -52,6 +52,7 @@ def by_kind(values: Shaped[Tensor, "frames 12 *k"]) -> Shaped[Tensor, "unknowns 
 # What is known about poses and intrinsics before any residual is computed.
 
 INTRINSICS_SIGMA = 0.005  # share of the focal length, if the uncertainty of the intrinsics is not stated
+USUAL_FRAME_ROTATION_DEG = 2.0  # 1 sigma about each axis of a starting pose, if it is not stated
 
 
 @dataclass(frozen=True)

@@ -147,12 +147,12 @@ class HopSettings:
     as rough."""
     size: float = 0.3
     """Distance from the best end at which a search begins, as a share of the starting poses' uncertainty."""
-    least_gain: float = 0.002
-    """Share by which a search must explain more to replace the best one."""
+    least_gain: float = 5.0
+    """Logarithm of the odds (nats) by which the end of a search must be more probable to replace the best one."""
     most_left: float = 0.35
     """Share of that distance within which all frames must return for a search to lead back."""
     width_noises: float = 4.0
-    """Residual that counts half, as a multiple of the noise."""
+    """Residual at which a look-up costs half of what a contradiction costs, as a multiple of the noise."""
     anchors_per_frame: int = 300
     """Decoded pixels of each frame that are looked up for that comparison."""
     most_frames: int = 100

@@ -100,8 +100,8 @@ def departed_message(found: Sequence[DepartedFrame]) -> str:
         return ""
     return (
         f"Frames far from their starting poses: {describe_departed(found)}.\n"
-        "    cause:  a starting pose is wrong by far more than its stated uncertainty and was found again, or the\n"
-        "            frame slid along an object that looks the same from there (of revolution, a rod)\n"
+        "    cause:  a starting pose is wrong by far more than its stated or usual uncertainty and was found again,\n"
+        "            or the frame slid along an object that looks the same from there (of revolution, a rod)\n"
         "    remedy: look at these frames in the viewer; if a starting pose is right, leave its frame out"
     )
 

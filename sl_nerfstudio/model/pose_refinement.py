@@ -20,6 +20,7 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
 from sl_nerfstudio.bundle_adjustment.parameters import (
     INTRINSICS_SIGMA,
     UNKNOWNS,
+    USUAL_FRAME_ROTATION_DEG,
     PosePrior,
     RefinePoses,
     SelfCalibration,
@@ -39,8 +40,7 @@ from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
 
 _STEP = 1e-5  # scene units and radian, of central differences
-# 1 sigma of starting poses if the scan does not state it in `sl_pose_sigma`.
-FRAME_ROTATION_DEG = 2.0  # orientation of a frame in the world
+# 1 sigma of starting poses, besides USUAL_FRAME_ROTATION_DEG, if the scan does not state it in `sl_pose_sigma`.
 FRAME_TRANSLATION = 0.1  # position of a frame's part of the surface, as a share of the object's radius
 RELATIVE_ROTATION_DEG = 0.3  # orientation of the projector relative to the camera
 RELATIVE_TRANSLATION = 0.05  # position of the projector relative to the camera, as a share of the baseline
@@ -86,7 +86,7 @@ def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> Po
         stated = frame.pose_sigma
         if stated is None:
             frame_sigma, relative_sigma = FRAME_TRANSLATION, RELATIVE_TRANSLATION * length
-            angles = FRAME_ROTATION_DEG, RELATIVE_ROTATION_DEG
+            angles = USUAL_FRAME_ROTATION_DEG, RELATIVE_ROTATION_DEG
         else:
             frame_sigma, relative_sigma = stated.camera_translation * scale, stated.relative_translation * scale
             angles = stated.camera_rotation_deg, stated.relative_rotation_deg

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from sl_nerfstudio.bundle_adjustment.parameters import USUAL_FRAME_ROTATION_DEG
 from sl_nerfstudio.calibration.board import BoardCalibration
 from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
 from sl_nerfstudio.review.agreement import (
@@ -51,7 +52,7 @@ def listed(names: Sequence[str], most: int = _LISTED) -> str:
     return ", ".join(names[:most]) + more
 
 
-# Frames that ended farther from their starting poses than these were stated to be off.
+# Frames that ended farther from their starting poses than these were stated to be off, or than is usual.
 
 _MOST_SIGMA = 6.0  # for each axis, RMS: by chance less than once in 10^20 frames
 
@@ -62,27 +63,31 @@ class DepartedFrame:
 
     name: str
     turned_deg: float  # of the camera, from its starting pose
-    stated_deg: float  # 1 sigma of that, about each axis
+    sigma_deg: float  # 1 sigma of that, about each axis
+    stated: bool = True  # by the scan; otherwise what is usual
 
 
-def departed_frames(scan: Scan, poses: DevicePoses) -> list[DepartedFrame]:
-    """Frames whose cameras are turned by far more than the stated uncertainty of their starts.
+def departed_frames(scan: Scan, poses: DevicePoses, usual_deg: float = USUAL_FRAME_ROTATION_DEG) -> list[DepartedFrame]:
+    """Frames whose cameras are turned by far more than the uncertainty of their starts: stated, or else usual.
 
     Positions are not compared: they depend on turns by as much as the camera is away from what it sees.
     """
     found = []
     for frame, T_start, T_end in zip(scan.frames, scan.poses.T_world_camera, poses.T_world_camera, strict=True):
-        if frame.pose_sigma is None:
-            continue
-        turned, stated = angle_deg(T_start[:3, :3].T @ T_end[:3, :3]), frame.pose_sigma.camera_rotation_deg
-        if turned > _MOST_SIGMA * np.sqrt(3) * stated:
-            found.append(DepartedFrame(frame.name, turned, stated))
+        stated = frame.pose_sigma
+        sigma = usual_deg if stated is None else stated.camera_rotation_deg
+        turned = angle_deg(T_start[:3, :3].T @ T_end[:3, :3])
+        if turned > _MOST_SIGMA * np.sqrt(3) * sigma:
+            found.append(DepartedFrame(frame.name, turned, sigma, stated is not None))
     return found
 
 
 def describe_departed(found: Sequence[DepartedFrame]) -> str:
     """Each frame in a few words."""
-    return ", ".join(f"{one.name} ({one.turned_deg:.1f} deg, stated {one.stated_deg:.2g})" for one in found)
+    return ", ".join(
+        f"{one.name} ({one.turned_deg:.1f} deg, {'stated' if one.stated else 'usual'} {one.sigma_deg:.2g})"
+        for one in found
+    )
 
 
 def departed_reasons(found: Sequence[DepartedFrame]) -> list[Reason]:

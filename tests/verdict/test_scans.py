@@ -115,7 +115,7 @@ def test_a_frame_that_nobody_else_saw_is_unconfirmed(scan):
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sigmas", [4.0, 9.0])
 def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axis, sigmas):
-    """Positions do not count, nor do frames whose uncertainty was not stated."""
+    """Positions do not count; where no uncertainty was stated, the usual one does."""
     stated, angle = 0.5, sigmas * np.sqrt(3) * 0.5
     frames = tuple(replace(f, pose_sigma=PoseSigma(0.001, stated, 0.001, stated)) for f in scan.frames[:-1])
     frames += (replace(scan.frames[-1], pose_sigma=None),)
@@ -126,6 +126,10 @@ def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axi
     found = departed_frames(replace(scan, frames=frames), DevicePoses(T, scan.poses.T_world_projector))
     assert [one.name for one in found] == ([scan.frames[3].name] if sigmas > 6 else [])
     for one in found:
-        assert one.turned_deg == pytest.approx(angle, rel=1e-6) and one.stated_deg == stated
+        assert one.turned_deg == pytest.approx(angle, rel=1e-6) and one.sigma_deg == stated
         assert [r.band for r in departed_reasons(found)] == ["acceptable"]
         assert f"{one.name} ({angle:.1f} deg, stated 0.5)" in describe_departed(found)
+    usual = departed_frames(replace(scan, frames=frames), DevicePoses(T, scan.poses.T_world_projector), stated)
+    assert [one.name for one in usual] == ([scan.frames[k].name for k in (3, -1)] if sigmas > 6 else [])
+    for one in usual[1:]:
+        assert f"{one.name} ({angle:.1f} deg, usual 0.5)" in describe_departed(usual)
