@@ -1,4 +1,4 @@
-"""What the other process compiles is what a step calls."""
+"""What another process compiles is what a step calls."""
 
 import os
 import subprocess

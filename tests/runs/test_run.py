@@ -9,13 +9,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.runs.run import read_config
+
 with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
     warnings.simplefilter("ignore")
     from sl_nerfstudio.methods import sl_neus, sl_neus_paper
 
-from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.runs.run import read_config
 
 TEXT = yaml.dump(sl_neus.config)
 ATTACK = '!!python/object/apply:os.system ["touch {ran}"]'

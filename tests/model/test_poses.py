@@ -1,4 +1,4 @@
-"""Poses as parameters: the meaning of an increment, derivatives, other base poses, and what each choice keeps fixed."""
+"""Poses as parameters: increments, derivatives, other base poses, and what each choice keeps fixed."""
 
 from types import SimpleNamespace
 from typing import Any
