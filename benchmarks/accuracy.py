@@ -10,13 +10,12 @@ the bundle adjustment (`by-gradient`, `independent`), at the paper's rate for po
 table and writes benchmarks/results/accuracy.json.
 """
 
-import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.whole_runs import Score, run, train_and_score, with_true_poses
+from benchmarks.common.measuring import Rows, options
+from benchmarks.common.runs import Score, run, train_and_score, with_true_poses
 
 FRAMES = {"cone-and-cylinder": 22, "head": 43, "frog": 57}
 COMPARED = {
@@ -50,39 +49,33 @@ class Row(Score):
     variant: str
 
 
-def measure(scene: str, seed: int, method: str, iterations: int, folder: Path, variants: Sequence[str]) -> list[Row]:
+def measure(
+    scene: str, seed: int, method: str, iterations: int, folder: Path, variants: Sequence[str]
+) -> Iterator[Row]:
     """Train and score all variants on one scan."""
     scan = folder / "scan"
-    run("sl-synth", "--output", str(scan), "--scene", scene, "--frames", str(FRAMES[scene]), "--seed", str(seed))
-    rows = []
+    run("sl-synth", "--output", scan, "--scene", scene, "--frames", FRAMES[scene], "--seed", seed)
     for variant in variants:
         data = with_true_poses(scan, folder / "true") if variant == "oracle" else scan
-        options = ("--max-num-iterations", str(iterations), *VARIANTS[variant])
-        score = train_and_score(data, folder, variant, options, method)
-        print(f"{scene:18} {seed:4} {variant:17} {score.text()}", flush=True)
-        rows.append(Row(**asdict(score), scene=scene, seed=seed, variant=variant))
-    return rows
+        flags = ("--max-num-iterations", str(iterations), *VARIANTS[variant])
+        score = train_and_score(data, folder, variant, flags, method)
+        yield Row(**asdict(score), scene=scene, seed=seed, variant=variant)
 
 
 def main() -> None:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(FRAMES), choices=FRAMES)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--variants", nargs="+", default=list(COMPARED), choices=VARIANTS)
-    parser.add_argument("--method", default="sl-neus", choices=("sl-neus", "sl-neus-paper"))
-    parser.add_argument("--iterations", type=int, default=1000)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/accuracy"), help="must not exist yet")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/accuracy.json"))
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True)
-    rows: list[Row] = []
-    for seed in options.seeds:
-        for scene in options.scenes:
-            folder = options.folder / f"{scene}-{seed}"
+    """Run the benchmark in a folder that must not exist yet."""
+    given = options(
+        __doc__, scenes=FRAMES, seeds=[1, 2, 3], variants=list(COMPARED), method="sl-neus", iterations=1000,
+        folder=Path("outputs/accuracy"), output=Path("benchmarks/results/accuracy.json"),
+    )  # fmt: skip
+    given.folder.mkdir(parents=True)
+    rows: Rows[Row] = Rows(given.output, method=given.method, iterations=given.iterations)
+    for seed in given.seeds:
+        for scene in given.scenes:
+            folder = given.folder / f"{scene}-{seed}"
             folder.mkdir()
-            rows += measure(scene, seed, options.method, options.iterations, folder, options.variants)
-            write_rows(options.output, rows, method=options.method, iterations=options.iterations)
+            for row in measure(scene, seed, given.method, given.iterations, folder, given.variants):
+                rows.add(row)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ What the camera would have seen is rendered: the board under the sequence of the
 by the same two devices, which no command is told. The known length is replaced by the true one.
 """
 
+import argparse
 import json
 import os
 import re
@@ -19,9 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
-from benchmarks.common.machine import write_rows
+from benchmarks.common.measuring import options, write_rows
 from sl_nerfstudio.cli.run import run as run_main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
@@ -38,24 +38,6 @@ _HARDWARE = ("--show", "--camera ")
 _LENGTH = "baseline of frame 0 = 85 mm"
 
 
-@dataclass(frozen=True)
-class Config:
-    """Where it runs."""
-
-    folder: Path = Path("outputs/first-scan")
-    """new folder, in which all commands run"""
-    poses: int = 10
-    """poses of the board"""
-    frames: int = 24
-    """captures of the object"""
-    resolution: int = 600
-    """width of the camera's image, pixels"""
-    seed: int = 7
-    """random seed of everything that is rendered"""
-    output: Path | None = None
-    """where to write the figures as JSON, with machine, date and commit"""
-
-
 def page_commands() -> list[list[str]]:
     """Words of the page's commands, but for those with a display or a camera."""
     lines = re.findall(r"^    (sl-.*|ns-.*)$", PAGE.read_text(), re.MULTILINE)
@@ -70,7 +52,7 @@ class Figure:
     value: float | str
 
 
-def first_scan(config: Config) -> list[Figure]:
+def first_scan(config: argparse.Namespace) -> list[Figure]:
     """Run the whole page. Raises UserError where a command fails."""
     folder = config.folder.absolute()
     folder.mkdir(parents=True)
@@ -85,7 +67,7 @@ def first_scan(config: Config) -> list[Figure]:
     return [*figures, *_accuracy(folder)]
 
 
-def _capture(config: Config, folder: Path) -> None:
+def _capture(config: argparse.Namespace, folder: Path) -> None:
     """What the camera sees: captures/ of an object, and calibration/ of the board, by the same devices."""
     # The pattern of step 4 is that of the preset, so it can be made before its command.
     _run(folder, ["sl-pattern", "--preset", "1280x720", "--output", "rendered-pattern"])
@@ -148,13 +130,14 @@ def _accuracy(folder: Path) -> list[Figure]:
 
 
 def main() -> None:
-    """Entry point."""
-    config = tyro.cli(Config)
+    """Run all commands in a new folder."""
+    config = options(
+        __doc__, folder=Path("outputs/first-scan"), poses=10, frames=24, resolution=600, seed=7, output=Path
+    )
     figures = first_scan(config)
     for figure in figures:
         print(f"{figure.name:45s} {figure.value if isinstance(figure.value, str) else f'{figure.value:.4g}'}")
-    if config.output is not None:
-        write_rows(config.output, figures)
+    write_rows(config.output, figures)
 
 
 if __name__ == "__main__":

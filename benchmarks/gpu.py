@@ -1,6 +1,6 @@
 """Everything that is to be known of a GPU, within ten minutes, into one file.
 
-python -m benchmarks.gpu [--device cpu --steps 2 --paper-steps 3 --default-steps 30 --compared-steps 2] [--only NAME]
+    python -m benchmarks.gpu [--device cpu --steps 2 --paper-steps 3 --default-steps 30] [--only NAME]
 
 Step times and memory of both methods with every backend, with and without a CUDA graph; whole trainings, with their
 surfaces against the truth, and against the same training on the CPU; the same step with nerfstudio's own encoding, in
@@ -10,7 +10,6 @@ begins; the file is written after each. With `--device cpu` all of it runs witho
 
 import json
 import statistics
-import subprocess
 import tempfile
 import time
 import traceback
@@ -18,16 +17,16 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-import tyro
 
 from benchmarks.common.iteration_step import SIZES, Ours, Theirs, softplus
-from benchmarks.common.machine import describe
-from benchmarks.common.scans import made_once
+from benchmarks.common.measuring import describe, parsed
+from benchmarks.common.runs import made_once
 from benchmarks.common.training import Training, model_of, settings
 from sl_nerfstudio.errors import first_line
 from sl_nerfstudio.evaluation.evaluate import read_reference, score_alignments
@@ -47,26 +46,16 @@ _GROUPS = 10  # of timed steps; their median counts
 class Config:
     """All measurements on one device."""
 
-    device: Literal["cuda", "cpu"] = "cuda"
-    """Where the field is; cpu: to try this command."""
-    frames: int = 22
-    """Frames of the scan, which is made in outputs/bench unless it is there."""
+    device: str = "cuda"  # where the field is; cpu: to try this command
+    frames: int = 22  # of the scan, which is made in outputs/bench unless it is there
     resolution: int = 400
-    """Width and height of its images."""
-    steps: int = 200
-    """Timed steps of each variant, after the first ones that are not timed."""
-    paper_steps: int = 10_000
-    """Length of the whole training of sl-neus-paper on the device."""
-    default_steps: int = 1000
-    """Length of the whole training of sl-neus, on the device and on the CPU."""
-    compared_steps: int = 300
-    """Length of the trainings of sl-neus-paper that compare the device with the CPU."""
-    mesh_resolution: int = 256
-    """Cells along the scene's box of the surfaces that are compared."""
-    only: tuple[str, ...] = ()
-    """Only parts whose names contain one of these; by default all."""
+    steps: int = 200  # timed ones of each variant, after the first ones that are not timed
+    paper_steps: int = 10_000  # length of the whole training of sl-neus-paper on the device
+    default_steps: int = 1000  # of sl-neus, on the device and on the CPU
+    compared_steps: int = 300  # of the trainings of sl-neus-paper that compare the device with the CPU
+    mesh_resolution: int = 256  # cells along the scene's box of the surfaces that are compared
+    only: tuple[str, ...] = ()  # parts of the names of what is measured; by default all
     output: Path = Path("benchmarks/results/gpu.json")
-    """The result file."""
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -124,9 +113,7 @@ def encodings(device: str) -> dict[str, Callable[..., Ours | Theirs]]:
     return found
 
 
-def begun(
-    config: Config, scan: Path, size: str, device: str, steps: int, backend: BackendName, graph: bool, adjust: bool
-) -> Training:
+def begun(scan: Path, size: str, device: str, steps: int, backend: BackendName, graph: bool, adjust: bool) -> Training:
     """A training whose run folder is forgotten."""
     run = settings(METHODS[size], scan, Path(tempfile.mkdtemp()), device, steps)
     run.cuda_graph = graph
@@ -138,7 +125,7 @@ def begun(
 def step_times(config: Config, scan: Path, size: str, backend: BackendName, graph: bool) -> dict[str, Any]:
     """Milliseconds of a step in which rays are rendered, and memory."""
     _forget_memory(config.device)
-    training = begun(config, scan, size, config.device, 1000, backend, graph, adjust=False)
+    training = begun(scan, size, config.device, 1000, backend, graph, adjust=False)
     training.done = 601  # all levels have their weight
     times = _timed(training.step, config.steps, config.device)
     return {**times, "graph": training.trainer.recorded is not None, **_memory(config.device)}
@@ -154,19 +141,16 @@ def surface(config: Config, scan: Path, size: str, device: str, steps: int) -> d
     """Seconds of a whole training without its start, and the distance of its surface from the truth."""
     _forget_memory(device)
     begin = time.perf_counter()
-    training = begun(config, scan, size, device, steps, "auto", True, adjust=True)
+    training = begun(scan, size, device, steps, "auto", True, adjust=True)
     prepared = time.perf_counter()
     for _ in range(steps):
         training.step()
     _wait(device)
     trained = time.perf_counter()
     return {
-        "steps": steps,
-        "prepare_s": round(prepared - begin, 2),
-        "train_s": round(trained - prepared, 2),
-        **rmse(config.mesh_resolution, training),
-        **_memory(device),
-    }
+        "steps": steps, "prepare_s": round(prepared - begin, 2), "train_s": round(trained - prepared, 2),
+        **rmse(config.mesh_resolution, training), **_memory(device),
+    }  # fmt: skip
 
 
 def rmse(resolution: int, training: Training) -> dict[str, Any]:
@@ -185,24 +169,13 @@ def rmse(resolution: int, training: Training) -> dict[str, Any]:
 def describe_device(device: str) -> dict[str, Any]:
     """The machine, the GPU, its driver, and the versions that matter."""
     found: dict[str, Any] = dict(describe())
-    found["warp"] = None
-    if find_spec("warp") is not None:
-        import warp
-
-        found["warp"] = warp.__version__
+    found["warp"] = version("warp-lang") if find_spec("warp") is not None else None
     if device == "cuda":
         properties = torch.cuda.get_device_properties(0)
         found |= {"gpu": properties.name, "gpu_mb": properties.total_memory >> 20, "cuda": torch.version.cuda}
-        found["driver"] = _driver()
+        driver = Path("/proc/driver/nvidia/version")
+        found["driver"] = driver.read_text().splitlines()[0] if driver.exists() else "unknown"
     return found
-
-
-def _driver() -> str:
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[0]
-    except (OSError, subprocess.CalledProcessError, IndexError):
-        return "unknown"
 
 
 def _timed(step: Callable[[], Any], steps: int, device: str) -> dict[str, float]:
@@ -238,4 +211,4 @@ def _memory(device: str) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(parsed(Config, __doc__))

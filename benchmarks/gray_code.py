@@ -7,35 +7,24 @@ Every decoded pixel of the reference is looked up in the scan. Coordinates are c
 are triangulated with the poses of their own scan and compared after one common similarity.
 """
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from benchmarks.common.measuring import options
 from sl_nerfstudio.geometry.devices import (
     Device,
     Intrinsics,
     project,
     unproject,
 )
-from sl_nerfstudio.geometry.lie import fit_similarity
+from sl_nerfstudio.geometry.lie import angle_deg, fit_similarity
 from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.scan import Frame, Scan, read_scan
-
-
-@dataclass(frozen=True)
-class Arguments:
-    """Compare a scan of real photographs with a reference."""
-
-    scan: Path
-    """scan folder that sl-process wrote"""
-    reference: Path
-    """scan folder of the same captures, decoded and calibrated by other means"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +39,7 @@ class Pairs:
 
 def main() -> None:
     """Print the figures."""
-    arguments = tyro.cli(Arguments)
+    arguments = options(__doc__, scan=Path, reference=Path)
     scan, reference = read_scan(arguments.scan), read_scan(arguments.reference)
     pairs = [compare(scan, f, reference, r) for f, r in zip(scan.frames, reference.frames, strict=True)]
     for frame, pair in zip(scan.frames, pairs, strict=True):
@@ -60,7 +49,7 @@ def main() -> None:
         print(f"{frame.name}: {pair.share:.2%} of the reference's pixels decoded")
         print(f"  difference px, 50 75 90 95 99 %: {percent}; median in x, y: {bias[0]:+.4f}, {bias[1]:+.4f}")
     for k in range(len(pairs)):
-        turn, swing = _angles(_relative(scan, k), _relative(reference, k))
+        turn, swing = _angles(scan.poses.T_camera_projector[k], reference.poses.T_camera_projector[k])
         print(f"{scan.frames[k].name}: relative pose: rotation {turn:.3f} deg, direction {swing:.3f} deg off")
     first = np.linalg.inv(scan.poses.T_world_camera[0]) @ scan.poses.T_world_camera
     first_reference = np.linalg.inv(reference.poses.T_world_camera[0]) @ reference.poses.T_world_camera
@@ -127,13 +116,9 @@ def without_lens(uv: Float64[ndarray, "n 2"], device: Device) -> Float64[ndarray
 
 def _points(scan: Scan, frame: Frame, uv: torch.Tensor, coords: ndarray) -> Float64[ndarray, "n 3"]:
     meeting = triangulate(
-        _of(frame.camera),
-        torch.from_numpy(frame.T_world_camera),
-        uv,
-        _of(scan.projector),
-        torch.from_numpy(frame.T_world_projector),
-        torch.from_numpy(coords.astype(np.float64)),
-    )
+        _of(frame.camera), torch.from_numpy(frame.T_world_camera), uv, _of(scan.projector),
+        torch.from_numpy(frame.T_world_projector), torch.from_numpy(coords.astype(np.float64)),
+    )  # fmt: skip
     return meeting.p_world.numpy()
 
 
@@ -141,17 +126,12 @@ def _of(device: Device) -> Intrinsics:
     return Intrinsics.of(device, torch.float64)
 
 
-def _relative(scan: Scan, k: int) -> Float64[ndarray, "4 4"]:
-    return scan.poses.T_camera_projector[k]
-
-
 def _angles(a: Float64[ndarray, "4 4"], b: Float64[ndarray, "4 4"]) -> tuple[float, float]:
     """Angles in degrees between two rotations, and between two directions of translation."""
-    turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
     t, s = a[:3, 3], b[:3, 3]
     swing = np.arctan2(np.linalg.norm(np.cross(t, s)), t @ s)
-    return float(np.degrees(turn)), float(np.degrees(swing))
+    return angle_deg(a[:3, :3].T @ b[:3, :3]), float(np.degrees(swing))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

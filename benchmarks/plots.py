@@ -5,7 +5,6 @@
 Results that do not exist are skipped.
 """
 
-import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,8 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from benchmarks.common.measuring import options
 
 INK, MUTED, GRID = "#1d2733", "#66727f", "#dfe4e9"
 COLOURS = ("#2563a8", "#c2571a", "#3c8d5a", "#7a4fa3", "#8a8f98")
@@ -42,10 +43,11 @@ def plain_decades(axis: Axis) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def series(rows: Rows, key: str, value: str) -> tuple[list[float], list[float]]:
-    """Keys in ascending order, and their values."""
-    ordered = sorted(rows, key=lambda row: row[key])
-    return [row[key] for row in ordered], [row[value] for row in ordered]
+def series(ax: Any, rows: Rows, x: str, y: str, colour: int, label: str) -> None:
+    """A curve through all rows."""
+    ordered = sorted(rows, key=lambda row: row[x])
+    values = ([row[key] for row in ordered] for key in (x, y))
+    ax.plot(*values, "o-", color=COLOURS[colour], markersize=4, label=label)
 
 
 def accuracy(rows: Rows) -> Figure:
@@ -96,8 +98,7 @@ def basin(rows: Rows) -> Figure:
     figure, (ax,) = panels(1)
     figure.set_size_inches(5.2, 3.2)
     for k, seed in enumerate(sorted({row["seed"] for row in rows})):
-        x, y = series([row for row in rows if row["seed"] == seed], "start_deg", "end_deg")
-        ax.plot(x, y, "o-", color=COLOURS[k], markersize=4, label=f"seed {seed}")
+        series(ax, [row for row in rows if row["seed"] == seed], "start_deg", "end_deg", k, f"seed {seed}")
     ax.set_yscale("log")
     plain_decades(ax.yaxis)
     ax.set_xlabel("starting poses: camera rotation error, degrees RMS", color=INK)
@@ -109,18 +110,15 @@ def basin(rows: Rows) -> Figure:
 def sweeps(rows: Rows) -> Figure:
     """Surface error against decoding quality, number of frames and image size."""
     titles = {
-        "noise": "noise, pattern pixels",
-        "missing": "share of cells missing",
-        "wrong": "share of cells wrong",
-        "frames": "frames",
-        "resolution": "image width, pixels",
-    }
+        "noise": "noise, pattern pixels", "missing": "share of cells missing", "wrong": "share of cells wrong",
+        "frames": "frames", "resolution": "image width, pixels",
+    }  # fmt: skip
     shown = [name for name in titles if any(row["sweep"] == name for row in rows)]
     figure, axes = panels(len(shown))
     for ax, name in zip(axes, shown, strict=True):
         mine = [row for row in rows if row["sweep"] == name]
         for k, (key, label) in enumerate((("rigid_rmse", "RMSE"), ("rigid_median", "median"))):
-            ax.plot(*series(mine, "value", key), "o-", color=COLOURS[k], markersize=4, label=label)
+            series(ax, mine, "value", key, k, label)
         ax.set_xlabel(titles[name], color=INK)
         ax.set_ylim(bottom=0)
     axes[0].set_ylabel("surface, mm", color=INK)
@@ -134,7 +132,7 @@ def error_over_time(rows: Rows) -> Figure:
     figure.set_size_inches(5.2, 3.4)
     for k, variant in enumerate(dict.fromkeys(row["variant"] for row in rows)):
         some = [row for row in rows if row["variant"] == variant]
-        ax.plot(*series(some, "training_seconds", "rigid_rmse"), "o-", color=COLOURS[k], markersize=4, label=variant)
+        series(ax, some, "training_seconds", "rigid_rmse", k, variant)
     ax.set_xscale("log")
     ax.set_yscale("log")
     plain_decades(ax.xaxis)
@@ -145,45 +143,35 @@ def error_over_time(rows: Rows) -> Figure:
     return figure
 
 
-def read_rows(path: Path) -> Rows:
-    """The rows of a result file; none if it does not exist."""
-    return json.loads(path.read_text())["rows"] if path.exists() else []
+def all_pictures(results: Path) -> dict[str, Figure | None]:
+    """Draw all pictures, by the name of the file; None without results."""
 
+    def rows(name: str) -> Rows:
+        path = results / f"{name}.json"
+        return json.loads(path.read_text())["rows"] if path.exists() else []
 
-def accuracy_rows(results: Path) -> Rows:
-    """Our surfaces, and those of fusion on the same scans."""
-    fused = [row for row in read_rows(results / "tsdf_baseline.json") if row["poses"] == "registered"]
-    return read_rows(results / "accuracy.json") + [
-        {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]} for row in fused
+    fused = [
+        {"scene": row["scan"].rsplit("-", 1)[0], "variant": FUSION, "rigid_rmse": row["accuracy_rmse"]}
+        for row in rows("tsdf_baseline")
+        if row["poses"] == "registered"
     ]
-
-
-def sweep_rows(results: Path, timed: bool) -> Rows:
-    """The sweeps over time, or all other sweeps."""
-    return [row for row in read_rows(results / "sweeps.json") if (row["sweep"] == "time") == timed]
-
-
-PICTURES: dict[str, tuple[Callable[[Path], Rows], Callable[[Rows], Figure]]] = {
-    "accuracy.png": (accuracy_rows, accuracy),
-    "ablation.png": (lambda results: read_rows(results / "ablation.json"), ablation),
-    "basin.png": (lambda results: read_rows(results / "basin.json"), basin),
-    "sweeps.png": (lambda results: sweep_rows(results, timed=False), sweeps),
-    "error_over_time.png": (lambda results: sweep_rows(results, timed=True), error_over_time),
-}
+    timed = [row for row in rows("sweeps") if row["sweep"] == "time"]
+    others = [row for row in rows("sweeps") if row["sweep"] != "time"]
+    wanted: dict[str, tuple[Callable[[Rows], Figure], Rows]] = {
+        "accuracy.png": (accuracy, rows("accuracy") + fused), "ablation.png": (ablation, rows("ablation")),
+        "basin.png": (basin, rows("basin")), "sweeps.png": (sweeps, others),
+        "error_over_time.png": (error_over_time, timed),
+    }  # fmt: skip
+    return {name: draw(found) if found else None for name, (draw, found) in wanted.items()}
 
 
 def main() -> None:
     """Draw all pictures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=Path("benchmarks/results"))
-    parser.add_argument("--output", type=Path, default=Path("docs/pictures"))
-    options = parser.parse_args()
-    for name, (read, draw) in PICTURES.items():
-        rows = read(options.results)
-        if rows:
-            figure = draw(rows)
-            FigureCanvasAgg(figure).print_png(str(options.output / name))
-            print(options.output / name)
+    given = options(__doc__, results=Path("benchmarks/results"), output=Path("docs/pictures"))
+    for name, figure in all_pictures(given.results).items():
+        if figure is not None:
+            FigureCanvasAgg(figure).print_png(str(given.output / name))
+            print(given.output / name)
 
 
 if __name__ == "__main__":

@@ -2,27 +2,24 @@
 
     python -m benchmarks.redecode [--scenes head frog ...] [--missing 0.3 0.6 0.9] [--realistic 0.6] [--output FILE]
 
-Each scan is trained on, decoded again with the result, and trained on once more: the real commands, in this process.
+Each scan is trained on, decoded again with the result, and trained on once more: the real commands.
 Coordinates are compared with exact ones, meshes with the true surface after rigid alignment: with all of it, and with
 what the captures see of it, where each lit pixel counts. Rows that are in the
 result file are not measured again, so an interrupted benchmark continues. A case takes two to three minutes of a core.
 """
 
-import io
 import json
-import sys
-import warnings
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-import tyro
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from benchmarks.common.machine import write_rows
+from benchmarks.common.measuring import Rows, kept_rows, parsed
+from benchmarks.common.runs import evaluate, export, run, train
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_scan
@@ -39,21 +36,13 @@ class Config:
     """Which scans are measured."""
 
     scenes: tuple[str, ...] = ("head", "frog")
-    """objects"""
-    missing: tuple[float, ...] = (0.3, 0.6, 0.9)
-    """shares of missing cells in plain scans"""
-    realistic: tuple[float, ...] = (0.6,)
-    """shares of missing cells in scans of realistic photographs"""
+    missing: tuple[float, ...] = (0.3, 0.6, 0.9)  # shares of missing cells in plain scans
+    realistic: tuple[float, ...] = (0.6,)  # in scans of realistic photographs
     frames: int = 12
-    """captures of a scan"""
     resolution: int = 280
-    """width of the images, pixels"""
-    iterations: int = 400
-    """steps of each training"""
-    seed: int = 3
-    """of the scans"""
+    iterations: int = 400  # steps of each training
+    seed: int = 3  # of the scans
     output: Path = Path("benchmarks/results/redecode.json")
-    """where the figures are written"""
 
 
 @dataclass(frozen=True)
@@ -100,18 +89,14 @@ class Row:
 def measure(scene: str, appearance: str, missing: float, config: Config, folder: Path) -> Row:
     """Make a scan, train, decode again, train."""
     synth = SynthConfig(
-        scene=scene,
-        appearance="plain" if appearance == "plain" else "realistic",
-        frames=config.frames,
-        resolution=config.resolution,
-        missing=missing,
-        seed=config.seed,
-    )
+        scene=scene, appearance="plain" if appearance == "plain" else "realistic", frames=config.frames,
+        resolution=config.resolution, missing=missing, seed=config.seed,
+    )  # fmt: skip
     first, second = folder / "scan", folder / "again"
     synthesise(synth, first)
     truth, p_world = _truth(synth)
-    run, before = _trained(first, folder / "a", p_world, config)
-    command("sl_nerfstudio.cli.redecode", "--load-config", run, "--output", second)
+    trained, before = _trained(first, folder / "a", p_world, config)
+    run("sl-redecode", "--load-config", trained, "--output", second)
     _, after = _trained(second, folder / "b", p_world, config)
     record = json.loads((second / "redecoding.json").read_text())
     learnt = [f["accepted_elsewhere"] for f in record["frames"] if f["limits"]]
@@ -141,60 +126,19 @@ def measure(scene: str, appearance: str, missing: float, config: Config, folder:
 
 def _trained(scan: Path, out: Path, p_world: Float64[ndarray, "n 3"], config: Config) -> tuple[Path, Surface]:
     """Train, export and evaluate; `p_world` is what lit pixels see. Returns the run's config.yml, too."""
-    _forget_writers()
-    named = ("--output-dir", out, "--experiment-name", "run", "--timestamp", "now")
-    command("nerfstudio.scripts.train", "sl-neus", "--data", scan, *named, "--max-num-iterations", config.iterations)
-    run, mesh, poses = out / "run/sl-neus/now/config.yml", out / "mesh.ply", out / "refined"
-    command("sl_nerfstudio.cli.export", "--load-config", run, "--output", mesh, "--poses", poses, "--resolution", 256)
-    given = ("--mesh", mesh, "--data", scan, "--poses", poses / "transforms.json")
-    command("sl_nerfstudio.cli.evaluate", *given, "--json", out / "e.json")
-    found = json.loads((out / "e.json").read_text())
+    trained = train(scan, out, "now", ("--max-num-iterations", config.iterations))
+    mesh, poses = out / "mesh.ply", out / "refined"
+    export(trained, mesh, poses, "--resolution", 256)
+    found = evaluate(mesh, scan, poses, out / "e.json")
     accuracy, completeness = found["rigid"]["accuracy"], found["rigid"]["completeness"]
     f_distance, f_score = list(found["rigid"]["f_score"].items())[1]
     T_mesh_truth = np.linalg.inv(found["rigid"]["matrix"])
     distance = IndexedMesh(read_mesh(mesh)).closest(p_world @ T_mesh_truth[:3, :3].T + T_mesh_truth[:3, 3]).distance
-    return run, Surface(
-        accuracy["rmse"],
-        accuracy["median"],
-        completeness["mean"],
-        completeness["rmse"],
-        f_score,
-        found["camera"]["translation_rmse"],
-        found["camera"]["rotation_rmse_deg"],
-        float(distance.mean()),
+    return trained, Surface(
+        accuracy["rmse"], accuracy["median"], completeness["mean"], completeness["rmse"], f_score,
+        found["camera"]["translation_rmse"], found["camera"]["rotation_rmse_deg"], float(distance.mean()),
         float((distance < float(f_distance)).mean()),
-    )
-
-
-def _forget_writers() -> None:
-    """nerfstudio keeps the writers of its logs in a module: they would write to the folder of the run before."""
-    import nerfstudio.scripts.train  # noqa: F401  (imported by itself first, nerfstudio's writer imports itself)
-    from nerfstudio.utils import writer
-
-    for one in writer.EVENT_WRITERS:
-        if hasattr(one, "tb_writer"):
-            one.tb_writer.close()
-    writer.EVENT_WRITERS.clear()
-    writer.GLOBAL_BUFFER.clear()
-
-
-def command(module: str, *arguments: object) -> None:
-    """Run a command in this process: importing nerfstudio takes ten seconds each time. Shows its output if it fails."""
-    from importlib import import_module
-
-    said, kept = io.StringIO(), sys.argv
-    loaded = import_module(module)
-    main = getattr(loaded, "entrypoint", None) or loaded.main
-    sys.argv = [module.rpartition(".")[2], *map(str, arguments)]
-    try:
-        with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            main()
-    except BaseException:
-        print(said.getvalue(), file=sys.__stderr__)
-        raise
-    finally:
-        sys.argv = kept
+    )  # fmt: skip
 
 
 def _coordinates(scan: Path) -> Float32[ndarray, "n h w 2"]:
@@ -220,32 +164,14 @@ def _wrong(errors: Float32[ndarray, "k"]) -> float:
     return float((errors > WRONG_PX).mean()) if len(errors) else 0.0
 
 
-def text(row: Row) -> str:
-    """One line."""
-    a, b = row.before, row.after
-    return (
-        f"{row.scene:18} {row.appearance:9} {row.missing:.0%}"
-        f"  decoded {row.decoded_before:.1%} -> {row.decoded_after:.1%}"
-        f"  new: median {row.added_median:.2f} 95 % {row.added_p95:.2f} px, wrong {row.added_wrong:.3%}"
-        f"  wrong of all {row.wrong_before:.2%} -> {row.wrong_after:.2%}"
-        f"  RMSE {a.rmse:.3f} -> {b.rmse:.3f}  median {a.median:.3f} -> {b.median:.3f}"
-        f"  complete {a.completeness_mean:.3f} -> {b.completeness_mean:.3f}"
-        f", of what is seen {_seen(a)} -> {_seen(b)}"
-        f"  F {a.f_score:.3f} -> {b.f_score:.3f}"
-        f"  cameras {a.camera_mm:.2f} -> {b.camera_mm:.2f} mm"
-    )
-
-
-def _seen(surface: Surface) -> str:
-    known = surface.seen_mean is not None and surface.seen_close is not None
-    return f"{surface.seen_mean:.3f} ({surface.seen_close:.1%})" if known else "-"
+def _row(before: dict[str, Any], after: dict[str, Any], **rest: Any) -> Row:
+    return Row(**rest, before=Surface(**before), after=Surface(**after))
 
 
 def main() -> None:
     """Run the benchmark."""
-    config = tyro.cli(Config, description=__doc__)
-    kept = json.loads(config.output.read_text())["rows"] if config.output.exists() else []
-    rows = [Row(**{**row, "before": Surface(**row["before"]), "after": Surface(**row["after"])}) for row in kept]
+    config = parsed(Config, __doc__)
+    rows = Rows(config.output, kept_rows(config.output, _row))
     size = (config.frames, config.resolution, config.iterations, config.seed)
     done = {(r.scene, r.appearance, r.missing, r.frames, r.resolution, r.iterations, r.seed) for r in rows}
     kinds = [("plain", share) for share in config.missing] + [("realistic", share) for share in config.realistic]
@@ -253,9 +179,7 @@ def main() -> None:
         for appearance, missing in kinds:
             if (scene, appearance, missing, *size) not in done:
                 with TemporaryDirectory() as folder:
-                    rows.append(measure(scene, appearance, missing, config, Path(folder)))
-                write_rows(config.output, rows)
-                print(text(rows[-1]), flush=True)
+                    rows.add(measure(scene, appearance, missing, config, Path(folder)))
 
 
 if __name__ == "__main__":

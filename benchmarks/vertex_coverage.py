@@ -8,15 +8,16 @@ truth than sigma, and 95 % closer than two sigma. Runs that are in the folder ar
 in the result file are not measured again, so an interrupted benchmark continues; `--again` measures all of them.
 """
 
-import argparse
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import rankdata
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.whole_runs import run
+from benchmarks.common.measuring import Rows, kept_rows, options
+from benchmarks.common.runs import export, run
+from benchmarks.common.runs import train as trained
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS
 from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, read_inputs, score_alignments
@@ -42,26 +43,19 @@ class Case:
     frames: int
     resolution: int
     iterations: int
-    intrinsics: float = 0.0  # 1 sigma of their error, as shares of the focal length; 0: exact, which nobody states
+    intrinsics: float  # 1 sigma of their error, as shares of the focal length; 0: exact, which nobody states
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         wrong = f"-{self.intrinsics:g}" if self.intrinsics else ""
         return f"{self.scene}-{self.seed}-{self.noise:g}-{self.frames}-{self.resolution}-{self.iterations}{wrong}"
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Case):
     """Errors of the vertices of one mesh; lengths in mm, shares between 0 and 1."""
 
-    scene: str
-    seed: int
-    noise: float
-    frames: int
-    resolution: int
-    iterations: int
-    intrinsics: float
     vertices: int  # with a sigma
     unobserved: float  # share of vertices that are marked as not observed
     error_rms: float
@@ -81,18 +75,13 @@ def train(case: Case, folder: Path) -> Path:
     """Make the scan and train on it, unless that was done; returns the run's config.yml."""
     scan, out = folder / case.name / "scan", folder / case.name / "runs"
     if not (scan / "transforms.json").exists():
-        run(
-            *("sl-synth", "--output", str(scan), "--scene", case.scene, "--frames", str(case.frames)),
-            *("--resolution", str(case.resolution), "--seed", str(case.seed), "--noise", str(case.noise)),
-        )
+        run("sl-synth", "--output", scan, "--scene", case.scene, "--frames", case.frames, "--resolution",
+            case.resolution, "--seed", case.seed, "--noise", case.noise)  # fmt: skip
         disturb_intrinsics(scan / "transforms.json", case)
     config = out / "run/sl-neus/now/config.yml"
     stated = ("--pipeline.model.prior.intrinsics", str(case.intrinsics)) if case.intrinsics else ()
     if not list(config.parent.glob(f"nerfstudio_models/step-*{case.iterations - 1}.ckpt")):
-        run(
-            *("ns-train", "sl-neus", "--data", str(scan), "--output-dir", str(out), "--experiment-name", "run"),
-            *("--timestamp", "now", "--max-num-iterations", str(case.iterations), *stated),
-        )
+        trained(scan, out, "now", ("--max-num-iterations", case.iterations, *stated))
     return config
 
 
@@ -112,10 +101,7 @@ def measure(case: Case, folder: Path) -> Row:
     """Export the run and compare its vertices with the truth."""
     config, here = train(case, folder), folder / case.name
     mesh, refined = here / "mesh.ply", here / "refined"
-    run(
-        *("sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(refined)),
-        *("--resolution", "256", "--overwrite"),
-    )
+    export(config, mesh, refined, "--resolution", 256, "--overwrite")
     inputs = read_inputs(mesh, here / "scan", refined / "transforms.json", None, _SAMPLES, 0)
     quality, reference = read_quality(mesh), inputs.reference
     assert quality is not None and isinstance(reference, MeshReference)
@@ -127,21 +113,14 @@ def measure(case: Case, folder: Path) -> Row:
     certain = error[seen] / _with_exact_intrinsics(inputs, quality)[seen]
     lengths = _length_errors(inputs, quality, reference, score.S_truth_result)
     return Row(
-        **asdict(case),
-        vertices=int(seen.sum()),
-        unobserved=float((~seen).mean()),
-        error_rms=_rms(error[seen]),
-        error_rms_unobserved=_rms(error[~seen]),
-        sigma_median=float(np.median(quality.sigma[seen])),
-        sigma_independent_median=float(np.median(quality.sigma_independent[seen])),
-        within_1=float((ratio < 1).mean()),
-        within_2=float((ratio < 2).mean()),
-        within_1_independent=float((alone < 1).mean()),
-        within_1_exact_intrinsics=float((certain < 1).mean()),
-        lengths_within_1=float((lengths < 1).mean()),
+        **asdict(case), vertices=int(seen.sum()), unobserved=float((~seen).mean()), error_rms=_rms(error[seen]),
+        error_rms_unobserved=_rms(error[~seen]), sigma_median=float(np.median(quality.sigma[seen])),
+        sigma_independent_median=float(np.median(quality.sigma_independent[seen])), within_1=float((ratio < 1).mean()),
+        within_2=float((ratio < 2).mean()), within_1_independent=float((alone < 1).mean()),
+        within_1_exact_intrinsics=float((certain < 1).mean()), lengths_within_1=float((lengths < 1).mean()),
         lengths_within_2=float((lengths < 2).mean()),
-        rank_correlation=float(np.corrcoef(_ranks(error[seen]), _ranks(quality.sigma[seen]))[0, 1]),
-    )
+        rank_correlation=float(np.corrcoef(rankdata(error[seen]), rankdata(quality.sigma[seen]))[0, 1]),
+    )  # fmt: skip
 
 
 def _with_exact_intrinsics(inputs: EvaluationInputs, quality: VertexQuality) -> np.ndarray:
@@ -182,56 +161,22 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean())) if len(values) else 0.0
 
 
-def _ranks(values: np.ndarray) -> np.ndarray:
-    return np.argsort(np.argsort(values)).astype(float)
-
-
 def main() -> None:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--noise", nargs="+", type=float, default=[0.2, 0.5])
-    parser.add_argument("--frames", type=int, default=14)
-    parser.add_argument("--resolution", type=int, default=240)
-    parser.add_argument("--iterations", type=int, default=400)
-    parser.add_argument(
-        "--intrinsics", type=float, default=0.0, help="error of the intrinsics, share of the focal length"
-    )
-    parser.add_argument("--folder", type=Path, default=Path("outputs/vertex_coverage"))
-    parser.add_argument("--again", action="store_true", help="measure also what is in the result file")
-    parser.add_argument("--train-only", action="store_true", help="make scans and runs, measure nothing")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/vertex_coverage.json"))
-    options = parser.parse_args()
-    size = (options.frames, options.resolution, options.iterations, options.intrinsics)
-    cases = [Case(a, b, c, *size) for b in options.seeds for c in options.noise for a in options.scenes]
-    if options.train_only:
-        for case in cases:
-            train(case, options.folder)
-            print(case.name, flush=True)
-        return
-    kept = [] if options.again or not options.output.exists() else json.loads(options.output.read_text())["rows"]
-    rows = [Row(**row) for row in kept]
-    done = {Case(*(row[name] for name in Case.__dataclass_fields__)) for row in kept}
-    for case in cases:
+    """Run the benchmark; `--intrinsics` is the error of the intrinsics as a share of the focal length."""
+    given = options(
+        __doc__, scenes=list(SCENES), seeds=[1, 2], noise=[0.2, 0.5], frames=14, resolution=240, iterations=400,
+        intrinsics=0.0, folder=Path("outputs/vertex_coverage"), again=False,
+        output=Path("benchmarks/results/vertex_coverage.json"),
+    )  # fmt: skip
+    size = (given.frames, given.resolution, given.iterations, given.intrinsics)
+    rows = Rows(given.output, [] if given.again else kept_rows(given.output, Row))
+    done = {Case(*(getattr(row, name) for name in Case.__dataclass_fields__)) for row in rows}
+    for case in (Case(a, b, c, *size) for b in given.seeds for c in given.noise for a in given.scenes):
         if case not in done:
-            rows.append(measure(case, options.folder))
-            write_rows(options.output, rows)
-            print(text(rows[-1]), flush=True)
+            rows.add(measure(case, given.folder))
     ones = np.array([row.within_1 for row in rows])
     inside = ((ones >= 0.6) & (ones <= 0.8)).sum()
     print(f"within 1 sigma: mean {ones.mean():.0%}, {inside} of {len(ones)} scans in 60 to 80 %")
-
-
-def text(row: Row) -> str:
-    """One line."""
-    return (
-        f"{row.scene:18} {row.seed} noise {row.noise:.2f}  RMS {row.error_rms:.3f} mm  sigma {row.sigma_median:.3f} "
-        f"(independent {row.sigma_independent_median:.3f})  within 1: {row.within_1:.0%}  2: {row.within_2:.0%}  "
-        f"independent alone: {row.within_1_independent:.0%}  exact intrinsics: {row.within_1_exact_intrinsics:.0%}  "
-        f"lengths {row.lengths_within_1:.0%} {row.lengths_within_2:.0%}  rank correlation {row.rank_correlation:.2f}  "
-        f"not observed {row.unobserved:.1%} (RMS {row.error_rms_unobserved:.2f})"
-    )
 
 
 if __name__ == "__main__":

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from training.noise_fields import log_uniform, smooth_field
 from training.patterns import DrawnPattern
 from training.surfaces import Surface
-from training.textures import natural, printed
+from training.textures import log_uniform, natural, printed, smooth_field
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from training.noise_fields import log_uniform, smooth_field
+from training.textures import log_uniform, smooth_field
 
 
 def photograph(
@@ -68,7 +68,7 @@ def _speckle(rng: np.random.Generator, signal: Float32[ndarray, "n n"], hard: fl
 
 
 def _compressed(rng: np.random.Generator, image: ndarray) -> ndarray:
-    """As a JPEG file stores it, in half of the captures."""
+    """The image as a JPEG file stores it, in half of the captures."""
     if rng.random() < 0.5:
         return image
     _, file = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(45, 96))])

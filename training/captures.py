@@ -9,9 +9,9 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.grid_phases import network_channels
 from training.appearance import illuminate, random_difficulty
 from training.camera import photograph
-from training.noise_fields import log_uniform
 from training.patterns import CELLS, PatternStock
 from training.surfaces import Surface, random_surface
+from training.textures import log_uniform
 
 _SAMPLING = 2
 

@@ -24,9 +24,8 @@ from sl_nerfstudio.decoding.grid_edges import EdgeNetwork, EdgeView, slopes
 from training.edge_captures import WRONG, EdgeCapture, edge_capture, load_capture, painted_capture, save_capture
 from training.edge_errors import continuation_errors, held_out, losses
 from training.mirrored import Crop, mirrored
-from training.records import cosine_rate, log_row, save_weights
 from training.rendered_captures import rendered_captures
-from training.steps import descend, made_ahead, resume, save_checkpoint
+from training.steps import cosine_rate, descend, log_row, made_ahead, resume, save_checkpoint, save_weights
 
 _RISK_WEIGHT = 5.0
 _HELD_OUT = 20  # every so many captures one is held out to measure with

@@ -19,8 +19,7 @@ from sl_nerfstudio.decoding.grid_graph import (
     turned_pattern,
 )
 from training.graphs import DamagedGraph, damage_graph, random_codes, random_damage
-from training.records import cosine_rate, log_row, save_weights
-from training.steps import descend
+from training.steps import cosine_rate, descend, log_row, save_weights
 
 
 @dataclass(frozen=True)
@@ -100,11 +99,9 @@ def train(config: Config) -> None:
         total, recognised = total + float(loss.detach()), recognised + right
         if (step + 1) % config.log_every == 0:
             row = {
-                "step": step + 1,
-                "seconds": round(time.monotonic() - start),
-                "loss": round(total / config.log_every, 4),
-                "recognised": round(recognised / config.log_every, 4),
-            }
+                "step": step + 1, "seconds": round(time.monotonic() - start),
+                "loss": round(total / config.log_every, 4), "recognised": round(recognised / config.log_every, 4),
+            }  # fmt: skip
             log_row(config.output, row)
             total, recognised = 0.0, 0.0
     save_weights(network, config.output / "gcn.safetensors", config)

@@ -36,7 +36,7 @@ class DamagedGraph:
 
 
 def random_damage(rng: np.random.Generator) -> Damage:
-    """From hardly any damage to more than can be corrected."""
+    """Draw damage, from hardly any to more than can be corrected."""
     return Damage(
         float(rng.uniform(0, 0.45)), float(rng.uniform(0, 0.4)), float(rng.uniform(0, 0.1)), bool(rng.random() < 0.4)
     )

@@ -23,12 +23,9 @@ class Crop(NamedTuple):
 
 
 def mirrored(
-    channels: Float32[ndarray, "c h w"],
-    fitted: Float32[ndarray, "h w 2"],
-    slope: Float32[ndarray, "h w 2 2"],
-    true: Float32[ndarray, "h w 2"],
-    how: int,
-) -> Crop:
+    channels: Float32[ndarray, "c h w"], fitted: Float32[ndarray, "h w 2"], slope: Float32[ndarray, "h w 2 2"],
+    true: Float32[ndarray, "h w 2"], how: int,
+) -> Crop:  # fmt: skip
     """One of eight: 1 changes left and right, 2 above and below, 4 rows and columns; `how` is their sum."""
     if how & 1:
         channels = _turned_around(channels[:, :, ::-1], _SINE_X, _MOVE_X, 4)

@@ -36,18 +36,14 @@ def random_grid(rng: np.random.Generator) -> GridPattern:
     """Random symbols, line width, gap and darkness."""
     side = CELLS * _PERIOD
     return GridPattern(
-        w=side,
-        h=side,
-        period=float(_PERIOD),
-        line_width=_PERIOD * rng.uniform(0.14, 0.28),
-        gap=_PERIOD * rng.uniform(0.22, 0.36),
-        dark=float(rng.uniform(0, 0.08)),
+        w=side, h=side, period=float(_PERIOD), line_width=_PERIOD * rng.uniform(0.14, 0.28),
+        gap=_PERIOD * rng.uniform(0.22, 0.36), dark=float(rng.uniform(0, 0.08)),
         codes=rng.integers(0, SYMBOLS, (CELLS, CELLS)).astype(np.int8),
-    )
+    )  # fmt: skip
 
 
 def seeded_grid(rng: np.random.Generator) -> GridPattern:
-    """The same with the symbols of a seed, as a pattern.json can hold them, and with more or fewer nodes."""
+    """The grid with the symbols of a seed, as a pattern.json can hold them, and with more or fewer nodes."""
     side = int(rng.integers(28, 50)) * _PERIOD
     one = random_grid(rng)
     return GridPattern(side, side, one.period, one.line_width, one.gap, one.dark, int(rng.integers(1 << 20)))

@@ -1,12 +1,41 @@
-"""What the trainings share: batches made ahead, a step of the optimiser, and checkpoints to continue from."""
+"""What the trainings share: batches made ahead, a step of the optimiser, checkpoints, logs and weights."""
 
-from collections.abc import Callable, Iterator
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
+
+
+def cosine_rate(highest: float, step: int, steps: int, warm_up: int) -> float:
+    """Learning rate of a step: it rises over `warm_up` steps, then falls to zero along a cosine."""
+    return highest * min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def log_row(folder: Path, row: Mapping[str, Any]) -> None:
+    """Print a line of figures and add it to `log.jsonl`."""
+    line = json.dumps(row)
+    print(line, flush=True)
+    with (folder / "log.jsonl").open("a") as stream:
+        stream.write(line + "\n")
+
+
+def settings(config: Any) -> dict[str, str]:
+    """The settings of a training (a dataclass) as metadata of its weights."""
+    return {key: str(value) for key, value in asdict(config).items() if key != "output"}
+
+
+def save_weights(network: nn.Module, path: Path, config: Any, **more: str) -> None:
+    """Write a network as safetensors, with the settings of its training and `more` as its metadata."""
+    weights = {key: value.contiguous() for key, value in network.state_dict().items()}
+    save_file(weights, path, {**more, **settings(config)})
+
 
 _LARGEST_GRADIENT = 2.0
 

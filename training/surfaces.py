@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8
 from numpy import ndarray
 
-from training.noise_fields import log_uniform, smooth_field
+from training.textures import log_uniform, smooth_field
 
 LARGEST_ROLL = np.radians(40.0)  # that remains after the decoder has turned the image
 PERIODS = (8.5, 24.0)  # pixels, before foreshortening
@@ -110,13 +110,9 @@ def _stretch(direction: float, factor: float) -> Float32[ndarray, "2 2"]:
 
 
 def _field(
-    rng: np.random.Generator,
-    x: Float32[ndarray, "n n"],
-    y: Float32[ndarray, "n n"],
-    jacobian: Float32[ndarray, "2 2"],
-    centre: Float32[ndarray, "2"],
-    parallax: float,
-) -> tuple[Float32[ndarray, "n n 2"], Float32[ndarray, "n n"]]:
+    rng: np.random.Generator, x: Float32[ndarray, "n n"], y: Float32[ndarray, "n n"], jacobian: Float32[ndarray, "2 2"],
+    centre: Float32[ndarray, "2"], parallax: float,
+) -> tuple[Float32[ndarray, "n n 2"], Float32[ndarray, "n n"]]:  # fmt: skip
     """Coordinates of one surface, and its shading in (0, 1.2)."""
     n, extent = len(x), float(x[0, -1] - x[0, 0])
     tilt = rng.normal(0, 0.12, 2) / extent

@@ -1,7 +1,4 @@
-"""Random textures of surfaces: natural ones, and printed ones with sharp edges at the scales of the grid.
-
-Each is a reflectance factor in (0, 1] on a square of samples; `period` is the width of a period of the grid in samples.
-"""
+"""Random fields, and textures made of them: natural ones, and prints at the scales of the grid."""
 
 from collections.abc import Callable
 
@@ -10,7 +7,19 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from training.noise_fields import log_uniform, smooth_field
+
+def smooth_field(rng: np.random.Generator, size: int, knots: int) -> Float32[ndarray, "n n"]:
+    """Random values of unit variance at `knots` x `knots` places, smoothly interpolated to `size` x `size`."""
+    coarse = rng.standard_normal((knots + 3, knots + 3)).astype(np.float32)
+    step, start = knots / size, rng.uniform(0.5, 1.5, 2)
+    place = np.array([[step, 0, start[0]], [0, step, start[1]]], dtype=np.float32)
+    return cv2.warpAffine(coarse, place, (size, size), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A random number whose logarithm is uniform between those of `low` and `high`."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
 
 _LETTERS = np.array(list("ABCDEFGHKLMNPRSTUXYZabdeghkmnprstuw0123456789#%&+="))
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)

@@ -23,8 +23,7 @@ from torch.nn import functional as F
 from sl_nerfstudio.decoding.grid_phases import NetworkOutput, UNet
 from training.captures import Capture, random_capture
 from training.patterns import PatternStock
-from training.records import cosine_rate, log_row, save_weights
-from training.steps import descend, made_ahead, resume, save_checkpoint
+from training.steps import cosine_rate, descend, log_row, made_ahead, resume, save_checkpoint, save_weights
 
 _NODE_WEIGHT = 3.0  # symbols are read at nodes: errors count more there
 _RENEWAL = 20  # steps between two new patterns
@@ -75,14 +74,10 @@ def stack(captures: list[Capture]) -> Batch:
     angle = 2 * math.pi * coords
     phase = torch.stack([angle[..., 0].cos(), angle[..., 0].sin(), angle[..., 1].cos(), angle[..., 1].sin()], 1)
     return Batch(
-        torch.from_numpy(np.stack([c.channels for c in captures])).contiguous(memory_format=torch.channels_last),
-        lit,
-        lit * certain,
-        certain,
-        phase,
-        torch.from_numpy(np.stack([c.symbol for c in captures]).astype(np.int64)),
+        torch.from_numpy(np.stack([c.channels for c in captures])).contiguous(memory_format=torch.channels_last), lit,
+        lit * certain, certain, phase, torch.from_numpy(np.stack([c.symbol for c in captures]).astype(np.int64)),
         ((coords - coords.round()).abs().amax(-1) < 0.25).float(),
-    )
+    )  # fmt: skip
 
 
 def losses(output: NetworkOutput, batch: Batch) -> dict[str, Tensor]:

@@ -13,36 +13,29 @@ import resource
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
-import tyro
 
-from benchmarks.another_renderer.captures import CaptureSet, captures_of
 from benchmarks.another_renderer.scoring import FrameError, score, usable_frames
-from benchmarks.another_renderer.sets import chosen_sets
+from benchmarks.another_renderer.sets import CaptureSet, captures_of, chosen_sets
+from benchmarks.common.measuring import parsed, shown
 
 
 @dataclass(frozen=True)
 class Config:
     """Which sets are measured, and where they are kept."""
 
-    sets: tuple[str, ...] = ()
-    """parts of the names of sets; default: all of the list"""
-    which: Literal["known", "unseen", "otherwise", "later", "equipment"] = "known"
-    """which list: the first; the second, at which nobody looks before a change is finished; other ways of walking;
-    objects that came later; or other cameras, projectors and matter"""
-    keep: Path = Path("outputs/another_renderer")
-    """folder of captures and scans"""
-    output: Path | None = None
-    """JSON with the figures; default: results.json in --keep"""
-    jobs: int = 1
-    """number of processes of sl-process"""
-    resume: bool = False
-    """use what an earlier run kept in its work folders; the time is then that of the rest"""
+    sets: tuple[str, ...] = ()  # parts of the names of sets; default: all of the list
+    # the first list (known); the second, at which nobody looks before a change is finished (unseen); other ways of
+    # walking (otherwise); objects that came later (later); other cameras, projectors and matter (equipment)
+    which: str = "known"
+    keep: Path = Path("outputs/another_renderer")  # folder of captures and scans
+    output: Path | None = None  # JSON with the figures; default: results.json in --keep
+    jobs: int = 1  # processes of sl-process
+    resume: bool = False  # use what an earlier run kept in its work folders; the time is then that of the rest
 
 
 @dataclass(frozen=True)
@@ -122,37 +115,18 @@ def _command(module: str, *flags: str) -> str:
     return "" if done.returncode == 0 else done.stderr.strip() or f"exit status {done.returncode}"
 
 
-HEAD = (
-    f"{'set':28} {'right':>6} {'wrong':>5} {'out':>3}  {'camera deg':>13}  {'turn/s':>10} {'shift/s':>10} "
-    f"{'rel.turn/s':>10} {'rel.shift/s':>11}  {'surface %':>11} {'decoded':>7} {'>2px':>5}  {'verdict':10} {'s':>4}"
-)
-
-
-def text_of(row: Row) -> str:
-    """A line of the table."""
-    ratios = (row.rotation_sigma, row.translation_sigma, row.relative_rotation_sigma, row.relative_translation_sigma)
-    return (
-        f"{row.name:28} {row.right:3d}/{row.usable:<2d} {len(row.wrong):5d} {len(row.left_out):3d}  "
-        f"{row.camera_deg[0]:6.3f} {row.camera_deg[1]:6.2f}  "
-        + " ".join(f"{a:4.1f} {b:5.1f}" for a, b in ratios)
-        + f"  {100 * row.surface_median:5.3f} {100 * row.surface_95:5.2f} {row.decoded:7.1%} {row.wrong_pixels:5.1%}  "
-        f"{row.verdict:10} {row.seconds:4.0f}" + (f"\n    {row.message.splitlines()[0]}" if row.message else "")
-    )
-
-
 def main() -> None:
     """Print a line for each set, and write all to JSON."""
-    config = tyro.cli(Config, description=__doc__)
+    config = parsed(Config, __doc__)
     cv2.setNumThreads(1)
     output = config.output or config.keep / "results.json"
     rows = json.loads(output.read_text()) if output.exists() else []
-    print(HEAD, flush=True)
     for one in chosen_sets(config.sets, config.which):
         if any(row["name"] == one.name for row in rows):
             print(f"{one.name}: in {output} already", flush=True)
             continue
         row = measure(one, config)
-        print(text_of(row), flush=True)
+        print(shown(replace(row, errors=())), flush=True)
         rows.append(asdict(row))
         output.write_text(json.dumps(rows, indent=1) + "\n")
 

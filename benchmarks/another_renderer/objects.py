@@ -1,28 +1,240 @@
-"""The objects, as meshes of about 120 mm: eight that found faults before, and twelve of the kind that people scan."""
+"""Solids, how they are joined and meshed, and the objects: meshes of about 120 mm. Lengths in mm, z is up."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
 import trimesh
 from numpy import ndarray
+from skimage.measure import marching_cubes
 
-from benchmarks.another_renderer.more_objects import car, hand, knight, pan, shell, shoe
-from benchmarks.another_renderer.shapes import (
-    ball,
-    block,
-    drum,
-    joined,
-    meshed,
-    moved,
-    prism,
-    ring,
-    rod,
-    sheet,
-    tube,
-    turned,
-    without,
-)
+Solid = Callable[[ndarray], ndarray]
+"""Signed distance of points (..., 3), negative inside; may be a bound instead of the distance itself."""
+
+
+def ball(centre: Sequence[float], radii: float | Sequence[float]) -> Solid:
+    """A ball, or an ellipsoid with three radii."""
+    r = np.broadcast_to(np.asarray(radii, dtype=float), 3)
+    return lambda p: (np.linalg.norm((p - np.asarray(centre)) / r, axis=-1) - 1) * r.min()
+
+
+def block(centre: Sequence[float], sides: Sequence[float], rounding: float = 0.5, turn_deg: float = 0.0) -> Solid:
+    """A box with rounded edges, turned about the vertical through its centre."""
+    half = np.asarray(sides, dtype=float) / 2 - rounding
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+
+    def distance(p: ndarray) -> ndarray:
+        x, y, z = np.moveaxis(p - np.asarray(centre), -1, 0)
+        q = np.abs(np.stack([c * x + s * y, c * y - s * x, z], -1)) - half
+        return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - rounding
+
+    return distance
+
+
+def rod(start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None) -> Solid:
+    """A capsule between two points, or a cone with round ends."""
+    a, d = np.asarray(start, dtype=float), np.subtract(end, start).astype(float)
+    last = radius if end_radius is None else end_radius
+
+    def distance(p: ndarray) -> ndarray:
+        t = np.clip((p - a) @ d / (d @ d), 0, 1)
+        return np.linalg.norm(p - a - t[..., None] * d, axis=-1) - (radius + t * (last - radius))
+
+    return distance
+
+
+def drum(centre: Sequence[float], radius: float, height: float, axis: int = 2) -> Solid:
+    """A cylinder along one of the axes."""
+
+    def distance(p: ndarray) -> ndarray:
+        q = p - np.asarray(centre)
+        across = np.linalg.norm(np.delete(q, axis, -1), axis=-1) - radius
+        along = np.abs(q[..., axis]) - height / 2
+        return np.minimum(np.maximum(across, along), 0) + np.hypot(np.maximum(across, 0), np.maximum(along, 0))
+
+    return distance
+
+
+def prism(corners: int, radius: float, height: float) -> Solid:
+    """A regular prism about z; `radius` is that of its inner circle."""
+
+    def distance(p: ndarray) -> ndarray:
+        step = 2 * np.pi / corners
+        angle = np.mod(np.arctan2(p[..., 1], p[..., 0]) + step / 2, step) - step / 2
+        return np.maximum(np.hypot(p[..., 0], p[..., 1]) * np.cos(angle) - radius, np.abs(p[..., 2]) - height / 2)
+
+    return distance
+
+
+def turned(profile: Sequence[tuple[float, float]]) -> Solid:
+    """A solid of revolution about z: (height, radius) from bottom to top, straight between."""
+    z, r = np.asarray(profile, dtype=float).T
+    steepest = float(np.hypot(1, np.max(np.abs(np.diff(r) / np.diff(z)))))
+
+    def distance(p: ndarray) -> ndarray:
+        side = (np.hypot(p[..., 0], p[..., 1]) - np.interp(p[..., 2], z, r)) / steepest
+        return np.maximum(side, np.maximum(z[0] - p[..., 2], p[..., 2] - z[-1]))
+
+    return distance
+
+
+def ring(centre: Sequence[float], radius: float, thickness: float, axis: int = 2) -> Solid:
+    """A torus; `thickness` is the radius of its tube."""
+
+    def distance(p: ndarray) -> ndarray:
+        q = p - np.asarray(centre)
+        return np.hypot(np.linalg.norm(np.delete(q, axis, -1), axis=-1) - radius, q[..., axis]) - thickness
+
+    return distance
+
+
+def moved(solid: Solid, shift: Sequence[float], turn_deg: float = 0.0, tilt_deg: float = 0.0) -> Solid:
+    """Tilted about y, turned about z, then shifted."""
+    a, b = np.radians(turn_deg), np.radians(tilt_deg)
+    turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    tilt = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    return lambda p: solid((p - np.asarray(shift)) @ (turn @ tilt))
+
+
+def joined(*solids: Solid, blend: float = 0.0) -> Solid:
+    """The union; with `blend`, of its size in mm, the seams are rounded."""
+
+    def distance(p: ndarray) -> ndarray:
+        result = solids[0](p)
+        for solid in solids[1:]:
+            other = solid(p)
+            h = np.maximum(blend - np.abs(result - other), 0) / max(blend, 1e-9)
+            result = np.minimum(result, other) - h * h * blend / 4
+        return result
+
+    return distance
+
+
+def without(solid: Solid, *holes: Solid) -> Solid:
+    """What is left of a solid."""
+
+    def distance(p: ndarray) -> ndarray:
+        result = solid(p)
+        for hole in holes:
+            result = np.maximum(result, -hole(p))
+        return result
+
+    return distance
+
+
+def meshed(solid: Solid, half: Sequence[float], voxel: float = 0.8) -> trimesh.Trimesh:
+    """Marching cubes in a box from -half to half. Raises ValueError if the solid leaves the box."""
+    axes = [np.arange(-h, h + voxel, voxel) for h in half]
+    slabs = [solid(np.stack(np.meshgrid(x, *axes[1:], indexing="ij"), -1))[0] for x in axes[0][:, None]]
+    values = np.stack(slabs).astype(np.float32)
+    rims = (values[[0, -1]], values[:, [0, -1]], values[:, :, [0, -1]])
+    if any(rim.min() <= 0 for rim in rims):
+        raise ValueError("the solid does not fit into its box")
+    points, faces, _, _ = marching_cubes(values, 0.0, spacing=(voxel,) * 3, gradient_direction="descent")
+    return trimesh.Trimesh(points + [a[0] for a in axes], faces, process=False)
+
+
+def tube(path: ndarray, radius: float, closed: bool = False, around: int = 20) -> trimesh.Trimesh:
+    """A pipe along a path (n, 3), with half-open ends unless it is closed."""
+    path = np.asarray(path, dtype=float)
+    along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    first = np.cross(along[0], [0.3, 0.5, 0.81])
+    sides = [first / np.linalg.norm(first)]
+    for direction in along[1:]:
+        side = sides[-1] - direction * (sides[-1] @ direction)
+        sides.append(side / np.linalg.norm(side))
+    u = np.stack(sides)
+    v = np.cross(along, u)
+    angle = np.arange(around) * 2 * np.pi / around
+    rings = path[:, None] + radius * (u[:, None] * np.cos(angle)[:, None] + v[:, None] * np.sin(angle)[:, None])
+    n = len(path)
+    i, k = np.meshgrid(np.arange(n if closed else n - 1), np.arange(around), indexing="ij")
+    a, b = i * around + k, i * around + (k + 1) % around
+    c, d = (i + 1) % n * around + k, (i + 1) % n * around + (k + 1) % around
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    return trimesh.Trimesh(rings.reshape(-1, 3), faces, process=False)
+
+
+def sheet(
+    height: Callable[[ndarray, ndarray], ndarray], sides: tuple[float, float], thickness: float
+) -> trimesh.Trimesh:
+    """A plate whose upper side is `height(x, y)`, and whose lower side is `thickness` below it."""
+    x, y = (np.linspace(-s / 2, s / 2, int(s / 0.7)) for s in sides)
+    X, Y = np.meshgrid(x, y, indexing="ij")
+    top = np.stack([X, Y, height(X, Y)], -1).reshape(-1, 3)
+    n, m = X.shape
+    index = np.arange(n * m).reshape(n, m)
+    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    upper = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    rim = np.concatenate([index[:, 0], index[-1, 1:], index[-2::-1, -1], index[0, -2::-1]])
+    wall = [face for p, q in pairwise(rim) for face in ((p, p + n * m, q), (q, p + n * m, q + n * m))]
+    faces = np.concatenate([upper, upper[:, ::-1] + n * m, np.array(wall)])
+    return trimesh.Trimesh(np.concatenate([top, top - [0, 0, thickness]]), faces, process=False)
+
+
+def shoe() -> trimesh.Trimesh:
+    """A low shoe with a heel and laces, open at the top."""
+    sole = joined(ball((-35, 0, -22), (26, 20, 9)), ball((25, 2, -22), (36, 24, 9)), blend=16)
+    heel = block((-42, 0, -28), (28, 34, 12), 3)
+    upper = joined(ball((-34, 0, -4), (24, 18, 26)), rod((-20, 0, 6), (38, 2, -14), 18, 13), blend=14)
+    inside = joined(ball((-33, 0, 14), (19, 13, 26)), rod((-20, 0, 16), (6, 1, 2), 12, 10))
+    laces = [rod((x, -12, 8.64 - 0.42 * x), (x, 12, 8.64 - 0.42 * x), 1.8) for x in (-4, 6, 16)]
+    return meshed(joined(joined(without(upper, inside), sole, blend=6), heel, *laces, blend=1.0), (76, 42, 48))
+
+
+def knight() -> trimesh.Trimesh:
+    """A chess knight on a turned foot."""
+    foot = turned([(-55, 26), (-48, 26), (-45, 22), (-40, 22), (-34, 15), (-30, 17), (-26, 15)])
+    neck = joined(rod((-4, 0, -28), (-8, 0, 8), 15, 12), rod((-8, 0, 8), (2, 0, 30), 13, 11), blend=8)
+    head = joined(rod((0, 0, 32), (26, 0, 14), 11, 7), ball((28, 0, 12), (7, 6, 6)), blend=6)
+    ears = [rod((-2, side * 6, 38), (-4, side * 8, 52), 3.4, 1.4) for side in (-1, 1)]
+    mane = [block((-20 + 0.15 * k * k, 0, 30 - 9 * k), (8, 5, 6), 1.2) for k in range(6)]
+    eyes = [ball((8, side * 10, 30), 2.5) for side in (-1, 1)]
+    return meshed(joined(foot, neck, head, *ears, *mane, *eyes, blend=2), (44, 36, 60))
+
+
+def car() -> trimesh.Trimesh:
+    """A toy car."""
+    body = joined(block((0, 0, -8), (112, 48, 18), 4), block((-8, 0, 10), (58, 42, 26), 8), blend=3)
+    arches = [drum((x, y, -16), 13, 14, axis=1) for x in (-33, 35) for y in (-24, 24)]
+    wheels = [drum((x, y, -16), 11, 9, axis=1) for x in (-33, 35) for y in (-21, 21)]
+    windows = [block((-8, side * 21, 14), (44, 4, 12), 2) for side in (-1, 1)]
+    bumper = [block((-54, 0, 6), (5, 44, 3), 1), *(rod((-52, y, 0), (-52, y, 6), 2) for y in (14, -14))]
+    lamp = drum((44, 14, -6), 4, 6, axis=0)
+    hollow = without(body, *arches, *windows, block((22, 0, 14), (5, 34, 12), 2))
+    return meshed(joined(hollow, *wheels, *bumper, lamp), (68, 36, 38))
+
+
+def hand() -> trimesh.Trimesh:
+    """A right hand, upright, with the fingers a little bent."""
+    palm = joined(ball((0, 0, -18), (24, 10, 28)), ball((-14, 4, -26), (14, 9, 16)), blend=10)
+    fingers = []
+    for x, length, y in ((-17, 36, 8), (-6, 46, 2), (5, 43, -2), (15, 32, 4)):
+        joint = (x * 1.25, y, 4 + length * 0.55)
+        fingers += [rod((x, 0, 4), joint, 7, 6), rod(joint, (x * 1.35, y + 7, 4 + length), 6, 5)]
+    thumb = [rod((-18, 4, -26), (-36, 12, -6), 9, 7), rod((-36, 12, -6), (-38, 18, 12), 7, 5.5)]
+    wrist = rod((2, 0, -36), (3, -2, -56), 16, 15)
+    return meshed(joined(joined(palm, wrist, blend=10), *fingers, *thumb, blend=5), (56, 34, 76))
+
+
+def shell() -> trimesh.Trimesh:
+    """A sea snail's."""
+    turn = np.linspace(0, 7 * np.pi, 130)
+    parts = [
+        ball((34 * k * np.cos(t), 34 * k * np.sin(t), 58 - 112 * k**0.9), 21 * k + 1 + k * np.cos(6 * t))
+        for t, k in zip(turn, np.exp(-0.11 * turn), strict=True)
+    ]
+    return meshed(joined(*parts, blend=1.5), (66, 66, 84), 1.0)
+
+
+def pan() -> trimesh.Trimesh:
+    """A pan: round but for its handle."""
+    bowl = turned([(-14, 38), (-10, 42), (14, 48), (16, 48)])
+    hollow = turned([(-10, 36), (-6, 39), (18, 45), (30, 45)])
+    handle = joined(rod((44, 0, 10), (74, 4, 16), 5, 6.5), ball((74, 4, 16), (10, 7, 5)), blend=3)
+    return meshed(joined(without(bowl, hollow), handle, blend=1.5), (92, 54, 28))
 
 
 def knot() -> trimesh.Trimesh:
@@ -164,18 +376,13 @@ def housing() -> trimesh.Trimesh:
     body = joined(block((0, 0, -28), (116, 46, 16), 2), drum((0, 0, 4), 32, 40, axis=1), blend=6)
     ribs = joined(block((30, 0, -10), (40, 7, 30), 1), block((-30, 6, -12), (36, 6, 24), 1))
     bosses = joined(
-        drum((46, 12, -14), 9, 22),
-        drum((-46, -10, -18), 8, 12),
-        drum((-44, 12, -16), 6, 20),
-        drum((8, 0, 38), 8, 24),
+        drum((46, 12, -14), 9, 22), drum((-46, -10, -18), 8, 12), drum((-44, 12, -16), 6, 20), drum((8, 0, 38), 8, 24),
         blend=2,
-    )
+    )  # fmt: skip
     holes = [
-        drum((0, 0, 4), 19, 80, axis=1),
-        drum((46, 12, -14), 4, 80),
-        drum((-46, -10, -18), 4, 80),
+        drum((0, 0, 4), 19, 80, axis=1), drum((46, 12, -14), 4, 80), drum((-46, -10, -18), 4, 80),
         drum((8, 0, 46), 4, 20),
-    ]
+    ]  # fmt: skip
     return meshed(without(joined(body, ribs, bosses, blend=2), *holes), (64, 34, 56))
 
 
@@ -234,21 +441,8 @@ def wire() -> trimesh.Trimesh:
     a, b, c, d = (-45, -32, -40), (46, -30, -40), (44, 34, -40), (-42, 30, -40)
     e, f, g, h = (-38, -24, 36), (40, -26, 20), (36, 28, 44), (-36, 26, 30)
     lines = [
-        (a, b),
-        (b, c),
-        (c, d),
-        (d, a),
-        (e, f),
-        (f, g),
-        (g, h),
-        (h, e),
-        (a, e),
-        (b, f),
-        (c, g),
-        (d, h),
-        (b, g),
-        (e, c),
-    ]
+        (a, b), (b, c), (c, d), (d, a), (e, f), (f, g), (g, h), (h, e), (a, e), (b, f), (c, g), (d, h), (b, g), (e, c),
+    ]  # fmt: skip
     parts = [tube(np.linspace(p, q, 60), 2.6) for p, q in lines]
     knots = [trimesh.creation.icosphere(subdivisions=3, radius=4.0) for _ in range(8)]
     for ball_, at in zip(knots, (a, b, c, d, e, f, g, h), strict=True):

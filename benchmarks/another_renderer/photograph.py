@@ -1,14 +1,299 @@
-"""One photograph of a scene under the projected pattern, and its truth."""
+"""One photograph of a scene under the projected pattern, and its truth: lenses, surfaces, light, sensor."""
 
+import io
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+import open3d as o3d
+import trimesh
 from numpy import ndarray
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
-from benchmarks.another_renderer.optics import Lens, dots, into_device
-from benchmarks.another_renderer.scene import EPSILON, Hits, Paint, Scene
-from benchmarks.another_renderer.sensor import Sensor, exposed
+
+def dots(a: ndarray, b: ndarray) -> ndarray:
+    """Products of vectors (..., k), summed over the last axis; much faster than by `sum`."""
+    return np.einsum("...i,...i->...", a, b)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics in pixels; the centre of the first pixel is (0.5, 0.5), y points down."""
+
+    w: int
+    h: int
+    f: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+
+    def document(self) -> dict[str, float]:
+        """The lens as the plain JSON of sl-process has it."""
+        return {"w": self.w, "h": self.h, "fl_x": self.f, "fl_y": self.f, "cx": self.cx, "cy": self.cy,
+                "k1": self.k1, "k2": self.k2, "p1": 0.0, "p2": 0.0}  # fmt: skip
+
+    def pixels(self, p: ndarray) -> ndarray:
+        """Pixels (..., 2) of points (..., 3) in device axes; NaN behind the device."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            n = np.stack([p[..., 0], -p[..., 1]], -1) / -p[..., 2:]
+        n[p[..., 2] >= 0] = np.nan
+        r2 = dots(n, n)[..., None]
+        return self.f * n * (1 + self.k1 * r2 + self.k2 * r2**2) + [self.cx, self.cy]
+
+    def directions(self, uv: ndarray) -> ndarray:
+        """Unit directions (..., 3) in device axes of pixels (..., 2)."""
+        distorted = (uv - [self.cx, self.cy]) / self.f
+        n = distorted.copy()
+        for _ in range(8):
+            r2 = dots(n, n)[..., None]
+            n = distorted / (1 + self.k1 * r2 + self.k2 * r2**2)
+        d = np.concatenate([n[..., :1], -n[..., 1:], -np.ones_like(n[..., :1])], -1)
+        return d / np.sqrt(dots(d, d))[..., None]
+
+    def turned_to_middle(self) -> ndarray:
+        """Rotation (4, 4) in device axes, after which the middle of the image looks where its axis did."""
+        right, down = (self.w / 2 - self.cx) / self.f, (self.h / 2 - self.cy) / self.f
+        if max(abs(right), abs(down)) < 0.1:  # as exact as people aim
+            return np.eye(4)
+        middle, axis = np.array([right, -down, -1.0]), np.array([0.0, 0.0, -1.0])
+        T = np.eye(4)
+        T[:3, :3] = Rotation.align_vectors(axis[None], middle[None])[0].as_matrix()
+        return T
+
+
+def looking(eye: ndarray, at: ndarray, roll: float) -> ndarray:
+    """Pose (4, 4), device to world, of a device at `eye` that looks at a point; `roll` in radian about its sight."""
+    back = (eye - at) / np.linalg.norm(eye - at)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    up = np.cross(back, right)
+    c, s = np.cos(roll), np.sin(roll)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([c * right + s * up, c * up - s * right, back], 1)
+    T[:3, 3] = eye
+    return T
+
+
+def into_device(T_world_device: ndarray, p_world: ndarray) -> ndarray:
+    """Points (..., 3) in the axes of the device."""
+    return (p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]
+
+
+def nearest_points(o1: ndarray, d1: ndarray, o2: ndarray, d2: ndarray) -> ndarray:
+    """Middles (n, 3) of the shortest connections of rays from o1 along d1 (n, 3) and from o2 along d2."""
+    a, b, c = dots(d1, d1), dots(d1, d2), dots(d2, d2)
+    e, f = d1 @ (o1 - o2), d2 @ (o1 - o2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s, t = (b * f - c * e) / (a * c - b * b), (a * f - b * e) / (a * c - b * b)
+    return (o1 + s[:, None] * d1 + o2 + t[:, None] * d2) / 2
+
+
+def triangulated(
+    camera: Lens, T_camera: ndarray, uv: ndarray, projector: Lens, T_projector: ndarray, xy: ndarray
+) -> ndarray:
+    """Points (n, 3) in the world that camera pixels and projector pixels see."""
+    d1, d2 = camera.directions(uv) @ T_camera[:3, :3].T, projector.directions(xy) @ T_projector[:3, :3].T
+    return nearest_points(T_camera[:3, 3], d1, T_projector[:3, 3], d2)
+
+
+EPSILON = 0.02  # mm by which shadow rays start off a surface
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What rays met first; `depth` is infinite where they met nothing."""
+
+    depth: ndarray
+    p_world: ndarray
+    normal: ndarray
+    is_object: ndarray
+
+
+class Scene:
+    """One object and what surrounds it, for one thread."""
+
+    def __init__(self, thing: trimesh.Trimesh, others: list[trimesh.Trimesh]) -> None:
+        self._caster: Any = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._normals: list[ndarray] = []
+        self._faces: list[ndarray] = []
+        for mesh in (thing, *others):
+            faces = np.asarray(mesh.faces, dtype=np.uint32)
+            self._caster.add_triangles(np.asarray(mesh.vertices, dtype=np.float32), faces)
+            # flat surroundings keep their facets' normals; of the object, whose facets are fine, they are interpolated
+            self._normals.append(
+                np.asarray(mesh.vertex_normals if mesh is thing else mesh.face_normals, dtype=np.float32)
+            )
+            self._faces.append(faces)
+
+    def hits(self, origin: ndarray, directions: ndarray) -> Hits:
+        """First hits of rays (n, 3) from one point, or from one each."""
+        rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1).astype(np.float32)
+        found = {key: value.numpy() for key, value in self._caster.cast_rays(o3d.core.Tensor(rays), nthreads=1).items()}
+        depth, which, face, uv = found["t_hit"], found["geometry_ids"], found["primitive_ids"], found["primitive_uvs"]
+        normal = np.zeros_like(directions)
+        for number, (normals, faces) in enumerate(zip(self._normals, self._faces, strict=True)):
+            chosen = which == number
+            if number == 0:
+                a, b, c = (normals[faces[face[chosen], k]] for k in range(3))
+                u, v = uv[chosen, :1], uv[chosen, 1:]
+                normal[chosen] = a * (1 - u - v) + b * u + c * v
+            else:
+                normal[chosen] = normals[face[chosen]]
+        normal /= np.maximum(np.sqrt(dots(normal, normal)), 1e-9)[:, None]
+        normal[dots(normal, directions) > 0] *= -1
+        points = origin + np.where(np.isfinite(depth), depth, 0)[:, None] * directions
+        return Hits(depth, points, normal, which == 0)
+
+    def sees(self, p_world: ndarray, eye: ndarray) -> ndarray:
+        """Whether nothing lies between points (n, 3) and `eye`."""
+        rays = np.concatenate([p_world, eye - p_world], -1).astype(np.float32)  # the eye is at 1 along each ray
+        return ~self._caster.test_occlusions(o3d.core.Tensor(rays), 0.0, 1.0, nthreads=1).numpy()
+
+
+def surroundings(kind: str, thing: trimesh.Trimesh, rng: np.random.Generator) -> list[trimesh.Trimesh]:
+    """Nothing ("none"), a table below the object, or a room with a table, walls and clutter."""
+    if kind == "none":
+        return []
+    low, high = thing.bounds
+    size, floor = float((high - low).max()), float(low[2])
+    table = _at(trimesh.creation.box((9 * size, 9 * size, 8)), (0, 0, floor - 4))
+    if kind == "table":
+        return [table]
+    walls = []
+    for angle in (20.0, 115.0, 200.0, 290.0):
+        wall = trimesh.creation.box((10, 12 * size, 7 * size))
+        turn = np.radians(angle + rng.uniform(-8, 8))
+        wall.apply_transform(trimesh.transformations.rotation_matrix(turn, (0, 0, 1)))
+        walls.append(_at(wall, (4.6 * size * np.cos(turn), 4.6 * size * np.sin(turn), floor + 2 * size)))
+    clutter = []
+    for k in range(6):
+        angle, far = np.radians(60 * k + rng.uniform(-20, 20)), rng.uniform(0.95, 1.3) * size
+        a, b, c = rng.uniform(0.12, 0.34, 3) * size
+        made = (trimesh.creation.box((a, b, c)), trimesh.creation.cylinder(a / 2, c), trimesh.creation.cone(a / 2, c))[
+            k % 3
+        ]
+        made.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, 6.3), (0, 0, 1)))
+        clutter.append(_at(made, (far * np.cos(angle), far * np.sin(angle), floor - float(made.bounds[0, 2]))))
+    return [table, *walls, *clutter]
+
+
+def _at(mesh: trimesh.Trimesh, shift: tuple[float, float, float]) -> trimesh.Trimesh:
+    mesh.apply_translation(shift)
+    return mesh
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Colours of surfaces: clouds of several sizes, and printed spots."""
+
+    waves: ndarray  # (n, 3) radian per mm
+    phases: ndarray  # (n,)
+    strength: float  # 0: one grey
+    tints: ndarray  # (2, 3) colours that are mixed
+    spots: bool
+
+    @staticmethod
+    def random(strength: float, spots: bool, colour: bool, rng: np.random.Generator) -> "Paint":
+        """Clouds from 8 to 80 mm."""
+        directions = rng.normal(size=(14, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        waves = directions * (2 * np.pi / np.geomspace(8, 80, 14))[:, None]
+        tints = rng.uniform(0.45, 0.95, (2, 3)) if colour else np.repeat(rng.uniform(0.6, 0.85, (2, 1)), 3, 1)
+        return Paint(waves, rng.uniform(0, 2 * np.pi, 14), strength, tints, spots)
+
+    def albedo(self, p_world: ndarray) -> ndarray:
+        """(n, 3) of points (n, 3)."""
+        p = p_world.astype(np.float32)
+        waves = np.cos(p @ self.waves.T.astype(np.float32) + self.phases.astype(np.float32))
+        clouds = np.clip(0.5 + 0.22 * waves[:, 4:].sum(1), 0, 1)[:, None]
+        colour = self.tints[0] * clouds + self.tints[1] * (1 - clouds)
+        shade = 1 - self.strength * np.clip(0.4 + 0.25 * waves[:, :8].sum(1), 0, 1)[:, None]
+        if self.spots:
+            shade = np.where((waves[:, 2] + waves[:, 5] + waves[:, 7] > 1.1)[:, None], shade * 0.45, shade)
+        return colour * shade
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How good the camera is."""
+
+    blur_px: float = 0.5  # sigma in focus, pixels
+    defocus_px: float = 0.0  # sigma at one and a half times the distance in focus
+    motion_px: float = 0.0  # longest smear
+    electrons: float = 12000.0  # at full scale
+    read_noise: float = 0.002  # of full scale
+    exposure_stops: float = 0.0  # frames differ by up to this, either way
+    gamma: float = 2.2
+    quality: int = 95  # of JPEG
+    vignetting: float = 0.0  # light lost in the corners, share
+    denoising_px: float = 0.0  # sigma of a filter that keeps edges
+    sharpening: float = 0.0  # share of what a blur of 1.2 pixels takes away that is added
+    tone: float = 0.0  # how far the tones are drawn to an S, as in the pictures of telephones; at most 1
+    thinned_colour: bool = False  # colour at half the resolution in JPEG
+
+
+def blurred_by_depth(light: ndarray, depth: ndarray, focus: float, sensor: Sensor) -> ndarray:
+    """(h, w, 3), each pixel blurred by its own distance."""
+    sigma = np.full(depth.shape, sensor.blur_px)
+    far = np.where(np.isfinite(depth), depth, 3 * focus)
+    sigma += 3 * sensor.defocus_px * np.abs(1 - focus / far)
+    levels = np.linspace(float(sigma.min()), float(max(np.quantile(sigma, 0.995), sigma.min() + 1e-3)), 4)
+    place = np.clip((sigma - levels[0]) / (levels[1] - levels[0]), 0, 3)
+    result = np.zeros_like(light)
+    for k, level in enumerate(levels):
+        weight = np.maximum(1 - np.abs(place - k), 0)[..., None]
+        result += weight * cv2.GaussianBlur(light, (0, 0), float(max(level, 0.05)))
+    return result
+
+
+def smeared(light: ndarray, length: float, angle: float) -> ndarray:
+    """Moved along a line of `length` pixels during the exposure."""
+    if length < 0.2:
+        return light
+    result, steps = np.zeros_like(light), 7
+    for t in np.linspace(-0.5, 0.5, steps) * length:
+        M = np.array([[1, 0, t * np.cos(angle)], [0, 1, t * np.sin(angle)]])
+        result += cv2.warpAffine(light, M, light.shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return result / steps
+
+
+def exposed(light: ndarray, depth: ndarray, focus: float, sensor: Sensor, rng: np.random.Generator) -> ndarray:
+    """Values from 0 to 255 of light (h, w, 3): the brightest hundredth comes near full scale, but for the exposure."""
+    image = blurred_by_depth(light.astype(np.float32), depth, focus, sensor)
+    image = smeared(image, sensor.motion_px * rng.uniform(0, 1), rng.uniform(0, np.pi))
+    stops = sensor.exposure_stops * rng.uniform(-1, 1) - 0.15
+    image = image / max(float(np.quantile(image, 0.99)), 1e-6) * 2**stops
+    image = image * _vignette(image.shape, sensor.vignetting)
+    electrons = rng.normal(image, np.sqrt(np.maximum(image, 0) / sensor.electrons + sensor.read_noise**2))
+    return (255 * processed(np.clip(electrons, 0, 1) ** (1 / sensor.gamma), sensor) + 0.5).astype(np.uint8)
+
+
+def processed(values: ndarray, sensor: Sensor) -> ndarray:
+    """Values from 0 to 1 (h, w, 3) as the camera's own software leaves them."""
+    if sensor.denoising_px:
+        values = cv2.bilateralFilter(values.astype(np.float32), -1, 0.05, sensor.denoising_px)
+    if sensor.sharpening:
+        values = values + sensor.sharpening * (values - cv2.GaussianBlur(values, (0, 0), 1.2))
+    values = np.clip(values, 0, 1)
+    return values + sensor.tone * (values**2 * (3 - 2 * values) - values)
+
+
+def _vignette(shape: tuple[int, ...], share: float) -> ndarray:
+    """(h, w, 1) of an image of `shape`, 1 in its middle."""
+    y, x = (np.linspace(-1, 1, n) for n in shape[:2])
+    return (1 - share * ((x[None, :] ** 2 + y[:, None] ** 2) / 2))[..., None]
+
+
+def jpeg(values: ndarray, sensor: Sensor, colour: bool) -> bytes:
+    """An image file of (h, w, 3), grey unless `colour`."""
+    image = Image.fromarray(values if colour else values[..., 1])
+    stored = io.BytesIO()
+    image.save(stored, "JPEG", quality=sensor.quality, subsampling=2 if sensor.thinned_colour else 0)
+    return stored.getvalue()
+
 
 _SIGMAS = (
     0.4,
@@ -93,13 +378,9 @@ def _looked_up(image: ndarray, xy: ndarray) -> ndarray:
 
 
 def photograph(
-    scene: Scene,
-    camera: Lens,
-    projection: Projection,
-    paints: tuple[Paint, Paint],
-    view: View,
+    scene: Scene, camera: Lens, projection: Projection, paints: tuple[Paint, Paint], view: View,
     rng: np.random.Generator,
-) -> tuple[ndarray, Truth]:
+) -> tuple[ndarray, Truth]:  # fmt: skip
     """Values (h, w, 3) from 0 to 255, four rays a pixel, and what the pixels' centres see."""
     look, shape = projection.look, (camera.h, camera.w)
     light, sent = np.zeros((*shape, 3), dtype=np.float32), np.zeros(shape, dtype=np.float32)

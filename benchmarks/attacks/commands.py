@@ -1,4 +1,4 @@
-"""Run the real commands: in a copy of a process that has imported everything, or as a process of their own."""
+"""What an attack is, how the real commands are run, and what they should have done."""
 
 import importlib
 import os
@@ -8,18 +8,31 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, Literal, NoReturn
 
-TIMEOUT = -1000
-"""Status of a command that had to be stopped because it did not end."""
+TIMEOUT = -1000  # status of a command that had to be stopped because it did not end
+Fixture = Literal["scan", "captures", "pattern", "run"]
+_MOST_LINES = 60  # a longer message is not read
+_MOST_GB = 3.0  # small input must not fill the memory
 
 _OUT, _ERR = ".stdout", ".stderr"
 _PRELOADED = ("sl-check", "sl-eval", "sl-export", "sl-pattern", "sl-process", "sl-synth", "ns-train")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One attack on one command, or on a row of them."""
+
+    group: str  # heading in the table
+    name: str  # unique in the group
+    fixtures: tuple[Fixture, ...]  # fresh copies of these lie in the case's folder, under their names
+    attack: Callable[[Path], str]  # called with that folder; "" if the package did right, else what it did wrong
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,59 @@ class Done:
         return self.stdout + self.stderr
 
 
+def refused(done: Done, *words: str) -> str:
+    """The fault, or "" if the command ended with status 1 and a message, not too long, that holds all words."""
+    fault = _crashed(done)
+    if fault:
+        return fault
+    if done.status != 1:
+        return f"exit status {done.status}"
+    if not done.text.strip():
+        return "no message"
+    if len(done.text.splitlines()) > _MOST_LINES:
+        return f"a message of {len(done.text.splitlines())} lines"
+    return _missing(done, words)
+
+
+def accepted(done: Done, *words: str) -> str:
+    """The fault, or "" if the command ended with status 0 and printed all words."""
+    return _crashed(done) or (f"exit status {done.status}" if done.status else _missing(done, words))
+
+
+def _missing(done: Done, words: tuple[str, ...]) -> str:
+    missing = [word for word in words if word.lower() not in done.text.lower()]
+    said = (done.stderr.strip() or done.stdout.strip() or "(nothing)").splitlines()[0][:150]
+    return f"does not say {missing[0]!r}: {said}" if missing else ""
+
+
+def _crashed(done: Done) -> str:
+    """What no input may cause."""
+    if done.status == TIMEOUT:
+        return f"did not end within {done.seconds:.0f} s"
+    if done.status < 0:
+        return f"killed by signal {-done.status}"
+    if "Traceback (most recent call last)" in done.text:
+        return f"traceback: {done.text.strip().splitlines()[-1][:150]}"
+    return f"took {done.peak_gb:.1f} GB of memory" if done.peak_gb > _MOST_GB else ""
+
+
+def listing(folder: Path) -> set[str]:
+    """All files and folders, without what the command printed."""
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if not p.name.startswith(".std")}
+
+
+def left_behind(folder: Path, before: set[str]) -> str:
+    """The fault if a command that was refused changed the folder."""
+    left = sorted(listing(folder) ^ before)
+    return f"left or removed {left[0]!r}" if left else ""
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """A file, or all files below a folder."""
+    files = [path] if path.is_file() else path.rglob("*")
+    return {str(file.relative_to(path)): file.read_bytes() for file in files if file.is_file()}
+
+
 def call(folder: Path, name: str, *arguments: str, seconds: float = 60.0) -> Done:
     """Run a console command in `folder`, in a fork of this process: it need not import everything again.
 
@@ -48,24 +114,20 @@ def call(folder: Path, name: str, *arguments: str, seconds: float = 60.0) -> Don
     if child == 0:
         _run_here(folder, name, arguments)
     status, usage = _wait(child, begin + seconds)
-    return Done(status, _text(folder / _OUT), _text(folder / _ERR), time.monotonic() - begin, usage)
+    out, err = (p.read_text(errors="replace") if p.exists() else "" for p in (folder / _OUT, folder / _ERR))
+    return Done(status, out, err, time.monotonic() - begin, usage)
 
 
 def start(folder: Path, name: str, *arguments: str) -> "subprocess.Popen[str]":
     """Start a console command as a process group of its own, with pipes for what it prints."""
     module, function = _entry_point(name)
     code = f"import sys; sys.argv[0] = {name!r}; from {module} import {function} as main; sys.exit(main())"
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        errors="replace",
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        [sys.executable, "-c", code, *arguments], cwd=folder, **pipes, text=True, errors="replace", env=environment,
         start_new_session=True,
-    )
+    )  # fmt: skip
 
 
 def preload() -> None:
@@ -75,17 +137,8 @@ def preload() -> None:
     torch.set_num_threads(1)
     for name in _PRELOADED:
         importlib.import_module(_entry_point(name)[0])
-    import open3d  # noqa: F401
-    import scipy.ndimage  # noqa: F401
-    import skimage.measure  # noqa: F401
-    import trimesh  # noqa: F401
-
-    import sl_nerfstudio.methods
-    import sl_nerfstudio.runs.export  # noqa: F401
-
-
-def _text(path: Path) -> str:
-    return path.read_text(errors="replace") if path.exists() else ""
+    for name in ("open3d", "scipy.ndimage", "skimage.measure", "trimesh", "sl_nerfstudio.methods"):
+        importlib.import_module(name)
 
 
 @cache

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.attacks.case import Case
-from benchmarks.attacks.commands import preload
-from benchmarks.attacks.fixtures import lay_out
-from benchmarks.attacks.groups import GROUPS
+from benchmarks.attacks import bad_files, flags, foreign_runs, kills, wrong_scans
+from benchmarks.attacks.commands import Case, preload
+
+GROUPS = (flags.cases, bad_files.cases, wrong_scans.cases, foreign_runs.cases, kills.cases)
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,17 @@ class Outcome:
 
 
 def all_cases() -> list[Case]:
-    """Of all groups, in their order."""
+    """The cases of all groups, in their order."""
     return [case for cases in GROUPS for case in cases()]
 
 
 def run_case(index: int, root: Path, keep: bool) -> Outcome:
     """One case, in a folder of its own that is removed afterwards."""
-    case = all_cases()[index]
-    folder = root / "cases" / f"{index:04d}"
-    lay_out(case, root / "fixtures", folder)
+    case, folder = all_cases()[index], root / "cases" / f"{index:04d}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name in case.fixtures:
+        shutil.copytree(root / "fixtures" / name, folder / name)
     begin = time.monotonic()
     try:
         fault = case.attack(folder)

@@ -1,4 +1,4 @@
-"""Scans that are wrong, each in one place, and right ones that look unusual."""
+"""Scans that are wrong, each in one place, and right ones that look unusual (keys and bytes: tests/fuzz)."""
 
 import json
 import shutil
@@ -10,26 +10,19 @@ import numpy as np
 from numpy import ndarray
 from PIL import Image
 
-from benchmarks.attacks.case import Case
-from benchmarks.attacks.commands import call
-from benchmarks.attacks.expect import accepted, refused
+from benchmarks.attacks.commands import Case, accepted, call, refused
 
 Document = dict[str, Any]
 _FRAME = 2
 _NAME = f"frame_{_FRAME:05d}"
-_VALUES = (None, True, "x", "", [], {}, -1e30, 1e308, float("nan"), [[1]], "../../etc/passwd")
 
 
 def cases() -> list[Case]:
-    """sl-check on every one of them, and what sl-eval and ns-train say of some."""
+    """What sl-check says of each."""
     return [
         *[_wrong("Coordinates and images", name, change, _NAME) for name, change in _content_faults().items()],
         *[_wrong("Poses", name, _edited(change), word) for name, (change, word) in _pose_faults().items()],
-        *_keys(),
-        *[_wrong("Large and foreign transforms.json", n, _edited(c), w) for n, (c, w) in _document_faults().items()],
-        *_other_commands(),
         *[_right(name, change) for name, change in _right_scans().items()],
-        *[_flip(file, k) for file in _FILES for k in range(8)],
     ]
 
 
@@ -74,24 +67,20 @@ def _content_faults() -> dict[str, Callable[[Path], None]]:
         "coordinates are noise": _on_coords(_noise),
         "rows and columns of the array exchanged": _on_coords(lambda c: c.transpose(1, 0, 2)),
         "x and y exchanged": _on_coords(lambda c: c[..., ::-1]),
-        "x counted from the right": _on_coords(_from_the_right),
-        "array mirrored": _on_coords(lambda c: c[:, ::-1]),
+        "x counted from the right": _on_coords(_from_the_right), "array mirrored": _on_coords(lambda c: c[:, ::-1]),
         "array upside down": _on_coords(lambda c: c[::-1]),
         "coordinates of the next frame": lambda f: _store(f, _coords(f, _FRAME + 1)),
-        "coordinates of two frames exchanged": _exchange,
-        "image of another frame": lambda f: _copy(f, "images", 0),
+        "coordinates of two frames exchanged": _exchange, "image of another frame": lambda f: _copy(f, "images", 0),
         "pattern image of another frame": lambda f: _copy(f, "patterns", 0),
-        "mask of another frame, inverted": _invert_mask,
-        "all NaN": _on_coords(lambda c: c * np.float32(np.nan)),
+        "mask of another frame, inverted": _invert_mask, "all NaN": _on_coords(lambda c: c * np.float32(np.nan)),
         "infinite": _on_coords(lambda c: np.where(np.isnan(c), np.float32(np.inf), c)),
         "-1 instead of NaN": _on_coords(lambda c: np.where(np.isnan(c), np.float32(-1), c)),
-        "normalised": _on_coords(lambda c: c / np.float32(800)),
-        "whole numbers": _on_coords(np.floor),
+        "normalised": _on_coords(lambda c: c / np.float32(800)), "whole numbers": _on_coords(np.floor),
         "float64": _on_coords(lambda c: c.astype(np.float64)),
         "pickled objects": _on_coords(lambda c: c.astype(object)),
         "channels first": _on_coords(lambda c: c.transpose(2, 0, 1)),
         "constant": _on_coords(lambda c: np.where(np.isnan(c), c, np.float32(7.5))),
-    }
+    }  # fmt: skip
     moves = ((1, 0), (0, 1), (-1, 0), (2, 0), (0, -2), (3, 3), (5, -4), (7, 0), (0, 9), (-12, 8), (25, 0), (40, -30))
     found |= {f"rolled by {x}, {y}": _on_coords(lambda c, m=(y, x): np.roll(c, m, (0, 1))) for x, y in moves}
     return found
@@ -148,78 +137,12 @@ def _without_baseline(document: Document) -> None:
     document["scale"].pop("baseline_of")
 
 
-def _keys() -> list[Case]:
-    """Each key with values that are right nowhere."""
-    places = (("units",), ("w",), ("fl_x",), ("projector", "h"), ("projector", "pattern_path"), ("scale", "known"),
-              ("frames", _FRAME, "file_path"), ("frames", _FRAME, "sl_coords_path"), ("sl_pose_sigma",))  # fmt: skip
-    found = []
-    for place in places:
-        for value in _VALUES:
-            if (place[-1], value) in (("sl_pose_sigma", None), ("known", True)):
-                continue  # these are right
-
-            def change(document: Document, place: tuple[Any, ...] = place, value: Any = value) -> None:
-                for key in place[:-1]:
-                    document = document[key]
-                document[place[-1]] = value
-
-            name = f"{'.'.join(map(str, place))} = {value!r}"
-            word = "is missing" if value == "x" and "path" in str(place[-1]) else str(place[-1])
-            found.append(_wrong("Keys of transforms.json", name, _edited(change), word))
-    return found
-
-
-def _document_faults() -> dict[str, tuple[Callable[[Document], Any], str]]:
-    def many(document: Document) -> None:
-        frame = document["frames"][0]
-        names = [f"frame_{k:05d}" for k in range(20_000)]
-        document["frames"] = [
-            {k: v.replace("frame_00000", name) if isinstance(v, str) else v for k, v in frame.items()} for name in names
-        ]
-
-    return {
-        "an ordinary data set of nerfstudio": (_ordinary, "sl-process"),
-        "20,000 frames without files": (many, "more frames"),
-        "the same frame 20,000 times": (lambda d: d.update(frames=d["frames"][:1] * 20_000), "more than once"),
-        "400,000 unknown keys and one wrong": (
-            lambda d: d.update({f"key_{k}": k for k in range(400_000)}, units="inch"),
-            "units",
-        ),
-        "500 lists in each other": (lambda d: d.update(extra=json.loads("[" * 500 + "]" * 500)), "nested"),
-    }
-
-
-def _ordinary(document: Document) -> None:
-    for key in ("projector", "sl_format", "scale", "units", "sl_pose_sigma"):
-        document.pop(key, None)
-    keys = ("file_path", "transform_matrix")
-    document["frames"] = [{key: frame[key] for key in keys} for frame in document["frames"]] * 50
-
-
 def _wrong(group: str, name: str, change: Callable[[Path], None], word: str) -> Case:
     def attack(folder: Path) -> str:
         change(folder)
         return refused(call(folder, "sl-check", "scan"), word, "remedy:")
 
     return Case(group, name, ("scan",), attack)
-
-
-def _other_commands() -> list[Case]:
-    """The same words from the commands that use a scan."""
-
-    def attack(folder: Path, command: tuple[str, ...]) -> str:
-        edit(folder, _ordinary)
-        return refused(call(folder, *command, seconds=120), "no projector", "sl-process")
-
-    group = "Large and foreign transforms.json"
-    commands = {
-        "sl-eval": ("sl-eval", "--mesh", "scan/ground_truth/mesh.ply", "--data", "scan"),
-        "ns-train": ("ns-train", "sl-neus", "--data", "scan", "--output-dir", "out", "--max-num-iterations", "5"),
-    }
-    return [
-        Case(group, f"an ordinary data set, {name}", ("scan",), lambda folder, c=command: attack(folder, c))
-        for name, command in commands.items()
-    ]
 
 
 def _right_scans() -> dict[str, Callable[[Path], None]]:
@@ -238,19 +161,16 @@ def _right_scans() -> dict[str, Callable[[Path], None]]:
                     row[3] /= 1000
 
     return {
-        "unchanged": lambda folder: None,
-        "frames in another order": _edited(lambda d: d["frames"].reverse()),
+        "unchanged": lambda folder: None, "frames in another order": _edited(lambda d: d["frames"].reverse()),
         "the last frames removed": _edited(lambda d: d.update(frames=d["frames"][:3])),
-        "without pattern images": drop("sl_pattern_path"),
-        "without masks": drop("mask_path"),
+        "without pattern images": drop("sl_pattern_path"), "without masks": drop("mask_path"),
         "without both": drop("mask_path", "sl_pattern_path"),
         "unknown keys": _edited(lambda d: d.update({f"key_{k}": [k] for k in range(1000)})),
-        "lengths in metres": _edited(in_metres),
-        "scale unknown": _edited(lambda d: d.update(scale={"known": False})),
+        "lengths in metres": _edited(in_metres), "scale unknown": _edited(lambda d: d.update(scale={"known": False})),
         "uncompressed coordinates": lambda f: np.savez(f / f"scan/coords/{_NAME}.npz", coords=_coords(f)),
         "half of the coordinates missing": _on_coords(_half),
         "a brighter image": lambda f: _brighter(f / f"scan/images/{_NAME}.png"),
-    }
+    }  # fmt: skip
 
 
 def _half(coords: ndarray) -> ndarray:
@@ -269,33 +189,3 @@ def _right(name: str, change: Callable[[Path], None]) -> Case:
         return accepted(call(folder, "sl-check", "scan"), "no faults")
 
     return Case("Right scans", name, ("scan",), attack)
-
-
-_FILES = ("pattern.png", f"images/{_NAME}.png", f"patterns/{_NAME}.png", f"masks/{_NAME}.png", f"coords/{_NAME}.npz")
-
-
-def _flip(file: str, number: int) -> Case:
-    """One changed byte: refused, or of no consequence for what is read."""
-
-    def attack(folder: Path) -> str:
-        path = folder / "scan" / file
-        content = bytearray(path.read_bytes())
-        before = _read(path)
-        place = np.random.default_rng([number, len(content)]).integers(len(content))
-        content[place] ^= 1 << number
-        path.write_bytes(bytes(content))
-        done = call(folder, "sl-check", "scan")
-        if done.status == 0 and accepted(done) == "":
-            return (
-                "" if np.array_equal(before, _read(path), equal_nan=file.endswith("npz")) else "accepted, other pixels"
-            )
-        return refused(done, Path(file).name)
-
-    return Case("Changed bytes", f"{file}, byte {number} of 8", ("scan",), attack)
-
-
-def _read(path: Path) -> ndarray:
-    if path.suffix == ".npz":
-        with np.load(path) as archive:
-            return archive["coords"]
-    return np.array(Image.open(path))

@@ -5,38 +5,99 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from numpy import ndarray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from benchmarks.baselines.depth import DepthMap, triangulated_depth
 from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan import Frame, Scan
 
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
-_UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
+_LEAST_REGION = 0.01  # of the frame's known pixels; smaller islands of depth are wrong decodings
+_STEP_PIXELS = 8.0  # neighbours whose depth differs by more than this many pixel footprints are not connected
 
 
 @dataclass(frozen=True)
-class TsdfConfig:
-    """Settings of the fusion, relative to the size of the object."""
+class DepthMap:
+    """Depth along the camera's axis (not along the ray), 0 where unknown, as an ideal pinhole camera sees it."""
 
-    voxel: float = 1 / 250  # of the object's size
-    truncation_voxels: float = 5.0
-    least_component: float = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
+    depth: Float[ndarray, "h w"]
+    camera: Device  # without distortion
 
 
-def fuse(scan: Scan, poses: DevicePoses, config: TsdfConfig | None = None) -> Mesh:
-    """TSDF fusion of the scan's triangulated depth maps with the given poses; world units and axes."""
-    config = config or TsdfConfig()
+def triangulated_depth(
+    frame: Frame, scan: Scan, T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]
+) -> DepthMap:
+    """Depth map of one frame from its decoded coordinates; isolated patches are dropped."""
+    camera, projector = Intrinsics.of(frame.camera, torch.float64), Intrinsics.of(scan.projector, torch.float64)
+    mask, coords = frame.read_mask(), frame.read_coords().astype(np.float64)
+    known = mask & np.isfinite(coords).all(-1)
+    uv = pixel_centres(frame.camera, torch.float64)[torch.as_tensor(known)]
+    T_c, T_p = torch.as_tensor(T_world_camera), torch.as_tensor(T_world_projector)
+    meeting = triangulate(camera, T_c, uv, projector, T_p, torch.as_tensor(coords[known]))
+    p_camera = (meeting.p_world - T_c[:3, 3]) @ T_c[:3, :3]
+    z = -p_camera[:, 2].numpy()
+    good = np.isfinite(z) & (z > 0) & (meeting.depth_projector.numpy() > 0)
+    depth = np.zeros(known.shape)
+    depth[known] = np.where(good, z, 0.0)
+    depth = drop_islands(depth, _STEP_PIXELS / frame.camera.fl_x)
+    return _undistorted(depth, frame.camera)
+
+
+def drop_islands(depth: Float[ndarray, "h w"], step: float) -> Float[ndarray, "h w"]:
+    """Set small regions to 0; neighbours are connected if their depths differ by less than `step` times depth."""
+    h, w = depth.shape
+    index = np.arange(h * w).reshape(h, w)
+    pairs = [
+        _joined(index[:, :-1], index[:, 1:], depth[:, :-1], depth[:, 1:], step),
+        _joined(index[:-1], index[1:], depth[:-1], depth[1:], step),
+    ]
+    a, b = np.concatenate(pairs, 1)
+    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(h * w, h * w))
+    _, label = connected_components(graph, directed=False)
+    large = np.bincount(label)[label].reshape(h, w) >= _LEAST_REGION * (depth > 0).sum()
+    return np.where(large, depth, 0.0)
+
+
+def _joined(a: ndarray, b: ndarray, depth_a: ndarray, depth_b: ndarray, step: float) -> ndarray:
+    together: Bool[ndarray, "h w"] = (depth_a > 0) & (depth_b > 0) & (np.abs(depth_a - depth_b) < step * depth_a)
+    return np.stack([a[together], b[together]])
+
+
+def _undistorted(depth: Float[ndarray, "h w"], camera: Device) -> DepthMap:
+    """The map as the same camera without distortion would see it (nearest pixel: depths must not be interpolated)."""
+    pinhole = Device(camera.w, camera.h, camera.fl_x, camera.fl_y, camera.cx, camera.cy)
+    if pinhole == camera:
+        return DepthMap(depth, pinhole)
+    x, y = ((pixel_centres(camera, torch.float64)[..., k] - c) / f for k, (c, f) in
+            enumerate(((camera.cx, camera.fl_x), (camera.cy, camera.fl_y))))  # fmt: skip
+    uv, _ = project(Intrinsics.of(camera, torch.float64), torch.stack([x, -y, -torch.ones_like(x)], -1))
+    column, row = np.floor(uv.numpy()).astype(np.int64).transpose(2, 0, 1)
+    inside = (column >= 0) & (column < camera.w) & (row >= 0) & (row < camera.h)
+    out = np.where(inside, depth[np.clip(row, 0, camera.h - 1), np.clip(column, 0, camera.w - 1)], 0.0)
+    return DepthMap(out, pinhole)
+
+
+_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
+_TRUNCATION_VOXELS = 5.0
+_LEAST_PIECE = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
+_UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
+
+
+def fuse(scan: Scan, poses: DevicePoses, voxel_share: float = 1 / 250) -> Mesh:
+    """TSDF fusion of the scan's triangulated depth maps; world units and axes. Voxels are a share of the object."""
     depths = depth_maps(scan, poses)
     size = object_size(depths)
     unit = _UNIT_SIZE / size
-    voxel = config.voxel * _UNIT_SIZE
+    voxel = voxel_share * _UNIT_SIZE
     volume = o3d.pipelines.integration.ScalableTSDFVolume(
         voxel_length=voxel,
-        sdf_trunc=config.truncation_voxels * voxel,
+        sdf_trunc=_TRUNCATION_VOXELS * voxel,
         color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
     )
     for depth, T in track(zip(depths, poses.T_world_camera, strict=True), "fusing", total=len(depths)):
@@ -52,7 +113,7 @@ def fuse(scan: Scan, poses: DevicePoses, config: TsdfConfig | None = None) -> Me
             grey, image, depth_scale=1.0, depth_trunc=1e9, convert_rgb_to_intensity=False
         )
         volume.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ _OPENCV))
-    return _largest_pieces(volume.extract_triangle_mesh(), config.least_component, unit)
+    return _largest_pieces(volume.extract_triangle_mesh(), unit)
 
 
 def depth_maps(scan: Scan, poses: DevicePoses) -> list[DepthMap]:
@@ -81,8 +142,8 @@ def backprojected(depth: DepthMap) -> Float[ndarray, "n 3"]:
     return np.stack([x * z, -y * z, -z], 1)
 
 
-def _largest_pieces(mesh: o3d.geometry.TriangleMesh, least: float, unit: float) -> Mesh:
+def _largest_pieces(mesh: o3d.geometry.TriangleMesh, unit: float) -> Mesh:
     piece, count, _ = mesh.cluster_connected_triangles()
     piece, count = np.asarray(piece), np.asarray(count)
     whole = Mesh(np.asarray(mesh.vertices) / unit, np.asarray(mesh.triangles).astype(np.int64))
-    return whole.with_faces(count[piece] >= least * count.max()) if len(piece) else whole
+    return whole.with_faces(count[piece] >= _LEAST_PIECE * count.max()) if len(piece) else whole

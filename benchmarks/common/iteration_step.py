@@ -116,12 +116,9 @@ class Theirs:
     """nerfstudio's encoding in torch, gradients by double backward, torch's default Adam for all parameters."""
 
     def __init__(
-        self,
-        size: Size,
-        activation: Callable[[Tensor], Tensor],
-        device: str = "cpu",
+        self, size: Size, activation: Callable[[Tensor], Tensor], device: str = "cpu",
         implementation: Literal["torch", "tcnn"] = "torch",
-    ) -> None:
+    ) -> None:  # fmt: skip
         from nerfstudio.field_components.encodings import HashEncoding
 
         torch.manual_seed(0)

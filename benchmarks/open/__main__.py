@@ -13,7 +13,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.common.machine import write_rows
+from benchmarks.common.measuring import Rows, markdown
 from benchmarks.open.methods import METHODS, RECORD, Job, hand_in
 from benchmarks.open.scans import INDEX, SCANS, VERSION, checksum, chosen_scans, make, published
 from benchmarks.open.scoring import ScanFigures, score
@@ -56,7 +56,7 @@ def run_method(options: argparse.Namespace) -> None:
 
 def score_results(options: argparse.Namespace) -> None:
     """Score all results, naming scans without one; print a table; write the figures."""
-    rows: list[Row] = []
+    rows: Rows[Row] = Rows(options.json, version=VERSION)
     known = published()
     for results in options.results:
         for scan in chosen_scans(options.scans):
@@ -65,46 +65,29 @@ def score_results(options: argparse.Namespace) -> None:
                 print(f"{results.name}: no {scan.name}/mesh.ply")
                 continue
             record = json.loads((folder / RECORD).read_text()) if (folder / RECORD).exists() else {}
-            rows.append(Row(
-                **asdict(score(scan, options.data, folder)),
-                results=results.name, seconds=record.get("seconds"), steps=record.get("steps"),
-                published=checksum(options.data / scan.name) == known.get(scan.name),
+            rows.add(Row(
+                **asdict(score(scan, options.data, folder)), results=results.name, seconds=record.get("seconds"),
+                steps=record.get("steps"), published=checksum(options.data / scan.name) == known.get(scan.name),
             ))  # fmt: skip
-            print(text(rows[-1]), flush=True)
     if not rows:
         raise UserError("no result has a mesh.ply\n    remedy: name the folders like the scans: RESULTS/SCAN/mesh.ply")
     print(table(rows))
-    if options.json is not None:
-        write_rows(options.json, rows, version=VERSION)
-
-
-def text(row: Row) -> str:
-    """One line for one result."""
-    poses = "no poses" if row.camera_mm is None else f"cameras {row.camera_mm:.3f} mm {row.camera_deg:.3f} deg"
-    return (
-        f"{row.results:16} {row.scan:18} accuracy {row.accuracy_rmse:.3f} ({row.accuracy_median:.3f}) mm, completeness "
-        f"{row.completeness_mean:.3f} ({row.completeness_median:.3f}) mm, F {row.f_score:.3f} | {poses}, "
-        f"{row.frames} of {row.all_frames} frames"
-    )
 
 
 def table(rows: list[Row]) -> str:
     """Markdown: a line for each scan; accuracy (RMSE), completeness (mean), cameras."""
     columns = list(dict.fromkeys(row.results for row in rows))
-    lines = [f"| scan | {' | '.join(columns)} |", f"|---{'|---' * len(columns)}|"]
-    for scan in SCANS:
-        mine = {row.results: row for row in rows if row.scan == scan.name}
-        if mine:
-            lines.append(f"| {scan.name} | {' | '.join(_cell(mine.get(column)) for column in columns)} |")
-    return "\n".join(lines)
 
+    def cell(row: Row | None) -> str:
+        if row is None:
+            return ""
+        cameras = "" if row.camera_mm is None else f"; {row.camera_mm:.2f} mm, {row.camera_deg:.3f} deg"
+        lost = f" ({row.frames} of {row.all_frames})" if row.frames < row.all_frames else ""
+        return f"{row.accuracy_rmse:.3f} / {row.completeness_mean:.3f}{cameras}{lost}"
 
-def _cell(row: Row | None) -> str:
-    if row is None:
-        return ""
-    cameras = "" if row.camera_mm is None else f"; {row.camera_mm:.2f} mm, {row.camera_deg:.3f} deg"
-    lost = f" ({row.frames} of {row.all_frames})" if row.frames < row.all_frames else ""
-    return f"{row.accuracy_rmse:.3f} / {row.completeness_mean:.3f}{cameras}{lost}"
+    found = {(row.scan, row.results): row for row in rows}
+    scans = [scan.name for scan in SCANS if any(row.scan == scan.name for row in rows)]
+    return markdown(["scan", *columns], [[scan, *(cell(found.get((scan, c))) for c in columns)] for scan in scans])
 
 
 def main() -> None:
@@ -113,18 +96,16 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     making, running, scoring = (commands.add_parser(name) for name in ("make", "run", "score"))
     making.add_argument("--output", type=Path, required=True, help="folder of the scans")
-    making.set_defaults(do=make_scans)
-    running.add_argument("--data", type=Path, required=True, help="folder of the scans")
     running.add_argument("--method", required=True, choices=METHODS)
     running.add_argument("--results", type=Path, required=True, help="folder of the method's results")
     running.add_argument("--steps", type=int, help="of training; default: what the method recommends")
-    running.set_defaults(do=run_method)
-    scoring.add_argument("--data", type=Path, required=True, help="folder of the scans")
     scoring.add_argument("--results", type=Path, nargs="+", required=True, help="folders of results, one for a method")
     scoring.add_argument("--json", type=Path, help="where to write the figures")
-    scoring.set_defaults(do=score_results)
-    for command in (making, running, scoring):
+    for command, do in ((making, make_scans), (running, run_method), (scoring, score_results)):
+        command.set_defaults(do=do)
         command.add_argument("--scans", nargs="+", default=[], help="names of scans; default: all")
+        if command is not making:
+            command.add_argument("--data", type=Path, required=True, help="folder of the scans")
     options = parser.parse_args()
     run(lambda: options.do(options))
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.baselines.icp_registration import register
-from benchmarks.baselines.refined_poses import refined_poses
+from benchmarks.baselines.poses import refined_poses, register
 from benchmarks.baselines.tsdf import fuse
-from benchmarks.common.whole_runs import run
+from benchmarks.common.runs import export, process, train
 from benchmarks.open.scans import OpenScan
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import write_mesh
 from sl_nerfstudio.scan import Scan, read_scan, write_transforms
@@ -49,20 +49,16 @@ def _scan_folder(job: Job, work: Path, adjusted: bool) -> Path:
     root = job.data / job.scan.name
     if not job.scan.photographs:
         return root
-    files = ("--images", root / "images", "--pattern", root / "pattern.json", "--intrinsics", root / "intrinsics.json")
-    more = () if adjusted else ("--no-adjust",)
-    run("sl-process", *map(str, files), "--output", str(work / "scan"), "--jobs", "1", *more)
+    fault = process(root, work / "scan", work / "scan.work", 1, *(() if adjusted else ("--no-adjust",)))
+    if fault:
+        raise UserError(f"{root}: sl-process made no scan\n{fault}")
     return work / "scan"
 
 
 def _trained(job: Job, work: Path) -> None:
-    data = _scan_folder(job, work, adjusted=job.method == "sl-neus")
-    steps = () if job.steps is None else ("--max-num-iterations", str(job.steps))
-    fixed = ("--output-dir", str(work), "--experiment-name", "run", "--timestamp", "now")
-    run("ns-train", job.method, "--data", str(data), *fixed, *steps)
-    config = work / "run" / job.method / "now/config.yml"
-    mesh, poses = job.folder / "mesh.ply", work / "poses"
-    run("sl-export", "--load-config", str(config), "--output", str(mesh), "--poses", str(poses))
+    data, poses = _scan_folder(job, work, adjusted=job.method == "sl-neus"), work / "poses"
+    steps = () if job.steps is None else ("--max-num-iterations", job.steps)
+    export(train(data, work, "now", steps, job.method), job.folder / "mesh.ply", poses)
     shutil.copyfile(poses / "transforms.json", job.folder / "transforms.json")
 
 
@@ -73,14 +69,9 @@ def _fused(job: Job, work: Path) -> None:
     write_transforms(job.folder / "transforms.json", scan, poses)
 
 
-def icp_poses(scan: Scan) -> DevicePoses:
-    """Poses after rigid multiway ICP of the frames' point clouds."""
-    return register(scan, scan.poses)
-
-
 FUSIONS: dict[str, Callable[[Scan], DevicePoses]] = {
     "fusion-start": lambda scan: scan.poses,
-    "fusion-icp": icp_poses,
+    "fusion-icp": lambda scan: register(scan, scan.poses),
     "fusion-refined": refined_poses,
 }
 METHODS = ("sl-neus", "sl-neus-paper", *FUSIONS)

@@ -1,12 +1,14 @@
-"""The figures of one result on one scan of the benchmark."""
+"""What a method hands in for one scan, and its figures."""
 
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from benchmarks.open.results import HandedPoses, read_handed_poses
 from benchmarks.open.scans import OpenScan
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import score_alignments
@@ -15,6 +17,73 @@ from sl_nerfstudio.evaluation.reference import MeshReference, compare_poses, mes
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
+from sl_nerfstudio.scan.document import TRANSFORMS, frame_label, read_document
+
+CAMERAS_TUM, PROJECTORS_TUM = "cameras.txt", "projectors.txt"
+_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # its device axes to ours, on the right
+_ORTHOGONAL = 1e-3  # largest departure of R R^T from the identity
+
+
+@dataclass(frozen=True)
+class HandedPoses:
+    """Device-to-world poses by the frame's name, in the axes of the scan format; projectors may be missing."""
+
+    camera: dict[str, Float64[ndarray, "4 4"]]
+    projector: dict[str, Float64[ndarray, "4 4"]]
+
+
+def read_handed_poses(folder: Path) -> HandedPoses | None:
+    """The poses in a folder; None if it has neither file. Raises UserError for files that cannot be right."""
+    if (folder / TRANSFORMS).exists():
+        return _of_transforms(folder / TRANSFORMS)
+    if (folder / CAMERAS_TUM).exists():
+        path = folder / PROJECTORS_TUM
+        return HandedPoses(_of_tum(folder / CAMERAS_TUM), _of_tum(path) if path.exists() else {})
+    return None
+
+
+def _of_transforms(path: Path) -> HandedPoses:
+    document = read_document(path)
+    frames = document.get("frames")
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise UserError(f"{path}: frames: is missing or is not a list of objects")
+    found: list[dict[str, Float64[ndarray, "4 4"]]] = []
+    for key in ("transform_matrix", "projector_transform_matrix"):
+        labels = [(frame_label(frame, k), frame) for k, frame in enumerate(frames)]
+        found.append({name: _pose(path, name, frame[key]) for name, frame in labels if frame.get(key) is not None})
+    return HandedPoses(*found)
+
+
+def _of_tum(path: Path) -> dict[str, Float64[ndarray, "4 4"]]:
+    found = {}
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            tx, ty, tz, qx, qy, qz, qw = map(float, words[1:])
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), (tx, ty, tz)
+        except ValueError as error:
+            raise UserError(
+                f"{path}: line {number}: is not NAME TX TY TZ QX QY QZ QW\n"
+                "    remedy: one line for each frame: its name, the position, and a quaternion other than 0"
+            ) from error
+        found[words[0]] = T @ _OPENCV
+    return found
+
+
+def _pose(path: Path, name: str, value: object) -> Float64[ndarray, "4 4"]:
+    try:
+        T = np.array(value, dtype=np.float64)
+        R = T[:3, :3]
+        right = T.shape == (4, 4) and bool(np.abs(R @ R.T - np.eye(3)).max() < _ORTHOGONAL)
+    except (ValueError, TypeError, IndexError):
+        right = False
+    if not right:
+        raise UserError(f"{path}: {name}: is not a 4 x 4 pose\n    remedy: give rotation and translation, unscaled")
+    return T
+
 
 F_SHARE = 0.002  # of the truth's diagonal: the distance of the F-score
 _FEWEST_FRAMES = 2
@@ -87,19 +156,13 @@ def score(scan: OpenScan, data: Path, folder: Path) -> ScanFigures:
     errors = None if estimated is None or true is None else compare_poses(estimated, true)
     both = handed is not None and bool(handed.projector)
     return ScanFigures(
-        scan=scan.name,
-        accuracy_rmse=found.accuracy.rmse,
-        accuracy_median=found.accuracy.median,
-        completeness_mean=found.completeness.mean,
-        completeness_median=found.completeness.median,
-        f_score=found.f_score[distance],
-        scale=scaled.scale,
-        frames=len(index),
-        all_frames=len(names),
+        scan=scan.name, accuracy_rmse=found.accuracy.rmse, accuracy_median=found.accuracy.median,
+        completeness_mean=found.completeness.mean, completeness_median=found.completeness.median,
+        f_score=found.f_score[distance], scale=scaled.scale, frames=len(index), all_frames=len(names),
         camera_mm=None if errors is None else errors.camera.translation_rmse,
         camera_deg=None if errors is None else errors.camera.rotation_rmse_deg,
         projector_deg=None if errors is None or not both else errors.projector.rotation_rmse_deg,
-    )
+    )  # fmt: skip
 
 
 def _in_order(handed: HandedPoses, names: list[str]) -> DevicePoses:

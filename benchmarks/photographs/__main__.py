@@ -11,17 +11,23 @@ import json
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
 
-from benchmarks.common.machine import write_rows
-from benchmarks.photographs.command import process
-from benchmarks.photographs.scoring import NOTHING_DECODED, DecodingFigures, PoseError, decoding_figures, pose_errors
+from benchmarks.common.measuring import Rows, parsed, shown
+from benchmarks.common.runs import process
+from benchmarks.photographs.scoring import (
+    NOTHING_DECODED,
+    DecodingFigures,
+    PoseError,
+    Truth,
+    decoding_figures,
+    pose_errors,
+    read_truth,
+)  # fmt: skip
 from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets
-from benchmarks.photographs.truth import Truth, read_truth
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.scan import read_scan
 
@@ -30,25 +36,17 @@ from sl_nerfstudio.scan import read_scan
 class Config:
     """Which sets are measured, and where their captures are kept."""
 
+    # parts of the names of sets, for example "chair" or "realistic"; by default all. A full name that is not among
+    # them, like "head-walls-hard-701-shuffled", is a new one: captures on which nothing was tuned
     sets: tuple[str, ...] = ()
-    """parts of the names of sets, for example "chair" or "realistic"; default: all sets. A full name that is not among
-    them, like "head-walls-hard-701-shuffled", is a new one: captures on which nothing was tuned."""
-    frames: int = 24
-    """captures of each set"""
-    resolution: int = 600
-    """width of the images, pixels"""
-    keep: Path = Path("outputs/photographs")
-    """folder in which captures are kept between runs"""
-    scans: Path | None = None
-    """folder of the scans made from them; default: scans/ in the folder of the captures"""
-    resume: bool = False
-    """use the frames that an earlier run decoded; the time is then that of the rest"""
-    jobs: int = 4
-    """number of processes of sl-process"""
-    render_only: bool = False
-    """render the captures that are missing, and stop"""
+    frames: int = 24  # captures of each set
+    resolution: int = 600  # width of the images, pixels
+    keep: Path = Path("outputs/photographs")  # folder in which captures are kept between runs
+    scans: Path | None = None  # folder of the scans made from them; default: scans/ in the folder of the captures
+    resume: bool = False  # use the frames that an earlier run decoded; the time is then that of the rest
+    jobs: int = 4  # processes of sl-process
+    render_only: bool = False  # render the captures that are missing, and stop
     output: Path | None = None
-    """where to write the figures as JSON, with machine, date and commit"""
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def measure(one: CaptureSet, config: Config) -> Row:
     if not config.resume:
         shutil.rmtree(work, ignore_errors=True)
     start = time.monotonic()
-    message = process(captures, output, work, config.jobs, ["--unordered"] if one.unordered else [])
+    message = process(captures, output, work, config.jobs, *("--unordered" for _ in range(one.unordered)))
     seconds = time.monotonic() - start
     found = read_scan(output) if message == "" else None
     errors = [] if found is None else pose_errors(found, truth)
@@ -96,56 +94,24 @@ def measure(one: CaptureSet, config: Config) -> Row:
 
 
 def row_of(
-    one: CaptureSet,
-    truth: Truth,
-    kept: tuple[str, ...],
-    errors: list[PoseError],
-    decoding: DecodingFigures | None,
-    verdict: str,
-    seconds: float,
-    message: str,
-) -> Row:
+    one: CaptureSet, truth: Truth, kept: tuple[str, ...], errors: list[PoseError], decoding: DecodingFigures | None,
+    verdict: str, seconds: float, message: str,
+) -> Row:  # fmt: skip
     """The figures of a set; a frame in the scan that does not show the object at all counts as wrong."""
     decoding = decoding or NOTHING_DECODED
     right = {error.name for error in errors if error.right}
     ratio = np.array([error.over_sigma for error in errors if np.isfinite(error.over_sigma)])
     usable = truth.usable
     return Row(
-        name=one.name,
-        appearance=one.appearance,
-        frames=len(truth.frames),
-        usable=len(usable),
-        right=len(right & set(usable)),
-        wrong=tuple(name for name in kept if name not in right),
-        left_out=len(set(usable) - set(kept)),
-        decoded=decoding.decoded,
-        median_px=decoding.median_px,
-        wrong_pixels=decoding.wrong,
-        slipped_pixels=decoding.slipped,
+        name=one.name, appearance=one.appearance, frames=len(truth.frames), usable=len(usable),
+        right=len(right & set(usable)), wrong=tuple(name for name in kept if name not in right),
+        left_out=len(set(usable) - set(kept)), decoded=decoding.decoded, median_px=decoding.median_px,
+        wrong_pixels=decoding.wrong, slipped_pixels=decoding.slipped,
         camera_deg=float(np.median([e.camera_deg for e in errors if e.right])) if right else float("nan"),
         within_1_sigma=float((ratio <= 1).mean()) if len(ratio) else float("nan"),
         within_2_5_sigma=float((ratio <= 2.5).mean()) if len(ratio) else float("nan"),
-        verdict=verdict,
-        seconds=seconds,
-        errors=tuple(errors),
-        message=message,
-    )
-
-
-HEAD = (
-    f"{'set':42} {'right':>7} {'wrong':>5} {'out':>4} {'decoded':>8} {'px':>6} {'>2 px':>7} {'>10 px':>7} "
-    f"{'cam deg':>8} {'1 s':>5} {'2.5 s':>5}  {'verdict':10} {'s':>4}"
-)
-
-
-def text_of(row: Row) -> str:
-    """A line of the table."""
-    return (
-        f"{row.name:42} {row.right:3d}/{row.usable:<3d} {len(row.wrong):5d} {row.left_out:4d} {row.decoded:8.1%} "
-        f"{row.median_px:6.2f} {row.wrong_pixels:7.2%} {row.slipped_pixels:7.2%} "
-        f"{row.camera_deg:8.3f} {row.within_1_sigma:5.0%} {row.within_2_5_sigma:5.0%}  "
-        f"{row.verdict:10} {row.seconds:4.0f}" + (f"\n    {row.message.splitlines()[0]}" if row.message else "")
-    )
+        verdict=verdict, seconds=seconds, errors=tuple(errors), message=message,
+    )  # fmt: skip
 
 
 def summary(rows: list[Row]) -> str:
@@ -167,26 +133,22 @@ def summary(rows: list[Row]) -> str:
 
 
 def _median(values: Sequence[float]) -> float:
-    """Of those that exist."""
+    """The median of those that exist."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.median(known)) if known else float("nan")
 
 
 def main() -> None:
     """Print a line for each set, and write all to JSON."""
-    config = tyro.cli(Config, description=__doc__)
+    config = parsed(Config, __doc__)
     sets = chosen_sets(config.sets)
     if config.render_only:
         for one in sets:
             print(captures_of(one, config.frames, config.resolution, config.keep), flush=True)
         return
-    rows: list[Row] = []
-    print(HEAD, flush=True)
+    rows: Rows[Row] = Rows(config.output, frames=config.frames, resolution=config.resolution)
     for one in sets:
-        rows.append(measure(one, config))
-        print(text_of(rows[-1]), flush=True)
-        if config.output is not None:
-            write_rows(config.output, rows, frames=config.frames, resolution=config.resolution)
+        rows.add(measure(one, config), line=lambda row: shown(replace(row, errors=())))
     print(summary(rows))
 
 

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -35,32 +36,26 @@ class CaptureSet:
 
     @property
     def name(self) -> str:
-        """Unique, and changes with everything that changes the images."""
+        """A unique name, which changes with everything that changes the images."""
         return f"{self.scene}-{self.background}-{self.appearance}-{self.seed}{'-shuffled' if self.shuffled else ''}"
 
 
 SETS = (
-    CaptureSet("frog", "none", "plain", 501),
-    CaptureSet("dog", "table", "plain", 502),
-    CaptureSet("vase", "walls", "plain", 503),
-    CaptureSet("chair", "none", "plain", 504, shuffled=True),
-    CaptureSet("head", "table", "realistic", 505),
-    CaptureSet("chair", "table", "realistic", 506),
-    CaptureSet("leaf", "walls", "realistic", 507),
-    CaptureSet("medal", "table", "realistic", 508),
+    CaptureSet("frog", "none", "plain", 501), CaptureSet("dog", "table", "plain", 502),
+    CaptureSet("vase", "walls", "plain", 503), CaptureSet("chair", "none", "plain", 504, shuffled=True),
+    CaptureSet("head", "table", "realistic", 505), CaptureSet("chair", "table", "realistic", 506),
+    CaptureSet("leaf", "walls", "realistic", 507), CaptureSet("medal", "table", "realistic", 508),
     CaptureSet("dog", "none", "realistic", 509, shuffled=True, unordered=True),
-    CaptureSet("vase", "none", "realistic", 510),
-    CaptureSet("frog", "walls", "hard", 511),
-    CaptureSet("leaf", "table", "hard", 512),
-    CaptureSet("chair", "walls", "hard", 513),
+    CaptureSet("vase", "none", "realistic", 510), CaptureSet("frog", "walls", "hard", 511),
+    CaptureSet("leaf", "table", "hard", 512), CaptureSet("chair", "walls", "hard", 513),
     CaptureSet("cone-and-cylinder", "none", "hard", 514),
-)
+)  # fmt: skip
 
 
 _NAME = re.compile(r"(.+)-(none|table|walls)-(plain|realistic|hard)-(\d+)(-shuffled)?")
 
 
-def chosen_sets(parts: tuple[str, ...]) -> list[CaptureSet]:
+def chosen_sets(parts: Sequence[str]) -> list[CaptureSet]:
     """The sets whose names contain one of the parts, and new ones that are named in full.
 
     Raises UserError if a part fits none and is no name of a set.
@@ -89,15 +84,9 @@ def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> 
     pattern = folder / "pattern.json"
     write_atomic(pattern, PATTERN.encode())
     config = SynthConfig(
-        scene=one.scene,
-        background=one.background,
-        appearance=one.appearance,
-        seed=one.seed,
-        frames=frames,
-        resolution=resolution,
-        pattern=pattern,
-        images_only=True,
-    )
+        scene=one.scene, background=one.background, appearance=one.appearance, seed=one.seed, frames=frames,
+        resolution=resolution, pattern=pattern, images_only=True,
+    )  # fmt: skip
     # two runs side by side, or one that is interrupted, must not leave half a set under its name
     started = folder / f".{root.name}-{os.getpid()}"
     shutil.rmtree(started, ignore_errors=True)

@@ -15,9 +15,121 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
-from benchmarks.pretended.operations import indexes, launches, name_of, takes_scalars_of_the_cpu, wait_of
-from benchmarks.pretended.tensor import CUDA, DeviceTensor, on_cpu, on_gpu
 from sl_nerfstudio.field import device_kernels
+
+CUDA = torch.device("cuda:0")
+
+
+class DeviceTensor(Tensor):
+    """A tensor that says it is on `cuda:0`; its values are in a CPU tensor, to which only `PretendedGpu` gets."""
+
+    values: Tensor
+
+    @staticmethod
+    def __new__(cls, values: Tensor) -> "DeviceTensor":
+        """It shares the memory of the CPU tensor `values`."""
+        made = Tensor._make_wrapper_subclass(
+            cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype
+        )
+        made.values = values.detach()
+        return made
+
+    @property
+    def device(self) -> torch.device:  # pyright: ignore
+        """Where it pretends to be; torch's own code sees a tensor on the CPU."""
+        return CUDA
+
+    @property
+    def is_cuda(self) -> bool:  # pyright: ignore
+        """True, as on a GPU."""
+        return True
+
+    def numpy(self, *_: Any, **__: Any) -> Any:  # pyright: ignore
+        """Raise TypeError, as on a GPU."""
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() first")
+
+    def __array__(self, *_: Any, **__: Any) -> Any:  # pyright: ignore
+        self.numpy()
+
+    def __repr__(self, **_: Any) -> str:  # pyright: ignore
+        return f"DeviceTensor({self.values!r})"
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Files hold the values: they are read with `map_location="cpu"`."""
+        return self.values.__reduce_ex__(protocol)
+
+    def __tensor_flatten__(self) -> tuple[list[str], None]:
+        return ["values"], None  # torch then exchanges a module's parameters for those on another device
+
+    @staticmethod
+    def __tensor_unflatten__(inner: dict[str, Tensor], _: None, size: Any, stride: Any) -> "DeviceTensor":
+        return DeviceTensor(inner["values"])
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Only PretendedGpu computes with such tensors."""
+        raise RuntimeError(f"{func} on the pretended GPU after it was switched off")
+
+
+def on_cpu(x: Any) -> Any:
+    """The values of a tensor, anything else as it is."""
+    return x.values if isinstance(x, DeviceTensor) else x
+
+
+def on_gpu(x: Any) -> Any:
+    """A tensor as one of the pretended GPU, anything else as it is."""
+    return DeviceTensor(x) if isinstance(x, Tensor) and not isinstance(x, DeviceTensor) else x
+
+
+_NO_LAUNCH = {
+    "alias", "as_strided", "detach", "diagonal", "empty", "empty_like", "empty_strided", "expand", "is_same_size",
+    "lift_fresh", "narrow", "new_empty", "new_empty_strided", "permute", "result_type", "select", "set_", "slice",
+    "split", "split_with_sizes", "squeeze", "squeeze_", "t_", "transpose_", "unsqueeze_", "sym_numel", "sym_size",
+    "sym_stride", "t", "transpose", "unbind", "unfold", "unsqueeze", "view", "_reshape_alias", "_unsafe_view",
+}  # fmt: skip
+
+_READ, _COUNTED = "a value read by the host", "a result as long as its values say"
+_WAITS = {
+    **dict.fromkeys(("_local_scalar_dense", "item", "is_nonzero", "equal", "nanmedian"), _READ),
+    **dict.fromkeys(("nonzero", "masked_select", "bincount", "repeat_interleave"), _COUNTED),
+    **dict.fromkeys(("_unique", "_unique2", "unique_dim", "unique_consecutive"), _COUNTED),
+}
+
+_TAKE_SCALARS = {
+    "copy_", "fill_", "index_put_", "index_put", "_index_put_impl_", "masked_fill_", "masked_fill", "where", "lerp",
+    "lerp_", "_foreach_add_",
+}  # fmt: skip
+_INDEXED = {"index", "index_put_", "index_put", "_index_put_impl_", "_unsafe_index"}
+
+
+def name_of(func: Any) -> str:
+    """Its name without overload and namespace."""
+    return func._schema.name.split("::")[-1]
+
+
+def launches(func: Any) -> bool:
+    """Whether it starts a kernel or a copy on the device."""
+    return name_of(func) not in _NO_LAUNCH and not func.is_view
+
+
+def takes_scalars_of_the_cpu(func: Any) -> bool:
+    """Whether a CPU tensor without dimensions may be among tensors of a GPU."""
+    return torch.Tag.pointwise in func.tags or name_of(func) in _TAKE_SCALARS
+
+
+def indexes(func: Any) -> bool:
+    """Whether its second argument is a list of indices, which may be on the CPU."""
+    return name_of(func) in _INDEXED
+
+
+def wait_of(func: Any, args: tuple[Any, ...]) -> str | None:
+    """Why the host waits for the device in it, None if it does not."""
+    if indexes(func) and any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1]):
+        return "indexing with a mask"
+    return _WAITS.get(name_of(func))
+
 
 _OWN = "sl_nerfstudio"
 _FACTORIES = {"arange", "eye", "full", "linspace", "ones", "scalar_tensor", "zeros"}
@@ -56,14 +168,12 @@ class PretendedGpu(TorchDispatchMode):
     def __enter__(self) -> "PretendedGpu":
         """Torch says that there is a GPU."""
         replaced: list[tuple[Any, str, Any]] = [
-            (torch.cuda, "is_available", lambda: True),
-            (torch.cuda, "device_count", lambda: 1),
+            (torch.cuda, "is_available", lambda: True), (torch.cuda, "device_count", lambda: 1),
             (torch.cuda, "mem_get_info", lambda *_: (8 << 30, 8 << 30)),
-            (torch.cuda, "is_current_stream_capturing", lambda: False),
-            (torch, "Generator", _Generator),
+            (torch.cuda, "is_current_stream_capturing", lambda: False), (torch, "Generator", _Generator),
             (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
             (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
-        ]
+        ]  # fmt: skip
         if self._kernels:
             replaced += [(device_kernels, "run", self._run_kernel), (device_kernels, "obstacle", lambda _: None)]
         for owner, name, stand_in in replaced:

@@ -9,9 +9,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from benchmarks.pretended.gpu import PretendedGpu
-from benchmarks.pretended.operations import launches
-from benchmarks.pretended.tensor import on_cpu
+from benchmarks.pretended.gpu import PretendedGpu, launches, on_cpu
 
 T = TypeVar("T")
 

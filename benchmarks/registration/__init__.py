@@ -1,1 +1,1 @@
-"""Registration of frames whose poses are known: of walks around objects, and of shuffled frames."""
+"""Registration of frames whose relative poses are known."""

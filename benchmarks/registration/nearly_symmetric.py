@@ -9,18 +9,28 @@ frames that agree with the truth. What is exactly symmetric cannot come out righ
 
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-import tyro
 from numpy import ndarray
 
-from benchmarks.another_renderer.objects import bracket, housing, nut
-from benchmarks.another_renderer.shapes import ball, block, drum, joined, meshed, moved, prism, without
-from benchmarks.common.machine import write_rows
+from benchmarks.another_renderer.objects import (
+    ball,
+    block,
+    bracket,
+    drum,
+    housing,
+    joined,
+    meshed,
+    moved,
+    nut,
+    prism,
+    without,
+)  # fmt: skip
+from benchmarks.common.measuring import Rows, options
 from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
@@ -33,18 +43,6 @@ from sl_nerfstudio.synthesis.synthesise import make_setup
 FRAMES, RESOLUTION = 24, 220
 _NOISE_PX, _WRONG, _MISSING = 0.35, 0.01, 0.1
 _WRONG_DEG = 5.0
-
-
-@dataclass(frozen=True)
-class Config:
-    """What is registered."""
-
-    things: tuple[str, ...] = ()
-    """names of objects; default: all"""
-    seeds: tuple[int, ...] = (1, 2)
-    """seeds of the walk, the noise and the order"""
-    output: Path = Path("benchmarks/results/nearly_symmetric.json")
-    """JSON with the figures"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ def mouse() -> trimesh.Trimesh:
 
 
 def brick() -> trimesh.Trimesh:
-    """The same after half a turn about each of three axes."""
+    """A block that is the same after half a turn about each of three axes."""
     return meshed(block((0, 0, 0), (100, 62, 40), 2), (60, 40, 30))
 
 
@@ -137,31 +135,24 @@ def row_of(thing: str, seed: int, found: Registration, true: ndarray, seconds: f
     return Row(thing, seed, len(kept) - len(wrong), len(wrong), len(found.names) - len(kept), named, by, seconds)
 
 
-def measure(things: Sequence[str], seeds: Sequence[int]) -> list[Row]:
-    """A line of the table for each; raises ValueError for a thing that is not there."""
-    unknown = sorted(set(things) - THINGS.keys())
-    if unknown:
-        raise ValueError(f"--things {' '.join(unknown)}: there are {', '.join(THINGS)}")
-    rows = []
-    for thing in things or THINGS:
-        for seed in seeds:
-            with tempfile.TemporaryDirectory() as folder:
-                mesh = Path(folder) / f"{thing}.ply"
-                THINGS[thing]().export(mesh)
-                clouds, true = shuffled(mesh, seed)
-            start = time.process_time()
-            found = register(clouds)
-            rows.append(row_of(thing, seed, found, true, round(time.process_time() - start, 1)))
-            r = rows[-1]
-            print(f"{thing:8} {seed:4d}  right {r.right:2d}  wrong {r.wrong:2d} {list(r.wrong_by_deg)}  left out "
-                  f"{r.left_out:2d}  named {list(r.turns_deg)}  {r.seconds:.0f} s", flush=True)  # fmt: skip
-    return rows
+def measure(thing: str, seed: int) -> Row:
+    """Register one thing."""
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = Path(folder) / f"{thing}.ply"
+        THINGS[thing]().export(mesh)
+        clouds, true = shuffled(mesh, seed)
+    start = time.process_time()
+    found = register(clouds)
+    return row_of(thing, seed, found, true, round(time.process_time() - start, 1))
 
 
 def main() -> None:
-    """Print the table, and write it to JSON."""
-    config = tyro.cli(Config, description=__doc__)
-    write_rows(config.output, measure(config.things, config.seeds), frames=FRAMES)
+    """Print the rows, and write them to JSON."""
+    given = options(__doc__, things=THINGS, seeds=[1, 2], output=Path("benchmarks/results/nearly_symmetric.json"))
+    rows: Rows[Row] = Rows(given.output, frames=FRAMES)
+    for thing in given.things:
+        for seed in given.seeds:
+            rows.add(measure(thing, seed))
 
 
 if __name__ == "__main__":

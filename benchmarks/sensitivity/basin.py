@@ -7,15 +7,14 @@ sl-synth's default calibration errors), and adjusted as `ns-train sl-neus` does 
 counts frames that end more than one degree off.
 """
 
-import argparse
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.scans import made_once
+from benchmarks.common.measuring import Rows, options
+from benchmarks.common.runs import made_once
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
@@ -24,17 +23,8 @@ from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 
-LEVELS = (
-    (0.0, 0.0),
-    (0.25, 1.0),
-    (0.5, 2.0),
-    (1.0, 3.0),
-    (2.0, 6.0),
-    (3.0, 10.0),
-    (5.0, 15.0),
-    (7.0, 20.0),
-    (10.0, 30.0),
-)
+LEVELS = ((0.0, 0.0), (0.25, 1.0), (0.5, 2.0), (1.0, 3.0), (2.0, 6.0), (3.0, 10.0), (5.0, 15.0), (7.0, 20.0),
+          (10.0, 30.0))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,57 +53,29 @@ def from_errors(scan: Scan, setup: Setup) -> Scan:
 def measure(loaded: LoadedScan, setup: Setup, seed: int, level: tuple[float, float]) -> Row:
     """Adjust one set of starting poses."""
     begin = time.monotonic()
-    found = adjust_scan(
-        from_errors(loaded.scan, setup),
-        loaded.S_scene_world,
-        loaded.samples,
-        "free",
-        PriorConfig(),
-        AdjustmentSettings(),
-    )
+    scan = from_errors(loaded.scan, setup)
+    found = adjust_scan(scan, loaded.S_scene_world, loaded.samples, "free", PriorConfig(), AdjustmentSettings())
     seconds = time.monotonic() - begin
     end = compare_poses(found.rig.poses(loaded.S_scene_world.inverse()), setup.truth).camera
     before = compare_poses(setup.start, setup.truth).camera
     return Row(
-        seed,
-        *level,
-        before.translation_rmse,
-        before.rotation_rmse_deg,
-        end.translation_rmse,
-        end.rotation_rmse_deg,
-        int((np.asarray(end.rotation_deg) > 1).sum()),
-        found.adjusted,
-        seconds,
-    )
+        seed, *level, before.translation_rmse, before.rotation_rmse_deg, end.translation_rmse, end.rotation_rmse_deg,
+        int((np.asarray(end.rotation_deg) > 1).sum()), found.adjusted, seconds,
+    )  # fmt: skip
 
 
 def main() -> None:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="cone-and-cylinder")
-    parser.add_argument("--frames", type=int, default=22)
-    parser.add_argument("--resolution", type=int, default=400)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
-    parser.add_argument("--folder", type=Path, default=Path("outputs/basin"), help="folder of the scans, made once")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/basin.json"))
-    options = parser.parse_args()
-    rows: list[Row] = []
-    for seed in options.seeds:
-        config = SynthConfig(scene=options.scene, frames=options.frames, resolution=options.resolution, seed=seed)
-        loaded = made_once(config, options.folder)
+    """Run the benchmark; the scans are made once."""
+    given = options(
+        __doc__, scene="cone-and-cylinder", frames=22, resolution=400, seeds=[1, 2, 3], folder=Path("outputs/basin"),
+        output=Path("benchmarks/results/basin.json"),
+    )  # fmt: skip
+    rows: Rows[Row] = Rows(given.output)
+    for seed in given.seeds:
+        config = SynthConfig(scene=given.scene, frames=given.frames, resolution=given.resolution, seed=seed)
+        loaded = made_once(config, given.folder)
         for level in LEVELS:
-            rows.append(measure(loaded, make_setup(replace(config, pose_error=level)), seed, level))
-            print(text(rows[-1]), flush=True)
-    write_rows(options.output, rows)
-
-
-def text(r: Row) -> str:
-    """One line of the table."""
-    return (
-        f"seed {r.seed}  frames off by {r.frame_deg:5.2f} deg {r.frame_mm:4.0f} mm | cameras {r.start_mm:6.2f} mm "
-        f"{r.start_deg:6.3f} deg -> {r.end_mm:6.3f} mm {r.end_deg:6.3f} deg, {r.over_1_deg} over 1 deg"
-        f"{'' if r.kept else ', starting poses kept'} | {r.seconds:.0f} s"
-    )
+            rows.add(measure(loaded, make_setup(replace(config, pose_error=level)), seed, level))
 
 
 if __name__ == "__main__":

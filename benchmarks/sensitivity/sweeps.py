@@ -12,16 +12,14 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.common.machine import write_rows
-from benchmarks.common.whole_runs import Score, run, train_and_score, with_true_poses
+from benchmarks.common.measuring import Rows, options
+from benchmarks.common.runs import Score, run, train_and_score, with_true_poses
 
 SYNTH = {
-    "noise": ("--noise", (0.0, 0.3, 0.6, 1.0, 2.0)),
-    "missing": ("--missing", (0.0, 0.15, 0.3, 0.45, 0.6)),
-    "wrong": ("--wrong", (0.0, 0.02, 0.05, 0.1, 0.15)),
-    "frames": ("--frames", (3, 6, 11, 22, 57)),
+    "noise": ("--noise", (0.0, 0.3, 0.6, 1.0, 2.0)), "missing": ("--missing", (0.0, 0.15, 0.3, 0.45, 0.6)),
+    "wrong": ("--wrong", (0.0, 0.02, 0.05, 0.1, 0.15)), "frames": ("--frames", (3, 6, 11, 22, 57)),
     "resolution": ("--resolution", (200, 400, 800, 1200)),
-}
+}  # fmt: skip
 TIME = {
     "sl-neus": ("sl-neus", (), (100, 200, 400, 1000)),
     "oracle": ("sl-neus", ("--pipeline.model.refine-poses", "off"), (100, 400, 1000)),
@@ -40,31 +38,23 @@ class Row(Score):
     value: float  # of what the sweep changes; number of iterations in the sweep over time
 
 
-def synth(options: argparse.Namespace, folder: Path, *flags: str) -> Path:
-    """A scan made with these flags, unless it exists."""
-    scan = folder / "scan"
-    if not scan.exists():
-        fixed = ("--scene", options.scene, "--seed", str(options.seed))
-        run("sl-synth", "--output", str(scan), *fixed, *flags)
-    return scan
-
-
-def over_scans(options: argparse.Namespace, sweep: str) -> Iterator[Row]:
+def over_scans(given: argparse.Namespace, sweep: str) -> Iterator[Row]:
     """One scan and one run for each value."""
     flag, values = SYNTH[sweep]
     for value in values:
-        folder = options.folder / f"{sweep}-{value}"
-        folder.mkdir(exist_ok=True)
-        scan = synth(options, folder, flag, str(value))
-        score = train_and_score(scan, folder, "run", ("--max-num-iterations", str(options.iterations)))
+        folder = given.folder / f"{sweep}-{value}"
+        folder.mkdir()
+        run("sl-synth", "--output", folder / "scan", "--scene", given.scene, "--seed", given.seed, flag, value)
+        score = train_and_score(folder / "scan", folder, "run", ("--max-num-iterations", str(given.iterations)))
         yield Row(**asdict(score), sweep=sweep, variant="sl-neus", value=value)
 
 
-def over_time(options: argparse.Namespace) -> Iterator[Row]:
+def over_time(given: argparse.Namespace) -> Iterator[Row]:
     """One scan; runs of growing length, each with its schedules stretched to fit."""
-    folder = options.folder / "time"
-    folder.mkdir(exist_ok=True)
-    scan = synth(options, folder)
+    folder = given.folder / "time"
+    folder.mkdir()
+    scan = folder / "scan"
+    run("sl-synth", "--output", scan, "--scene", given.scene, "--seed", given.seed)
     true = with_true_poses(scan, folder / "true")
     for variant, (method, flags, lengths) in TIME.items():
         data = true if variant == "oracle" else scan
@@ -75,22 +65,16 @@ def over_time(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sweeps", nargs="+", default=list(SWEEPS), choices=SWEEPS)
-    parser.add_argument("--scene", default="cone-and-cylinder")
-    parser.add_argument("--seed", type=int, default=4)
-    parser.add_argument("--iterations", type=int, default=400, help="of all sweeps except the one over time")
-    parser.add_argument("--folder", type=Path, default=Path("outputs/sweeps"), help="must not exist yet")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/sweeps.json"))
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True)
-    rows: list[Row] = []
-    for sweep in options.sweeps:
-        for row in over_time(options) if sweep == "time" else over_scans(options, sweep):
-            rows.append(row)
-            print(f"{sweep:10} {row.variant:13} {row.value:7g} {row.text()}", flush=True)
-            write_rows(options.output, rows, scene=options.scene, seed=options.seed, iterations=options.iterations)
+    """Run the benchmark in a folder that must not exist yet."""
+    given = options(
+        __doc__, sweeps=dict.fromkeys(SWEEPS), scene="cone-and-cylinder", seed=4, iterations=400,
+        folder=Path("outputs/sweeps"), output=Path("benchmarks/results/sweeps.json"),
+    )  # fmt: skip
+    given.folder.mkdir(parents=True)
+    rows: Rows[Row] = Rows(given.output, scene=given.scene, seed=given.seed, iterations=given.iterations)
+    for sweep in given.sweeps:
+        for row in over_time(given) if sweep == "time" else over_scans(given, sweep):
+            rows.add(row)
 
 
 if __name__ == "__main__":

@@ -7,18 +7,15 @@ those that contradict the epipolar geometry by more than 1.5 px are dropped, as 
 wrong by `--pose-deg` about the object, and by a ninth of that in their position as seen from there.
 """
 
-import argparse
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.machine import write_rows
+from benchmarks.common.measuring import Rows, options
 from benchmarks.separation.cases import Conditions, make_case
 from benchmarks.separation.objects import BACKGROUNDS, OBJECTS
-from sl_nerfstudio.object_separation.planes import PlaneFinding
 from sl_nerfstudio.object_separation.separate import Part, separate
 
 
@@ -36,7 +33,7 @@ class Row:
     seconds: float
 
 
-def measure(name: str, background: str, given: Conditions) -> tuple[Row, tuple[PlaneFinding, ...]]:
+def measure(name: str, background: str, given: Conditions) -> Row:
     """Separate one case and compare."""
     case = make_case(OBJECTS[name](), background, given)
     start = time.monotonic()
@@ -48,57 +45,26 @@ def measure(name: str, background: str, given: Conditions) -> tuple[Row, tuple[P
         shown = found.parts(k, frame) == Part.OBJECT
         kept[k], total[k] = (shown & decoded & is_object).sum(), (decoded & is_object).sum()
         left[k], others[k] = (shown & decoded & ~is_object).sum(), (decoded & ~is_object).sum()
-    row = Row(
-        name,
-        background,
-        object_kept=float(kept.sum() / total.sum()),
+    return Row(
+        name, background, object_kept=float(kept.sum() / total.sum()),
         object_kept_worst=float((kept / total.clip(1)).min()),
         surroundings_left=float(left.sum() / max(others.sum(), 1)),
         surroundings_share=float(others.sum() / (others.sum() + total.sum())),
-        verdicts=tuple(f.verdict for f in found.findings),
-        seconds=seconds,
-    )
-    return row, found.findings
+        verdicts=tuple(f.verdict for f in found.findings), seconds=seconds,
+    )  # fmt: skip
 
 
-def describe(row: Row) -> str:
-    """One line."""
-    return (
-        f"{row.object:18} {row.background:6} object kept {row.object_kept:7.2%} (worst frame "
-        f"{row.object_kept_worst:7.2%}), of the surroundings ({row.surroundings_share:3.0%}) left "
-        f"{row.surroundings_left:6.2%}  {row.seconds:4.1f} s"
-    )
-
-
-def describe_plane(f: PlaneFinding) -> str:
-    """One line."""
-    return (
-        f"    {f.verdict:22} share {f.share:.2f} front {f.cameras_in_front:.2f} behind {f.behind:.3f} "
-        f"above {f.above:.3f} continues {f.continues:.2f} area {f.area_ratio:.1f} "
-        f"height {f.height_ratio:.2f} around {f.around:.2f}"
-    )
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure all cases and write them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
-    parser.add_argument("--backgrounds", nargs="+", default=list(BACKGROUNDS), choices=list(BACKGROUNDS))
-    parser.add_argument("--zoom", type=float, default=0.75, help="below 1, devices see more of the surroundings")
-    parser.add_argument("--pose-deg", type=float, default=0.05, help="error of each frame about the object")
-    parser.add_argument("--noise-px", type=float, default=0.3, help="noise of coordinates")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/separation.json"))
-    parser.add_argument("--verbose", action="store_true", help="print every plane")
-    flags = parser.parse_args(arguments)
-    given = Conditions(zoom=flags.zoom, pose_deg=flags.pose_deg, noise_px=flags.noise_px, seed=flags.seed)
-    rows = []
-    for name in flags.objects:
-        for background in flags.backgrounds:
-            row, planes = measure(name, background, given)
-            rows.append(row)
-            print("\n".join([describe(row), *(map(describe_plane, planes) if flags.verbose else ())]), flush=True)
-    write_rows(flags.output, rows, **vars(given))
+def main() -> None:
+    """Measure all cases and write them. With a zoom below 1, devices see more of the surroundings."""
+    given = options(
+        __doc__, objects=OBJECTS, backgrounds=dict.fromkeys(BACKGROUNDS), zoom=0.75, pose_deg=0.05, noise_px=0.3,
+        seed=0, output=Path("benchmarks/results/separation.json"),
+    )  # fmt: skip
+    conditions = Conditions(zoom=given.zoom, pose_deg=given.pose_deg, noise_px=given.noise_px, seed=given.seed)
+    rows: Rows[Row] = Rows(given.output, **vars(conditions))
+    for name in given.objects:
+        for background in given.backgrounds:
+            rows.add(measure(name, background, conditions))
 
 
 if __name__ == "__main__":

@@ -92,13 +92,10 @@ def _consistent(frame: DecodedFrame) -> Float32[ndarray, "h w 2"]:
     """The coordinates that agree with the poses, as sl-process keeps them."""
     row, column = np.nonzero(np.isfinite(frame.coords).all(-1))
     residual = epipolar_residual(
-        Intrinsics.of(frame.camera, torch.float64),
-        torch.from_numpy(frame.T_world_camera),
-        torch.from_numpy(np.stack([column, row], -1) + 0.5),
-        Intrinsics.of(frame.projector, torch.float64),
-        torch.from_numpy(frame.T_world_projector),
-        torch.from_numpy(frame.coords[row, column].astype(np.float64)),
-    )
+        Intrinsics.of(frame.camera, torch.float64), torch.from_numpy(frame.T_world_camera),
+        torch.from_numpy(np.stack([column, row], -1) + 0.5), Intrinsics.of(frame.projector, torch.float64),
+        torch.from_numpy(frame.T_world_projector), torch.from_numpy(frame.coords[row, column].astype(np.float64)),
+    )  # fmt: skip
     coords = frame.coords.copy()
     wrong = ~(residual.abs().numpy() <= _KEPT_PX)
     coords[row[wrong], column[wrong]] = np.nan

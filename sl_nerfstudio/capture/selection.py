@@ -51,9 +51,8 @@ def _windows(shape: tuple[int, ...], x: ndarray, y: ndarray, side: int) -> Bool[
 
 # What a single image shows of the coded grid, fast enough for several images a second.
 #
-# The decoder's detector finds the nodes of the grid and recognises them. Coordinates between them, which cost most
-# of the
-# decoding, are not needed to judge an image.
+# The decoder's detector finds the nodes of the grid and recognises them. Coordinates between them, which cost most of
+# the decoding, are not needed to judge an image.
 
 _LONGEST_SIDE = 960  # pixels of the reduced image in which the grid is looked for
 _SAME_PLACE = 0.25  # periods: a node that is farther away than this shows another place

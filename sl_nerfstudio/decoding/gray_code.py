@@ -22,9 +22,8 @@ from sl_nerfstudio.scan.images import as_grey
 # Coordinates finer than the cells of a Gray code.
 #
 # Between two neighbouring cells exactly one bit changes, and the difference of its image and its inverse is zero
-# exactly
-# on the border, whatever albedo and shading are. So borders are found to a fraction of a camera pixel, and a plane
-# through the borders around a pixel gives its coordinate.
+# exactly on the border, whatever albedo and shading are. So borders are found to a fraction of a camera pixel, and a
+# plane through the borders around a pixel gives its coordinate.
 
 LEVELS = 3  # a pixel is used if fewer of its finest bits than this are uncertain
 # The plane through the borders around a pixel.

@@ -16,8 +16,7 @@ from sl_nerfstudio.pattern.layout import HEAD, ORDERS, SequenceName
 # Whether photographs of a sequence show what they should: each image against its place in the sequence.
 #
 # This follows for any object: white is the brightest image of every pixel and black the darkest; an image and its
-# inverse add up to white and black; finer bits change more often from pixel to pixel than coarser ones; and where
-# the
+# inverse add up to white and black; finer bits change more often from pixel to pixel than coarser ones; and where the
 # cell changes, it changes to one of its neighbours. The axes of the pattern turn as those of the camera do, because
 # projector and camera see the same side of a surface. All of it is measured at a few of the pixels.
 

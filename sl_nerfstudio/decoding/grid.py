@@ -30,8 +30,7 @@ from sl_nerfstudio.scan.images import as_grey, read_photograph
 # An image of the coded grid, decoded without calibration or other frames.
 #
 # The grid is found and its phases are read, its nodes are recognised, coordinates spread from the nodes over all
-# pixels,
-# a dense fit to the image refines them, and beside edges they are continued from where their surface is seen
+# pixels, a dense fit to the image refines them, and beside edges they are continued from where their surface is seen
 # better.
 
 # Which pixels are kept.

@@ -46,10 +46,8 @@ class EdgeEvidence:
 # Coordinates continued as a plane from a place some pixels away.
 #
 # The displacement of a pixel to a place on the same surface that is farther from its edge follows Ramamonjisoa et
-# al.,
-# "Predicting sharp and accurate occlusion boundaries in monocular depth estimation using displacement fields"
-# (2020);
-# here the plane at that place is continued, not its value.
+# al., "Predicting sharp and accurate occlusion boundaries in monocular depth estimation using displacement fields"
+# (2020); here the plane at that place is continued, not its value.
 
 _DISTANCES = (3, 6, 9, 13)  # pixels of the rectified image
 _DIRECTIONS = 8

@@ -177,8 +177,7 @@ class GridLight:
 # One least-squares step of the dense fit: light, and shift of the coordinates, in a window about each place.
 #
 # Lucas and Kanade (1981), with brightness and contrast as further unknowns. All sums that the normal equations need
-# are
-# moments of the image, the drawn pattern and its derivatives.
+# are moments of the image, the drawn pattern and its derivatives.
 
 # Windows.
 _SQUARES = 8  # per period, for which fits are made

@@ -25,10 +25,8 @@ from sl_nerfstudio.pattern.grid import gaussian_window
 # How well coordinates agree with the symbols that the network read around them.
 #
 # Phases can run on smoothly from one surface to another whose lines happen to continue those of the first; the
-# symbols
-# show that the second one is elsewhere in the pattern. Even where the network is certain, it may have misread a
-# symbol:
-# all likelihoods allow for that.
+# symbols show that the second one is elsewhere in the pattern. Even where the network is certain, it may have misread
+# a symbol: all likelihoods allow for that.
 
 _MISREAD = 0.15  # share of the symbols that may be wrong, however certain the network is
 _WINDOW = 0.7  # periods over which symbols are averaged
@@ -81,8 +79,7 @@ def _weigh(coords: ndarray, codes: ndarray, ratio: ndarray, to_map: ndarray, sum
 # The grid graph of a capture: crossings of lines, and which of them are neighbours along a line.
 #
 # Directions (right, down, left, up) are those of the rectified image, in which the pattern may be turned by any
-# number of
-# quarter turns.
+# number of quarter turns.
 
 RIGHT, DOWN, LEFT, UP = range(4)
 STEPS = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -298,11 +295,9 @@ def _agree(a: Int32[ndarray, "n"], b: Int32[ndarray, "n"]) -> Int32[ndarray, "n"
 #
 # The graph network judges every node by its neighbourhood. Nodes joined by an edge must be one place apart in the
 # pattern, all in the same quarter turn: beliefs are passed along edges, and nodes that then agree with their
-# neighbours
-# form pieces. Each piece is compared with the whole pattern: where the symbols of all its nodes fit one place much
-# better
-# than any other, it gets that place; otherwise it is dropped. Nodes next to a piece get the place that follows from
-# it.
+# neighbours form pieces. Each piece is compared with the whole pattern: where the symbols of all its nodes fit one
+# place much better than any other, it gets that place; otherwise it is dropped. Nodes next to a piece get the place
+# that follows from it.
 
 # Passing beliefs along edges.
 _ROUNDS = 4

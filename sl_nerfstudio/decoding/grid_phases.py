@@ -137,8 +137,7 @@ def from_pattern(coords: Float32[ndarray, "*n 2"], grid: GridPattern, turn: int)
 # Phase unwrapping: from nodes whose place is known to coordinates of all pixels.
 #
 # The coordinate of a pixel is a whole number plus its phase. The whole number spreads from the nodes over
-# neighbouring
-# pixels as long as the phase changes smoothly.
+# neighbouring pixels as long as the phase changes smoothly.
 
 _LARGEST_STEP = 0.3  # periods between two neighbouring pixels
 _FARTHEST = 2.0  # periods from the node
@@ -203,8 +202,7 @@ def _spread(
 
 # Captures turned and scaled to the roll and period that the network was trained on.
 #
-# The grid of a capture appears as peaks in the local power spectrum. They give its period and its roll up to
-# quarter
+# The grid of a capture appears as peaks in the local power spectrum. They give its period and its roll up to quarter
 # turns; the symbols decide between the quarter turns later.
 
 # Local power spectra.

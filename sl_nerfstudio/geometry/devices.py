@@ -1,4 +1,4 @@
-"""Changes of focal lengths and principal points, as shares of the focal length, by which a calibration is corrected."""
+"""Cameras and projectors: intrinsics, device models, lens distortion; projection as tensors and in compiled loops."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -177,8 +177,7 @@ def pinhole_direction(x: Tensor, y: Tensor) -> Tensor:
 # z').
 #
 # Its normalised coordinates are direction cosines, because those of the diffraction orders are evenly spaced (and
-# their
-# tangents are not).
+# their tangents are not).
 
 
 def doe_normalised(x: Number, y: Number, z: Number) -> tuple[Number, Number]:
@@ -263,8 +262,7 @@ def pixel_of(code, x, y, z, parameters):
 
 # From points in device axes to pixels, and back.
 #
-# Every model maps points to normalised coordinates (image axes, y down). Lens distortion, focal lengths and
-# principal
+# Every model maps points to normalised coordinates (image axes, y down). Lens distortion, focal lengths and principal
 # point are then applied in the same way for all models.
 
 

@@ -83,7 +83,11 @@ class BlockEquations:
         solved = np.linalg.solve(
             self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_block[..., None]], -1)
         )
-        H = self.H + damping * np.diag(np.diag(self.H)) - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1])
+        H = (
+            self.H
+            + damping * np.diag(np.diag(self.H))
+            - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1], optimize=True)
+        )
         return NormalEquations(H, self.g - np.einsum("bsk,bk->s", self.coupling, solved[..., -1]))
 
     def step(self, damping: float) -> tuple[Float64[ndarray, "s"], Float64[ndarray, "b k"]]:

@@ -19,11 +19,10 @@ from sl_nerfstudio.parallel import compiled
 # Local search for code arrays whose 3x3 windows keep a minimum Hamming distance.
 #
 # Two tables count, for each of the 5^9 possible windows, how often it occurs upright and how often in the pattern
-# turned
-# by 90, 180 or 270 degrees. The conflicts of a window are the occurrences in the Hamming balls around it. Cells of
-# windows with conflicts get the symbol that leaves the fewest conflicts (min-conflicts heuristic). Constants that
-# are
-# passed on are `np.int64(1)` rather than 1: for each such constant, numba would compile the called function anew.
+# turned by 90, 180 or 270 degrees. The conflicts of a window are the occurrences in the Hamming balls around it.
+# Cells of windows with conflicts get the symbol that leaves the fewest conflicts (min-conflicts heuristic). Constants
+# that are passed on are `np.int64(1)` rather than 1: for each such constant, numba would compile the called function
+# anew.
 
 _SYMBOLS, _CELLS = 5, 9
 _MOVES_PER_CELL = 3  # after that a margin counts as unreachable

@@ -98,8 +98,7 @@ def _is_table(value: Any) -> bool:
 # What each image of a sequence of patterns shows, and in which order programs show them.
 #
 # A sequence numbers the pattern's cells along both axes with the bits of a Gray code, each with or without its
-# inverse,
-# or with shifted sines ("phase shifting"), or with both. The orders here are those of
+# inverse, or with shifted sines ("phase shifting"), or with both. The orders here are those of
 #
 # - OpenCV, `structured_light::GrayCodePattern` and its sample `cap_pattern`; procam-calibration takes them from
 # there;

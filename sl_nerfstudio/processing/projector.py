@@ -38,7 +38,7 @@ from sl_nerfstudio.processing.inputs import Inputs
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration
 from sl_nerfstudio.registration.static_projector import (
-    STATIC_DEFAULTS,
+    DOUBTFUL_SIGMA,
     NoPlacement,
     StaticPlacement,
     place_under_static_projector,
@@ -161,7 +161,7 @@ def _remedy(role: Role) -> str:
 
 def static_doubt(sigma_focal: float, frames: int) -> str:
     """Why the intrinsics of a static projector are uncertain; "" if they are well determined."""
-    if sigma_focal <= STATIC_DEFAULTS.doubtful_sigma:
+    if sigma_focal <= DOUBTFUL_SIGMA:
         return ""
     return (
         f"the projector's focal length is known only to {100 * sigma_focal:.1f} % (1 sigma), from {frames} cameras\n"

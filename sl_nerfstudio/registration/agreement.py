@@ -1,4 +1,4 @@
-"""How well the surfaces of two frames agree under a similarity, and how to improve it: sums over looked-up points.
+"""Agreement of the surfaces of two frames under a similarity, and normal equations to improve it.
 
 Points of one frame are projected into the other's camera and compared with the tangent plane of the surface seen
 there, both ways. Unlike nearest neighbours this also finds contradictions: a point in front of a surface that the other
@@ -21,16 +21,20 @@ from sl_nerfstudio.geometry.devices import pixel_of
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled, compiled_range, compiled_sums
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, AgreementSettings, PairSettings
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
-# The compiled loops of `surface_agreement`.
-#
-# Most of the time that registration takes is spent here. So each step does one thing for all points, without
-# branches
-# that a processor would have to guess: they are mapped (several at once), then looked up, then compared, then
-# summed up;
-# of those that are still of interest, the numbers are kept.
+COARSE_POINTS = 400  # of each frame, wherever many pairs are compared
+AGREEING_SIGMAS = 4.0  # standard deviations of the two surfaces within which a point agrees
+HIDDEN_DEPTH = 0.35  # radii behind a surface: points farther back are hidden by it, nearer ones contradict it
+LEAST_FACING_COSINE = 0.3  # between the normals of two places that may be the same
+LEAST_LIT_COSINE = 0.35  # between a normal and its rays to camera and projector: a surface would be seen and lit
+KERNEL_CUTOFF = 4.0  # widths of the robust kernel beyond which a point has no weight
+BEHIND_WEIGHT = 0.5  # of a point a little behind the surface, where a point in front of it counts 1
+PENALTY = 3.0  # of a contradicting point where results are compared: a plane always agrees with a plane
+
+# The compiled loops of `agreement`. Registration spends most of its time here, so each step does one thing for all
+# points, without branches that a processor would have to guess: map, look up, compare, sum up; each step keeps the
+# numbers of the points that are still of interest.
 
 _kernel_weight = compiled(geman_mcclure_weight)
 _kernel_cost = compiled(geman_mcclure_cost)
@@ -109,7 +113,7 @@ def _on_surface(place, valid, some):
 
 @compiled
 def _absent(mapped, place, empty, light, least_cosine):
-    """How many points would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
+    """Count the points that would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
     code, projector, T, reach = light
     h, w = reach.shape
     count = 0
@@ -147,21 +151,21 @@ def _compare(mapped, sigma, place, plane, scales, tolerances, least_facing, cuto
         na, nb, nc = plane[at, 0], plane[at, 1], plane[at, 2]
         r = scales[2] * (na * mapped[0, n] + nb * mapped[1, n] + nc * mapped[2, n] - plane[at, 3])
         spread = np.sqrt((scales[0] * sigma[n]) ** 2 + (scales[1] * plane[at, 4]) ** 2)
-        tau, width = max(tolerances[0], tolerances[3] * spread), max(tolerances[1], tolerances[4] * spread)
+        tau = max(tolerances[0], tolerances[2] * spread)
         facing = na * mapped[3, n] + nb * mapped[4, n] + nc * mapped[5, n]
         agrees = (abs(r) < tau) & (facing > least_facing)
         in_front = (r > tau) & ~agrees
-        judged = r > -tolerances[2]
+        judged = r > -tolerances[1]
         agreeing += agrees
         ahead += in_front
         behind += judged & ~agrees & ~in_front
         squares += (r / spread) ** 2 if agrees else 0.0
-        x = (r / width) ** 2
+        x = (r / tau) ** 2
         cost += _kernel_cost(x) if judged else 0.0
         rows[0, used], rows[1, used], rows[2, used] = na, nb, nc
         rows[7, used], rows[8, used] = _kernel_weight(x) * facing, r
         some[used] = n
-        used += (facing >= least_facing) & (abs(r) <= cutoff * width)
+        used += (facing >= least_facing) & (abs(r) <= cutoff * tau)
     counts[0] += agreeing
     counts[1] += ahead
     counts[2] += behind
@@ -187,7 +191,7 @@ def _derive(points, turn, c, some, count, rows):
 
 @compiled_sums
 def _add_normal_equations(rows, count, H, g):
-    """Of derivatives, weights and distances."""
+    """Add the normal equations of weighted distances."""
     for i in range(7):
         total = 0.0
         for n in range(count):
@@ -216,9 +220,10 @@ class Hypotheses:
     log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
 
     @staticmethod
-    def of(S: Similarity) -> "Hypotheses":
-        """One similarity alone."""
-        return Hypotheses(np.array([S.scale]), S.R[None], S.t[None], np.log([S.scale]))
+    def of(*each: Similarity) -> "Hypotheses":
+        """Stack at least one similarity."""
+        scale = np.array([S.scale for S in each])
+        return Hypotheses(scale, np.stack([S.R for S in each]), np.stack([S.t for S in each]), np.log(scale))
 
     @staticmethod
     def joined(parts: Sequence["Hypotheses"]) -> "Hypotheses":
@@ -230,7 +235,7 @@ class Hypotheses:
         return len(self.scale)
 
     def __getitem__(self, index: list[int]) -> "Hypotheses":
-        """Some of them."""
+        """Select by index."""
         return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
 
     def incremented(
@@ -270,11 +275,11 @@ class Side:
 
     @staticmethod
     def sampled(surface: SurfaceMap, count: int, rng: np.random.Generator) -> "Side":
-        """With about `count` points spread evenly over the image."""
+        """Draw about `count` points spread evenly over the image."""
         return Side(surface, *surface.sample(count, rng))
 
     def thinned(self, most: int) -> "Side":
-        """With every n-th of its points, at most about `most`."""
+        """Keep every n-th point, about `most` at most."""
         some = slice(None, None, max(1, len(self.points) // most))
         return Side(self.map, *(np.ascontiguousarray(part[some]) for part in (self.points, self.normals, self.sigma)))
 
@@ -285,6 +290,9 @@ class Tolerance:
 
     radii: float  # of the target's points
     sigmas: float
+
+
+AGREES = Tolerance(0.0, AGREEING_SIGMAS)
 
 
 @dataclass(frozen=True)
@@ -302,7 +310,7 @@ class Agreement:
 
     @property
     def fitness(self) -> Float64[ndarray, "k"]:
-        """Of the points that could be judged, or should be seen and are not, the fraction that agree."""
+        """Fraction that agrees, of the points that could be judged, or should be seen and are not."""
         return self.agreeing / self.expected.clip(1e-9)
 
     @property
@@ -315,38 +323,31 @@ class Agreement:
         """Fraction of the points that the other camera should have seen: what could be judged, and absent ones."""
         return self.judged + self.absent
 
-    def contradicting(self, behind: float) -> Float64[ndarray, "k"]:
-        """Fraction that contradicts, of which points behind count as `behind`."""
-        return self.in_front + self.absent + behind * self.behind
+    @property
+    def contradicting(self) -> Float64[ndarray, "k"]:
+        """Fraction that contradicts; a point a little behind the surface counts BEHIND_WEIGHT."""
+        return self.in_front + self.absent + BEHIND_WEIGHT * self.behind
 
-    def score(self, penalty: float, behind: float) -> Float64[ndarray, "k"]:
-        """Points that agree less `penalty` times those that contradict, of which points behind count as `behind`."""
-        return self.agreeing - penalty * self.contradicting(behind)
+    def score(self, penalty: float = 1.0) -> Float64[ndarray, "k"]:
+        """Points that agree less `penalty` times those that contradict."""
+        return self.agreeing - penalty * self.contradicting
 
 
-def agreement(
-    source: Side,
-    target: Side,
-    hypotheses: Hypotheses,
-    tolerance: Tolerance,
-    width: Tolerance,
-    settings: AgreementSettings = REGISTRATION_DEFAULTS.pair.agreement,
-) -> Agreement:
-    """Both ways, for k similarities `p_target = scale R p_source + t`.
+def agreement(source: Side, target: Side, hypotheses: Hypotheses, tolerance: Tolerance) -> Agreement:
+    """Compare both ways, for k similarities `p_target = scale R p_source + t`.
 
-    `tolerance` is the distance within which points agree, `width` that of the robust kernel.
+    `tolerance` is the distance within which points agree, and the width of the robust kernel.
     """
     k, radius = len(hypotheses), target.map.radius
     H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 6))
-    tolerances = np.array([tolerance.radii * radius, width.radii * radius, settings.hidden_depth * radius,
-                           tolerance.sigmas, width.sigmas])  # fmt: skip
+    tolerances = np.array([tolerance.radii * radius, HIDDEN_DEPTH * radius, tolerance.sigmas])
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
         agreement_sums(
             len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid, m.model_code,
-            m.parameters, target.map.centroid, tolerances, settings.least_facing_cosine, settings.kernel_cutoff,
-            m.nothing.empty, m.nothing.light, settings.least_lit_cosine, H, g, counts[reverse],
+            m.parameters, target.map.centroid, tolerances, LEAST_FACING_COSINE, KERNEL_CUTOFF,
+            m.nothing.empty, m.nothing.light, LEAST_LIT_COSINE, H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
     squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
@@ -355,12 +356,8 @@ def agreement(
 
 
 def agreement_at(
-    maps: tuple[SurfaceMap, SurfaceMap],
-    S_target_source: Similarity,
-    rng: np.random.Generator,
-    tolerance: Tolerance,
-    settings: PairSettings,
+    maps: tuple[SurfaceMap, SurfaceMap], S_target_source: Similarity, rng: np.random.Generator, tolerance: Tolerance
 ) -> Agreement:
-    """How two frames agree under one similarity."""
-    source, target = (Side.sampled(m, settings.coarse_points, rng) for m in maps)
-    return agreement(source, target, Hypotheses.of(S_target_source), tolerance, tolerance, settings.agreement)
+    """Compare two frames under one similarity."""
+    source, target = (Side.sampled(m, COARSE_POINTS, rng) for m in maps)
+    return agreement(source, target, Hypotheses.of(S_target_source), tolerance)

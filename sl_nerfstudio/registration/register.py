@@ -1,7 +1,7 @@
-"""Registration of all frames: pairs, cycles, a robust pose graph.
+"""Registration of all frames: pairs, cycles, a robust pose graph; frames that are placed later; undecided projectors.
 
 The result is a camera pose and the length of the baseline of every frame. Lengths are relative: the geometric mean of
-the registered frames' baselines is 1 until `known_length` says how long one of them really is.
+the registered frames' baselines is 1 until a known length says how long one of them really is.
 """
 
 import math
@@ -16,10 +16,23 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
-from sl_nerfstudio.registration.agreement import Tolerance, agreement_at
-from sl_nerfstudio.registration.assembly import Assembly, Component, Nodes, PoseGraphSolution, node_at
+from sl_nerfstudio.registration.agreement import AGREES, PENALTY, agreement_at
+from sl_nerfstudio.registration.assembly import (
+    INNER_MISFIT_FACTOR,
+    Assembly,
+    Component,
+    PoseGraphSolution,
+    see_same_side,
+)
 from sl_nerfstudio.registration.pairs import (
+    ANYWHERE,
+    KERNEL_SIGMAS,
+    LEAST_FITNESS,
+    LEAST_OVERLAP,
+    NEIGHBOURS,
+    SAME_ROTATION_DEG,
     PairMatch,
+    Search,
     is_accepted,
     is_ambiguous,
     quality,
@@ -40,16 +53,102 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
-from sl_nerfstudio.registration.settings import REGISTRATION_DEFAULTS, EdgeSettings, RegistrationSettings
 from sl_nerfstudio.registration.surfaces import FrameCloud, SurfaceMap, build_surface_map
 from sl_nerfstudio.registration.symmetry import (
+    DIFFERENT_SIDES_DEG,
+    SEQUENCE_GAPS,
     chain_of_small_steps,
     sides_are_open,
     symmetric_turns_deg,
     turn_blocks_back,
     typical_step_deg,
 )
-from sl_nerfstudio.registration.view_graph import ViewGraph, split_by_slip, starting_similarities, with_common_centre
+from sl_nerfstudio.registration.view_graph import ViewGraph, starting_similarities, with_common_centre
+
+ROUNDS = 2  # of closing cycles
+LEAST_JOINED = 0.5  # share of successive frames that must be joined for their order to be that of capture
+LEAST_FRAME_FITNESS = 0.55  # share of a frame's points, of those that other frames can judge, which must agree
+MOST_DOUBTFUL = 0.25  # share of the frames most of whose pairs contradict the pose found; more: the pairs are to blame
+LARGEST_SIGMA_ROTATION_DEG = 3.0  # standard deviation of the least known rotation beyond which it is uncertain
+UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservable: of all angles from -180 to 180
+REACH = 2  # frames before and after one with which each pose of its projector is compared
+RIVAL = 0.8  # support of another pose, relative to the best, from which the choice is not certain
+
+
+@one_library_thread()
+def register(
+    clouds: Sequence[FrameCloud],
+    sequence: bool = True,
+    seed: int = 0,
+    start: Float64[ndarray, "n 4 4"] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Registration:
+    """Camera poses of all frames in one world; alternatives of the clouds are not considered.
+
+    Args:
+        clouds: the frames, in the order of capture if `sequence`.
+        sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
+        seed: of the choice of points.
+        start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
+        progress: called with a few words at the beginning of each stage.
+    """
+    report = progress or (lambda _: None)
+    n = len(clouds)
+    maps = tracked([partial(build_surface_map, c) for c in clouds], "averaging surfaces")
+    rough = {} if start is None else starting_similarities(start, maps)
+    centred = with_common_centre(rough, maps)
+    graph = ViewGraph(maps, centred, np.random.default_rng(seed))
+    report("registering pairs")
+    if start is not None:
+        graph.try_overlapping(rough)
+        graph.try_overlapping(centred)
+    ordered = sequence
+    if start is None and sequence:
+        for gap in SEQUENCE_GAPS:
+            graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
+        ordered = _in_order(graph.assemble(), n)
+    if start is None and not ordered:
+        report("comparing all frames")
+        graph = ViewGraph(maps, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
+        graph.try_all()
+    for _ in range(ROUNDS):
+        report("closing loops")
+        components = graph.assemble()
+        for component in (c for c in components if len(c) > 1):
+            graph.try_overlapping(graph.solve(component).S_world_camera)
+        graph.bridge(components)
+    turn_blocks_back(graph)
+    names = tuple(c.name for c in clouds)
+    found = accept_frames(names, graph, ordered)
+    most_are_lost = found.registered.sum() <= n / 2
+    if start is None and sequence and (found.turns_deg or most_are_lost):
+        return _by_order(names, graph) or found
+    return found
+
+
+def _by_order(names: tuple[str, ...], graph: ViewGraph) -> Registration | None:
+    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
+
+    `graph` is without it: frames are at other sides than they show, or most could not be placed.
+    """
+    step_deg = typical_step_deg(graph.matches)
+    if step_deg is None or not sides_are_open(graph.said):
+        return None
+    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng)
+    near = ViewGraph(graph.maps, {}, graph.rng)
+    near.try_overlapping(chain, DIFFERENT_SIDES_DEG)
+    for _ in range(ROUNDS):
+        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, DIFFERENT_SIDES_DEG)
+    placed = accept_frames(names, near, True, graph.said)
+    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
+
+
+def _in_order(components: Sequence[Component], n: int) -> bool:
+    """Whether successive frames mostly are in the same component."""
+    number = {k: c for c, frames in enumerate(components) for k in frames}
+    joined = sum(number[k] == number[k + 1] for k in range(n - 1))
+    return joined >= LEAST_JOINED * (n - 1)
+
 
 # Which frames are registered in the end, why the others are not, and what is uncertain.
 
@@ -61,22 +160,24 @@ def accept_frames(
 
     `others`: pairs that are not in the graph, and may say that the surface looks the same after a turn.
     """
-    components, settings = graph.assemble(), graph.settings
+    components = graph.assemble()
     edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
     component = _numbers(components, len(names))
     solution = graph.solve(components[0])
     connected = component == 0
-    rngs = graph.rng.spawn(len(names))
-    fitness = np.array(
-        results([partial(_fitness_of, k, solution, connected, graph, rng) for k, rng in enumerate(rngs)])
-    )
-    agrees = connected & (fitness >= settings.acceptance.least_fitness)
-    doubts = _doubtful(names, agrees, edges, solution.consistent, settings.edge)
-    few = len(doubts) <= settings.acceptance.most_doubtful * agrees.sum()
+    tasks = [
+        partial(_fitness_of, k, solution, connected, graph, own) for k, own in enumerate(graph.rng.spawn(len(names)))
+    ]
+    fitness = np.array(results(tasks))
+    agrees = connected & (fitness >= LEAST_FRAME_FITNESS)
+    doubts = _doubtful(names, agrees, edges, solution.consistent)
+    few = len(doubts) <= MOST_DOUBTFUL * agrees.sum()
     registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
+    index: list[int] = np.flatnonzero(registered).tolist()
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
+    sigma = {k: _least_sigma_deg([e for e in consistent if k in (e.source, e.target)]) for k in index}
     return Registration(
         names,
         poses,
@@ -87,7 +188,7 @@ def accept_frames(
         tuple(
             Edge(
                 (names[e.source], names[e.target]), e.S_target_source.R, e.overlap, e.fitness, bool(used),
-                is_ambiguous(e, settings.edge), e.rotation_sigma_deg, e.by_tone,
+                is_ambiguous(e), e.rotation_sigma_deg, e.by_tone,
             )
             for e, used in zip(edges, solution.consistent, strict=True)
         ),
@@ -99,26 +200,22 @@ def accept_frames(
             else _exclusion(k, names, components, main, graph)
             for k in np.flatnonzero(~registered).tolist()
         ),
-        tuple(_uncertainties(names, consistent, registered, graph)),
+        tuple(UncertainRotation(names[k], sigma[k]) for k in index if sigma[k] > LARGEST_SIGMA_ROTATION_DEG),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(graph.sides, edges, solution, settings, [*others, *graph.put_aside]),
+        symmetric_turns_deg(graph.sides, edges, solution, [*others, *graph.put_aside]),
         ordered,
     )  # fmt: skip
 
 
 def _doubtful(
-    names: Sequence[str],
-    inside: Bool[ndarray, "n"],
-    edges: Sequence[PairMatch],
-    consistent: Bool[ndarray, "edges"],
-    settings: EdgeSettings,
+    names: Sequence[str], inside: Bool[ndarray, "n"], edges: Sequence[PairMatch], consistent: Bool[ndarray, "edges"]
 ) -> dict[int, PairsContradict]:
     """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
     found = {}
     frames: list[int] = np.flatnonzero(inside).tolist()
     for k in frames:
         mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
-        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e, settings)]
+        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e)]
         against = [e for e, used in mine if not used]
         if math.fsum(map(support, against)) > math.fsum(support(e) for e, used in mine if used):
             found[k] = PairsContradict(names[k], len(mine), len(against))
@@ -143,24 +240,21 @@ def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
 def _fitness_of(
     k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
 ) -> float:
-    """Of a frame's points that other frames can judge, the share that agrees."""
-    S, settings = solution.S_world_camera[k], graph.settings.pair
-    if S is None or not connected[k]:
+    """Share of a frame's points that agrees, of those that other frames can judge."""
+    if not connected[k]:
         return 0.0
-    agreeing = expected = 0.0
-    for j in np.flatnonzero(connected).tolist():
-        other = solution.S_world_camera[j]
-        if j == k or other is None or not graph.see_same_side(S, other):
+    S, agreeing, expected = solution.S_world_camera[k], 0.0, 0.0
+    for j, other in solution.S_world_camera.items():
+        if j == k or not see_same_side(S, other):
             continue
-        maps = graph.maps[k], graph.maps[j]
-        found = agreement_at(maps, other.inverse() @ S, rng, Tolerance(0.0, settings.tolerance_sigmas), settings)
+        found = agreement_at((graph.maps[k], graph.maps[j]), other.inverse() @ S, rng, AGREES)
         agreeing += found.agreeing[0]
         expected += found.expected[0]
     return agreeing / expected if expected else 0.0
 
 
 def _in_first_camera(
-    nodes: Nodes, registered: Bool[ndarray, "n"]
+    nodes: Component, registered: Bool[ndarray, "n"]
 ) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n"]]:
     """Camera poses and baselines in the axes of the first registered camera, geometric mean of the baselines one."""
     n = len(registered)
@@ -168,7 +262,7 @@ def _in_first_camera(
     frames: list[int] = np.flatnonzero(registered).tolist()
     if not frames:
         return poses, baseline
-    world = [node_at(nodes, k) for k in frames]
+    world = [nodes[k] for k in frames]
     unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
     gauge = Similarity.scaling(1 / unit) @ Similarity(1.0, world[0].R, world[0].t).inverse()
     for k, S in zip(frames, (gauge @ S for S in world), strict=True):
@@ -182,48 +276,36 @@ def _exclusion(
     k: int, names: Sequence[str], components: Sequence[Component], main: Component, graph: ViewGraph
 ) -> Exclusion:
     """Why a frame is not in the largest component."""
-    settings = graph.settings.edge
     mine = [e for e in graph.matches if k in (e.source, e.target)]
     if not mine:
         return NoCommonSurface(names[k])
-    best = max(mine, key=lambda e: quality(e, settings))
-    if not is_accepted(best, settings):
+    best = max(mine, key=lambda e: quality(e))
+    if not is_accepted(best):
         partner = names[best.other(k)]
-        return PoorPair(names[k], partner, best.overlap, best.fitness, settings.least_overlap, settings.least_fitness)
+        return PoorPair(names[k], partner, best.overlap, best.fitness, LEAST_OVERLAP, LEAST_FITNESS)
     component = next(c for c in components if k in c)
     across = [
         (e, e.source if e.source in main else e.target)
         for e in graph.matches
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
-    partner = names[max(across, key=lambda pair: quality(pair[0], settings))[1]] if across else None
+    partner = names[max(across, key=lambda pair: quality(pair[0]))[1]] if across else None
     # where no two frames could be joined, every pair of the frame might have joined it
-    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e, settings)]
+    joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e)]
     slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
     return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 
 
-def _uncertainties(
-    names: Sequence[str], consistent: Sequence[PairMatch], registered: Bool[ndarray, "n"], graph: ViewGraph
-) -> list[UncertainRotation]:
-    """Registered frames that no pair determines well."""
-    out: list[UncertainRotation] = []
-    frames: list[int] = np.flatnonzero(registered).tolist()
-    for k in frames:
-        mine = [e for e in consistent if k in (e.source, e.target)]
-        sigma_deg = min((e.rotation_sigma_deg for e in mine), default=0.0)
-        if mine and all(e.slip_deg > 0 for e in mine):
-            out.append(UncertainRotation(names[k], graph.settings.acceptance.unknown_sigma_rotation_deg))
-        elif sigma_deg > graph.settings.acceptance.largest_sigma_rotation_deg:
-            out.append(UncertainRotation(names[k], sigma_deg))
-    return out
+def _least_sigma_deg(pairs: Sequence[PairMatch]) -> float:
+    """Standard deviation of a frame's least known rotation by its best pair; 0 without pairs."""
+    if pairs and all(e.slip_deg > 0 for e in pairs):
+        return UNKNOWN_SIGMA_ROTATION_DEG
+    return min((e.rotation_sigma_deg for e in pairs), default=0.0)
 
 
-# Frames that were left out are placed against the others once those are adjusted.
-#
-# Before the joint adjustment every surface is bent by the errors of its own relative pose, and only as certain as
-# that.
-# Afterwards a weak frame has to agree with surfaces that are known far better.
+# Frames that were left out are placed against the others once those are adjusted. Before the joint adjustment every
+# surface is bent by the errors of its own relative pose; afterwards a weak frame has to agree with surfaces that are
+# known far better.
 
 
 def with_relative_pose(
@@ -254,29 +336,23 @@ def include_left_out(
     adjusted: DevicePoses,
     left_out: Sequence[int],
     seed: int = 0,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
 ) -> Registration:
     """The registration, at the adjusted poses, with those of `left_out` that can now be placed by more than one pair.
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
-    n = len(clouds)
-    graph = ViewGraph(
-        [build_surface_map(c, settings.surface_map) for c in clouds], [None] * n, np.random.default_rng(seed), settings
-    )
+    graph = ViewGraph([build_surface_map(c) for c in clouds], {}, np.random.default_rng(seed))
     main: Component = {
         k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
         for k, T in enumerate(adjusted.T_world_camera)
         if registration.registered[k]
     }
-    search = settings.pair.anywhere
     for k in left_out:
-        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), search)
+        graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
     used = [e.fitness for e in registration.edges if e.used]
-    firm, slipping = split_by_slip(graph.edges, settings.pair.bounded_slip_deg)
+    firm, slipping = [e for e in graph.edges if e.holds], [e for e in graph.edges if not e.holds]
     # after the adjustment right frames fit as well as the others do
-    strict = replace(settings.assembly, misfit_factor=settings.assembly.inner_misfit_factor)
-    assembly = Assembly(graph.sides, graph.pivots, firm, replace(settings, assembly=strict), used or None, slipping)
+    assembly = Assembly(graph.sides, graph.pivots, firm, slipping, used or None, INNER_MISFIT_FACTOR)
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):
@@ -316,9 +392,7 @@ def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Comp
     return with_edges_at_poses(found, names)
 
 
-def with_edges_at_poses(
-    registration: Registration, frames: Collection[str], settings: RegistrationSettings = REGISTRATION_DEFAULTS
-) -> Registration:
+def with_edges_at_poses(registration: Registration, frames: Collection[str]) -> Registration:
     """The registration; pairs of `frames`, which stand elsewhere now, are used if they say the same rotation."""
     T = dict(zip(registration.names, registration.T_world_camera, strict=True))
 
@@ -326,182 +400,80 @@ def with_edges_at_poses(
         first, second = (T[name][:3, :3] for name in edge.frames)
         if not np.isfinite([first, second]).all():
             return False
-        limit_deg = settings.pair.same_rotation_deg + settings.pair.kernel_sigmas * edge.rotation_sigma_deg
+        limit_deg = SAME_ROTATION_DEG + KERNEL_SIGMAS * edge.rotation_sigma_deg
         return angle_deg(edge.R_second_first @ first.T @ second) <= limit_deg
 
     edges = (replace(e, used=says_the_same(e)) if set(e.frames) & set(frames) else e for e in registration.edges)
     return replace(registration, edges=tuple(edges))
 
 
-# Frames of which two poses of the projector explain the coordinates: which one, by what neighbouring frames saw.
-#
-# A wrong pose of the projector bends the surface of its frame, so it agrees less with those of other frames.
+# Frames of which two poses of the projector explain the coordinates: a wrong pose bends the surface of its frame, so it
+# agrees less with those of other frames.
 
 
 @dataclass(frozen=True)
 class ProjectorChoice:
-    """Which cloud of every frame, and the frames where the choice is not certain."""
+    """The chosen cloud of every frame, and the frames where the choice is not certain."""
 
     chosen: tuple[int, ...]  # for every frame 0, its own cloud, or the number of an alternative from 1
     undecided: tuple[UndecidedProjector, ...]
 
 
 def chosen_clouds(clouds: Sequence[FrameCloud], chosen: Sequence[int]) -> list[FrameCloud]:
-    """Of every frame the cloud that was chosen, without alternatives."""
+    """The chosen cloud of every frame, without alternatives."""
     return [replace((cloud, *cloud.alternatives)[k], alternatives=()) for cloud, k in zip(clouds, chosen, strict=True)]
 
 
 @one_library_thread()
-def choose_projectors(
-    clouds: Sequence[FrameCloud],
-    sequence: bool = True,
-    seed: int = 0,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
-) -> ProjectorChoice:
-    """Of every frame the cloud that agrees best with those of its neighbours; the first where nothing tells."""
-    open_frames = [k for k, c in enumerate(clouds) if c.alternatives]
-    if not open_frames:
-        return ProjectorChoice((0,) * len(clouds), ())
-    search = _Choice(clouds, sequence, np.random.default_rng(seed), settings)
+def choose_projectors(clouds: Sequence[FrameCloud], sequence: bool = True, seed: int = 0) -> ProjectorChoice:
+    """Choose the cloud of every frame that agrees best with those of its neighbours; falls back to the first."""
+    choices = [(c, *c.alternatives) for c in clouds]
     chosen, undecided = [0] * len(clouds), []
+    open_frames = [k for k, every in enumerate(choices) if len(every) > 1]
+    built = iter(results([partial(build_surface_map, c) for every in choices for c in every]) if open_frames else [])
+    maps = [[next(built) for _ in every] for every in choices] if open_frames else []
+    rng = np.random.default_rng(seed)
     for k in track(open_frames, "comparing poses of projectors"):
-        support = search.support(k)
-        best = int(np.argmax(support))
-        chosen[k] = best
-        rivals = [h for h in range(len(support)) if h != best and support[h] >= settings.choice.rival * support[best]]
+        scores = _support_of_choices(k, maps, sequence, rng)
+        best = chosen[k] = int(np.argmax(scores))
+        rivals = [h for h, score in enumerate(scores) if h != best and score >= RIVAL * scores[best]]
         if rivals:
-            angle = max(_angle_deg(search.choices[k][best], search.choices[k][h]) for h in rivals)
-            undecided.append(UndecidedProjector(clouds[k].name, angle))
+            R = [c.pose.T_camera_projector[:3, :3] for c in choices[k]]
+            undecided.append(UndecidedProjector(clouds[k].name, max(angle_deg(R[best] @ R[h].T) for h in rivals)))
     return ProjectorChoice(tuple(chosen), tuple(undecided))
 
 
-class _Choice:
-    """All clouds of all frames, and how well pairs of them agree."""
-
-    def __init__(
-        self, clouds: Sequence[FrameCloud], sequence: bool, rng: np.random.Generator, settings: RegistrationSettings
-    ) -> None:
-        self.choices = [(c, *c.alternatives) for c in clouds]
-        maps = iter(
-            results([partial(build_surface_map, c, settings.surface_map) for all_ in self.choices for c in all_])
-        )
-        self._maps = [[next(maps) for _ in choice] for choice in self.choices]
-        self._sequence, self._rng, self._settings = sequence, rng, settings
-
-    def support(self, k: int) -> list[float]:
-        """For every cloud of a frame the sum of what agrees with its neighbours, less what contradicts."""
-        partners = self._partners(k)
-        pairs = [(m, j) for m in self._maps[k] for j in partners]
-        tasks = [
-            partial(self._agreement, *pair, rng) for pair, rng in zip(pairs, self._rng.spawn(len(pairs)), strict=True)
-        ]
-        return np.reshape(results(tasks), (len(self._maps[k]), -1)).sum(1).tolist()
-
-    def _partners(self, k: int) -> list[int]:
-        """Frames taken shortly before and after; of an unordered set those that look most alike."""
-        s, n = self._settings.choice, len(self.choices)
-        if self._sequence:
-            return [j for j in range(max(0, k - s.reach), min(n, k + s.reach + 1)) if j != k]
-        search = self._settings.pair.anywhere
-        others = [j for j in range(n) if j != k]
-        tasks = [
-            partial(search_score, (self._maps[k][0], self._maps[j][0]), search, rng, self._settings.pair)
-            for j, rng in zip(others, self._rng.spawn(len(others)), strict=True)
-        ]
-        return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * s.reach]]
-
-    def _agreement(self, own: SurfaceMap, partner: int, rng: np.random.Generator) -> float:
-        pair = self._settings.pair
-        search = pair.neighbours if self._sequence else pair.anywhere
-        best = 0.0
-        for other in self._maps[partner]:
-            match = register_pair((own, other), (0, 1), search, rng, None, pair)
-            if match is not None and is_accepted(match, self._settings.edge):
-                contradicting = match.overlap * (1 / match.fitness - 1)
-                best = max(best, match.overlap - pair.agreement.penalty * contradicting)
-        return best
+def _support_of_choices(
+    k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator
+) -> list[float]:
+    """Sum up, for every cloud of a frame, what agrees with its neighbours, less what contradicts."""
+    partners = _partners(k, maps, sequence, rng)
+    pairs = [(own, maps[j]) for own in maps[k] for j in partners]
+    search = NEIGHBOURS if sequence else ANYWHERE
+    tasks = [
+        partial(_best_agreement, *pair, search, own) for pair, own in zip(pairs, rng.spawn(len(pairs)), strict=True)
+    ]
+    return np.reshape(results(tasks), (len(maps[k]), -1)).sum(1).tolist()
 
 
-def _angle_deg(a: FrameCloud, b: FrameCloud) -> float:
-    R = a.pose.T_camera_projector[:3, :3] @ b.pose.T_camera_projector[:3, :3].T
-    return angle_deg(R)
+def _partners(k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator) -> list[int]:
+    """Frames taken shortly before and after; of an unordered set those that look most alike."""
+    n = len(maps)
+    if sequence:
+        return [j for j in range(max(0, k - REACH), min(n, k + REACH + 1)) if j != k]
+    others = [j for j in range(n) if j != k]
+    tasks = [
+        partial(search_score, (maps[k][0], maps[j][0]), ANYWHERE, own)
+        for j, own in zip(others, rng.spawn(len(others)), strict=True)
+    ]
+    return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * REACH]]
 
 
-@one_library_thread()
-def register(
-    clouds: Sequence[FrameCloud],
-    sequence: bool = True,
-    seed: int = 0,
-    start: Float64[ndarray, "n 4 4"] | None = None,
-    progress: Callable[[str], None] | None = None,
-    settings: RegistrationSettings = REGISTRATION_DEFAULTS,
-) -> Registration:
-    """Camera poses of all frames in one world; alternatives of the clouds are not considered.
-
-    Args:
-        clouds: the frames, in the order of capture if `sequence`.
-        sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
-        seed: of the choice of points.
-        start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
-        progress: called with a few words at the beginning of each stage.
-        settings: everything else.
-    """
-    report = progress or (lambda _: None)
-    n, selection = len(clouds), settings.selection
-    maps = tracked([partial(build_surface_map, c, settings.surface_map) for c in clouds], "averaging surfaces")
-    rough: list[Similarity | None] = [None] * n
-    if start is not None:
-        rough = starting_similarities(start, maps, settings.start)
-    centred = with_common_centre(rough, maps)
-    graph = ViewGraph(maps, centred, np.random.default_rng(seed), settings)
-    report("registering pairs")
-    if start is not None:
-        graph.try_overlapping(rough)
-        graph.try_overlapping(centred)
-    ordered = sequence
-    if start is None and sequence:
-        for gap in selection.sequence_gaps:
-            graph.try_pairs([(k, k + gap) for k in range(n - gap)], settings.pair.neighbours)
-        ordered = _in_order(graph.assemble(), n, selection.least_joined)
-    if start is None and not ordered:
-        report("comparing all frames")
-        graph = ViewGraph(maps, centred, np.random.default_rng(seed), settings)  # what chance neighbours say is no help
-        graph.try_all()
-    for _ in range(selection.rounds):
-        report("closing loops")
-        components = graph.assemble()
-        for component in (c for c in components if len(c) > 1):
-            graph.try_overlapping(graph.solve(component).S_world_camera)
-        graph.bridge(components)
-    turn_blocks_back(graph)
-    names = tuple(c.name for c in clouds)
-    found = accept_frames(names, graph, ordered)
-    most_are_lost = found.registered.sum() <= n / 2
-    if start is None and sequence and (found.turns_deg or most_are_lost):
-        return _by_order(names, graph, settings) or found
-    return found
-
-
-def _by_order(names: tuple[str, ...], graph: ViewGraph, settings: RegistrationSettings) -> Registration | None:
-    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
-
-    `graph` is without it: frames are at other sides than they show, or most could not be placed.
-    """
-    step_deg = typical_step_deg(graph.matches, settings)
-    if step_deg is None or not sides_are_open(graph.said, settings):
-        return None
-    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng, settings)
-    near = ViewGraph(graph.maps, [None] * len(names), graph.rng, settings)
-    within = settings.order.different_sides_deg
-    near.try_overlapping(chain, within)
-    for _ in range(settings.selection.rounds):
-        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, within)
-    placed = accept_frames(names, near, True, graph.said)
-    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
-
-
-def _in_order(components: Sequence[Component], n: int, least: float) -> bool:
-    """Whether successive frames mostly are in the same component."""
-    number = {k: c for c, frames in enumerate(components) for k in frames}
-    joined = sum(number[k] == number[k + 1] for k in range(n - 1))
-    return joined >= least * (n - 1)
+def _best_agreement(own: SurfaceMap, partner: Sequence[SurfaceMap], search: Search, rng: np.random.Generator) -> float:
+    best = 0.0
+    for other in partner:
+        match = register_pair((own, other), (0, 1), search, rng)
+        if match is not None and is_accepted(match):
+            contradicting = match.overlap * (1 / match.fitness - 1)
+            best = max(best, match.overlap - PENALTY * contradicting)
+    return best

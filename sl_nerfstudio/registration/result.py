@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.registration.settings import KNOWN_LENGTH_DEFAULTS, KnownLengthSettings
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.epipolar import directions
 from sl_nerfstudio.relative_pose.intrinsics import camera_depth
@@ -166,6 +165,8 @@ def without_undecided(registration: Registration, undecided: Sequence[UndecidedP
 
 # One known length sets the scale: the baseline of a frame, or the distance between two points picked in images.
 
+PICKING_RADIUS_PX = 3.0  # around a picked pixel, of whose depths the median is taken
+LEAST_METRES, MOST_METRES = 1e-9, 1e9  # of a known length: nothing that a camera sees is smaller
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 _NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
@@ -184,7 +185,7 @@ class KnownLength:
 
     @property
     def source(self) -> str:
-        """Where the scale of a scan comes from, in words."""
+        """Words for where the scale of a scan comes from."""
         if self.pixels:
             return "scale bar between frame {} and frame {}".format(*self.frames)
         return f"baseline of frame {self.frames[0]}"
@@ -209,9 +210,8 @@ def parse_known_length(text: str) -> KnownLength:
     if unit not in _METRES:
         raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
     metres = length * _METRES[unit]
-    limits = KNOWN_LENGTH_DEFAULTS
-    if not limits.least_metres <= metres <= limits.most_metres:
-        least, most = limits.least_metres / _METRES[unit], limits.most_metres / _METRES[unit]
+    if not LEAST_METRES <= metres <= MOST_METRES:
+        least, most = LEAST_METRES / _METRES[unit], MOST_METRES / _METRES[unit]
         problem = "above zero" if length <= 0 else f"between {least:g} and {most:g} {unit}"
         raise UserError(f'known length "{text}": a length must be {problem}')
     return KnownLength(metres, unit, frames, pixels)
@@ -223,7 +223,6 @@ def scale_to(
     clouds: Sequence[FrameCloud],
     T_world_camera: Float64[ndarray, "n 4 4"],
     T_world_projector: Float64[ndarray, "n 4 4"],
-    settings: KnownLengthSettings = KNOWN_LENGTH_DEFAULTS,
 ) -> float:
     """Factor by which all positions must be multiplied for the length to be true, in `unit` ("m", "cm", "mm", "um").
 
@@ -238,7 +237,7 @@ def scale_to(
             )
     if known.pixels:
         ends = [
-            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k], settings.picking_radius_px)
+            _point_at(clouds[k], pixel, T_world_camera[k], T_world_projector[k], PICKING_RADIUS_PX)
             for k, pixel in zip(index, known.pixels, strict=True)
         ]
         found = float(np.linalg.norm(ends[0] - ends[1]))

@@ -1,7 +1,8 @@
-"""All frames under a projector that stands still: cameras, then the projector, then everything together."""
+"""Placement of frames under a projector that stands still: cameras, then the projector, then everything together."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Literal
 
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
@@ -30,98 +32,110 @@ from sl_nerfstudio.relative_pose.unknown_projector import (
     values_of,
 )
 
-# Settings of the placement of cameras under a projector that stands still.
+# Squares of the pattern at whose centres all cameras are compared.
+CELL_PIXELS = 20.0  # camera pixels in a square, in the mean
+MOST_ALONG = 300  # squares along the longer side of the pattern
+FEWEST_IN_CELL = 6  # camera pixels from which a square is used
+ROUGHNESS_MEDIANS = 3.0  # distance of its pixels from a linear map, in medians of all, beyond which it lies at an edge
+LARGEST_LEVER = 4.0  # inverse share of pixels that determine the place of the centre: allowed extrapolation
+
+# Cameras one after the other.
+FEWEST_COMMON = 60  # squares that two cameras, or a camera and the known points, must have in common
+MOST_FIRST_PAIRS = 60  # pairs of cameras that are tried as the first
+OUTLIER_PX = 2.0  # distance within which a match is an inlier, camera pixels
+USABLE_ANGLE_DEG = 15.0  # between two cameras' rays, beyond which more is no gain for a first pair
+LEAST_ANGLE_DEG = 1.0  # between rays from which a point counts as known
+
+# The projector from points and their codes.
+FEWEST_POINTS = 20
+RESECTION_ROUNDS = 8  # of leaving out what does not fit
+OUTLIER_SIGMAS = 4.0  # standard deviations beyond which a point is left out
+LEAST_RELIEF = 1e-3  # extent of the points across their plane, as a share of that along it
+
+# Everything together.
+MOST_POINTS = 2500  # squares in the adjustment
+ITERATIONS = 40  # Levenberg-Marquardt steps
+STEPS_PER_WIDTH = 4  # of them with one width of the kernel
+FOLD_ITERATIONS = 5  # of them, with a part of the squares left out
+KERNEL_SIGMAS = 3.0  # width of the robust kernel, in standard deviations of the residuals
+NOISE_QUANTILE = 0.8  # of the residuals whose size tells the noise: imperfect lenses make half too few
+NOISE_FLOOR_PX = 1e-4  # noise that is assumed at least
+PARTS_ALONG = 8  # parts along the longer side of the pattern within which errors may depend on each other
+CONVERGED = 1e-6  # share of the cost that a step must gain for the search to go on
+STANDARD_ERRORS = 2.0  # by which left-out squares must agree better for another free parameter
+FOLDS = 4  # parts that are left out in turn
+DEPENDENCE = 2.0  # factor on the stated sigma: neighbouring squares share errors of decoding and of the lens
+LARGEST_SIGMA = 0.08  # of the focal length, as a share, beyond which there is no result
+DOUBTFUL_SIGMA = 0.02  # the same beyond which the result is doubtful
+LARGEST_NOISE_SHARE = 0.005  # of the pattern's width, beyond which no single projector explains what the cameras see
+DIFFERENCE_STEP = 1e-6  # change of the intrinsics for derivatives
+
+Fault = Literal["no pair", "no projector", "uncertain"]
 
 
 @dataclass(frozen=True)
-class CellSettings:
-    """Squares of the pattern at whose centres all cameras are compared."""
+class StaticPlacement:
+    """Poses in one world; the baseline of the first two cameras' pair is about one."""
 
-    pixels: float = 20.0
-    """camera pixels in a square, in the mean"""
-    most_along: int = 300
-    """squares along the longer side of the pattern, at most"""
-    fewest: int = 6
-    """camera pixels from which a square is used"""
-    roughness_medians: float = 3.0
-    """distance of a square's pixels from a linear map, in medians of all squares, beyond which it lies at an edge"""
-    largest_lever: float = 4.0
-    """inverse share of pixels that determine the place of the centre: how far it may lie beside the pixels"""
+    T_world_camera: Float64[ndarray, "frames 4 4"]  # NaN where a camera could not be placed
+    projector: Device
+    T_world_projector: Float64[ndarray, "4 4"]
+    covariance: Float64[ndarray, "5 5"]  # of its intrinsics, see `values_of`; zero where not free
+    noise_px: float  # robust standard deviation of one coordinate, pixels of all devices
 
 
 @dataclass(frozen=True)
-class ChainSettings:
-    """Cameras placed one after the other."""
+class NoPlacement:
+    """What could not be found."""
 
-    fewest: int = 60
-    """squares that two cameras, or a camera and the known points, must have in common"""
-    pairs: int = 60
-    """pairs of cameras that are tried as the first, at most"""
-    outlier_px: float = 2.0
-    """distance within which a match is an inlier, camera pixels"""
-    usable_angle_deg: float = 15.0
-    """angle between two cameras' rays beyond which more is no gain for a first pair"""
-    least_angle_deg: float = 1.0
-    """angle between rays from which a point counts as known"""
+    fault: Fault
+    common: int  # squares that the best two cameras have in common
+    sigma_focal: float = np.inf  # share of the focal length
 
 
-@dataclass(frozen=True)
-class ResectionSettings:
-    """The projector from points and their codes."""
+@one_library_thread()
+def place_under_static_projector(
+    coords: Sequence[Float32[ndarray, "_ _ 2"]], cameras: Sequence[Device], projector: Device, known: bool, stated: bool
+) -> StaticPlacement | NoPlacement:
+    """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
 
-    fewest: int = 20
-    """points, at least"""
-    rounds: int = 8
-    """of leaving out what does not fit"""
-    outlier_sigmas: float = 4.0
-    """standard deviations beyond which a point is left out"""
-    least_relief: float = 1e-3
-    """extent of the points across their plane, as a share of that along it"""
+    `stated`: the projector is at least a start for them.
+    """
+    cells = find_cells(coords, projector)
+    rays = np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
+    common = np.isfinite(rays[..., 0]).astype(np.float64)
+    most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
+    start = first_pair(rays, cameras)
+    if start is None:
+        return NoPlacement("no pair", most)
+    a, b, T_a_b = start
+    T = np.full((len(cameras), 4, 4), np.nan)
+    T[a], T[b] = np.eye(4), T_a_b
+    T = _grown(T, rays, cells, cameras)
+    points = triangulated(rays, T)
+    firm = _spread(np.isfinite(points[:, 0]))
+    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated)
+    if found is None:
+        return NoPlacement("no projector", most)
+    device, T_projector = found
+    placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+    scene = StaticScene(
+        (*(cameras[k] for k in placed), device), np.concatenate([T[placed], T_projector[None]]), points[firm]
+    )
+    sightings = _sightings(cells.chosen(firm), placed, with_projector=True)
+    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE")
+    if adjusted.noise_px > LARGEST_NOISE_SHARE * projector.w:
+        return NoPlacement("no projector", most)
+    T[placed] = adjusted.scene.T_world_device[:-1]
+    covariance = np.zeros((5, 5))
+    covariance[np.ix_(free, free)] = DEPENDENCE**2 * adjusted.covariance
+    sigma = float(np.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]))
+    if sigma > LARGEST_SIGMA:
+        return NoPlacement("uncertain", most, sigma)
+    return StaticPlacement(
+        T, adjusted.scene.devices[-1], adjusted.scene.T_world_device[-1], covariance, adjusted.noise_px
+    )
 
-
-@dataclass(frozen=True)
-class StaticSettings:
-    """All settings."""
-
-    most_points: int = 2500
-    """squares in the bundle adjustment, at most"""
-    iterations: int = 40
-    """Levenberg-Marquardt steps, at most"""
-    kernel_sigmas: float = 3.0
-    """width of the robust kernel, in standard deviations of the residuals"""
-    noise_quantile: float = 0.8
-    """share of the residuals whose size tells the noise: with lenses modelled less than perfectly, half is too few"""
-    parts_along: int = 8
-    """parts along the longer side of the pattern within which errors may depend on each other"""
-    noise_floor_px: float = 1e-4
-    """noise that is assumed at least, pixels"""
-    converged: float = 1e-6
-    """share of the cost that a step must gain for the search to go on"""
-    standard_errors: float = 2.0
-    """standard errors by which left-out squares must agree better for another free parameter"""
-    folds: int = 4
-    """parts that are left out in turn"""
-    dependence: float = 2.0
-    """factor on the stated sigma: neighbouring squares share errors of decoding and of the lens"""
-    largest_sigma: float = 0.08
-    """standard deviation of the focal length, as a share, beyond which there is no result"""
-    largest_noise_share: float = 0.005
-    """noise, as a share of the pattern's width, beyond which no single projector explains what the cameras see"""
-    doubtful_sigma: float = 0.02
-    """the same beyond which the result is doubtful"""
-    prior: IntrinsicsPrior = field(default_factory=IntrinsicsPrior)
-    """what is known of any projector"""
-    cells: CellSettings = field(default_factory=CellSettings)
-    """squares"""
-    chain: ChainSettings = field(default_factory=ChainSettings)
-    """placement of the cameras"""
-    resection: ResectionSettings = field(default_factory=ResectionSettings)
-    """the projector's first place"""
-    difference_step: float = 1e-6
-    """change of the intrinsics for derivatives"""
-
-
-STATIC_DEFAULTS = StaticSettings()
 
 # Where every camera sees the centres of small squares of the pattern: matches between all cameras at once.
 
@@ -133,38 +147,33 @@ class PatternCells:
     uv_projector: Float64[ndarray, "cells 2"]
     uv_camera: Float64[ndarray, "frames cells 2"]  # NaN where a camera does not see it
 
-    @property
-    def seen(self) -> Bool[ndarray, "frames cells"]:
-        """Which camera sees which square."""
-        return np.isfinite(self.uv_camera[..., 0])
-
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "cells"]) -> "PatternCells":
-        """Some of the squares."""
+        """Select squares."""
         return PatternCells(self.uv_projector[index], self.uv_camera[:, index])
 
 
-def find_cells(coords: Sequence[Float32[ndarray, "_ _ 2"]], projector: Device, settings: CellSettings) -> PatternCells:
+def find_cells(coords: Sequence[Float32[ndarray, "_ _ 2"]], projector: Device) -> PatternCells:
     """Squares of equal size; in each, a linear map from coordinates to pixels gives the place of the centre."""
     matches = [correspondences_of(uv) for uv in coords]
-    side = _side(matches, projector, settings)
+    side = _side(matches, projector)
     columns, rows = int(np.ceil(projector.w / side)), int(np.ceil(projector.h / side))
     number = np.arange(columns * rows)
     centres = (np.stack([number % columns, number // columns], -1) + 0.5) * side
-    seen = np.stack([_centres_seen(*match, centres, side, columns, rows, settings) for match in matches])
+    seen = np.stack([_centres_seen(*match, centres, side, columns, rows) for match in matches])
     used = np.isfinite(seen[..., 0]).sum(0) > 1
     return PatternCells(centres[used], seen[:, used])
 
 
-def _side(matches: Sequence[tuple[ndarray, ndarray]], projector: Device, settings: CellSettings) -> float:
+def _side(matches: Sequence[tuple[ndarray, ndarray]], projector: Device) -> float:
     """Side of the squares, so that they hold enough camera pixels in most frames."""
-    least = max(projector.w, projector.h) / settings.most_along
+    least = max(projector.w, projector.h) / MOST_ALONG
     density = []
     for _, uv in matches:
         if len(uv):
-            column, row = np.floor(uv / (4 * least)).astype(np.int64).clip(0, 4 * settings.most_along).T
-            squares = np.count_nonzero(np.bincount(row * (4 * settings.most_along + 1) + column))
+            column, row = np.floor(uv / (4 * least)).astype(np.int64).clip(0, 4 * MOST_ALONG).T
+            squares = np.count_nonzero(np.bincount(row * (4 * MOST_ALONG + 1) + column))
             density.append(len(uv) / (squares * 16 * least**2))
-    return max(least, float(np.sqrt(settings.pixels / np.median(density)))) if density else least
+    return max(least, float(np.sqrt(CELL_PIXELS / np.median(density)))) if density else least
 
 
 def _centres_seen(
@@ -174,7 +183,6 @@ def _centres_seen(
     side: float,
     columns: int,
     rows: int,
-    settings: CellSettings,
 ) -> Float64[ndarray, "cells 2"]:
     """Least squares in every square at once, from sums over its pixels."""
     column, row = np.floor(uv_projector / side).astype(np.int64).T
@@ -190,7 +198,7 @@ def _centres_seen(
     b = _sums(cell, basis[:, :, None] * from_middle[:, None, :], len(centres))
     squares = _sums(cell, from_middle**2, len(centres))
     out = np.full((len(centres), 2), np.nan)
-    good = (count >= settings.fewest) & (np.linalg.det(A) > 1e-6 * count.astype(float) ** 3)
+    good = (count >= FEWEST_IN_CELL) & (np.linalg.det(A) > 1e-6 * count.astype(float) ** 3)
     if not good.any():
         return out
     inverse = np.linalg.inv(A[good])
@@ -198,7 +206,7 @@ def _centres_seen(
     left = (squares[good] - (linear * b[good]).sum(1)).clip(0).sum(1) / (2 * count[good])
     rough = np.sqrt(left)
     lever = inverse[:, 0, 0] * count[good]  # 1 if the pixels lie around the centre, larger if they lie beside it
-    firm = (rough <= settings.roughness_medians * max(float(np.median(rough)), 1e-9)) & (lever < settings.largest_lever)
+    firm = (rough <= ROUGHNESS_MEDIANS * max(float(np.median(rough)), 1e-9)) & (lever < LARGEST_LEVER)
     index = np.flatnonzero(good)[firm]
     out[index] = middle[index] + linear[firm, 0]
     return out
@@ -212,14 +220,9 @@ def _sums(cell: Int64[ndarray, "n"], values: Float64[ndarray, "n *k"], cells: in
 
 
 # Cameras placed by the codes alone: two views first, then one camera after the other against the known points.
-#
-# Normalised coordinates are OpenCV's here (y down, looking along +z); poses are those of the devices (looking along
-# -z).
+# Normalised coordinates are OpenCV's here (y down, looking along +z); poses are those of the devices (along -z).
 
-
-def rays_of(cells: PatternCells, cameras: Sequence[Device]) -> Float64[ndarray, "frames cells 3"]:
-    """Unit rays in each camera's axes; NaN where it does not see the square."""
-    return np.stack([directions(camera, uv) for camera, uv in zip(cameras, cells.uv_camera, strict=True)])
+FLIP = np.diag([1.0, -1.0, -1.0])  # between the axes of OpenCV and those of the devices
 
 
 def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
@@ -230,38 +233,30 @@ def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
 def pose_from_opencv(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
     """T_world_device from OpenCV's R, t, which map points of the world to the device."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R.T @ _flip(), -R.T @ t
+    T[:3, :3], T[:3, 3] = R.T @ FLIP, -R.T @ t
     return T
 
 
-def _flip() -> Float64[ndarray, "3 3"]:
-    """Between the axes of OpenCV and those of the devices."""
-    return np.diag([1.0, -1.0, -1.0])
-
-
 def first_pair(
-    rays: Float64[ndarray, "frames cells 3"], cameras: Sequence[Device], settings: ChainSettings
+    rays: Float64[ndarray, "frames cells 3"], cameras: Sequence[Device]
 ) -> tuple[int, int, Float64[ndarray, "4 4"]] | None:
     """Two cameras with many matches and a large angle between them, and the pose of the second against the first."""
     seen = np.isfinite(rays[..., 0])
     common = seen.astype(np.float64) @ seen.T
-    pairs = [(a, b) for a, b in combinations(range(len(rays)), 2) if common[a, b] >= settings.fewest]
+    pairs = [(a, b) for a, b in combinations(range(len(rays)), 2) if common[a, b] >= FEWEST_COMMON]
     # spread over the whole set, not only neighbours, which share most and turn least
-    pairs = (
-        pairs
-        if len(pairs) <= settings.pairs
-        else [pairs[k] for k in np.linspace(0, len(pairs) - 1, settings.pairs).astype(int)]
-    )
+    if len(pairs) > MOST_FIRST_PAIRS:
+        pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, MOST_FIRST_PAIRS).astype(int)]
     best, best_score = None, 0.0
     for a, b in pairs:
         both = seen[a] & seen[b]
-        found = _two_views(rays[a, both], rays[b, both], settings.outlier_px / cameras[a].fl_x)
+        found = _two_views(rays[a, both], rays[b, both], OUTLIER_PX / cameras[a].fl_x)
         if found is None:
             continue
         T, good = found
         d_b = rays[b, both][good] @ T[:3, :3].T
         angle = np.degrees(np.arccos((rays[a, both][good] * d_b).sum(-1).clip(-1, 1)))
-        score = good.sum() * min(float(np.median(angle)), settings.usable_angle_deg)
+        score = good.sum() * min(float(np.median(angle)), USABLE_ANGLE_DEG)
         if score > best_score:
             best, best_score = (a, b, T), score
     return best
@@ -280,12 +275,12 @@ def _two_views(
         return None
     T = pose_from_opencv(R, t[:, 0])
     # the first camera's own axes are the world's: from OpenCV's to the device's
-    T[:3, :3], T[:3, 3] = _flip() @ T[:3, :3], _flip() @ T[:3, 3]
+    T[:3] = FLIP @ T[:3]
     return T, mask[:, 0] > 0
 
 
 def triangulated(
-    rays: Float64[ndarray, "frames cells 3"], T_world_camera: Float64[ndarray, "frames 4 4"], least_angle_deg: float
+    rays: Float64[ndarray, "frames cells 3"], T_world_camera: Float64[ndarray, "frames 4 4"]
 ) -> Float64[ndarray, "cells 3"]:
     """Points nearest to the rays of all placed cameras; NaN where their angle is too small, or they lie behind."""
     placed = np.isfinite(T_world_camera[:, 0, 0])
@@ -297,7 +292,7 @@ def triangulated(
     A, b = P.sum(0), np.einsum("fcij,fj->ci", P, o)
     # the smallest eigenvalue of the sum is the sum of squared sines of half the angles, to first order
     small = np.linalg.eigvalsh(A)[:, 0]
-    good = (seen.sum(0) > 1) & (small > 0.5 * np.sin(np.radians(least_angle_deg)) ** 2)
+    good = (seen.sum(0) > 1) & (small > 0.5 * np.sin(np.radians(LEAST_ANGLE_DEG)) ** 2)
     points = np.full((rays.shape[1], 3), np.nan)
     points[good] = np.linalg.solve(A[good], b[good][..., None])[..., 0]
     along = np.einsum("fci,fci->fc", d, points[None] - o[:, None])
@@ -307,17 +302,13 @@ def triangulated(
 
 
 def place_next(
-    k: int,
-    rays: Float64[ndarray, "cells 3"],
-    points: Float64[ndarray, "cells 3"],
-    camera: Device,
-    settings: ChainSettings,
+    rays: Float64[ndarray, "cells 3"], points: Float64[ndarray, "cells 3"], camera: Device
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a camera against known points (PnP with RANSAC); None where it has too few or no pose fits."""
     both = np.isfinite(rays[:, 0]) & np.isfinite(points[:, 0])
-    if both.sum() < settings.fewest:
+    if both.sum() < FEWEST_COMMON:
         return None
-    return posed(points[both], rays[both], 3 * settings.outlier_px / camera.fl_x, 0.5)
+    return posed(points[both], rays[both], 3 * OUTLIER_PX / camera.fl_x, 0.5)
 
 
 def posed(
@@ -340,26 +331,24 @@ def posed(
 
 
 def resect(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
-    settings: ResectionSettings = STATIC_DEFAULTS.resection,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Focal length, principal point (anywhere) and pose of a pinhole projector; its pixels count as square.
 
     None where the points lie in a plane, or no projector fits.
     """
     extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    if len(points) < settings.fewest or extent[2] < settings.least_relief * extent[1]:
+    if len(points) < FEWEST_POINTS or extent[2] < LEAST_RELIEF * extent[1]:
         return None
     keep = np.ones(len(points), dtype=bool)
     P = None
-    for _ in range(settings.rounds):
-        if keep.sum() < settings.fewest:
+    for _ in range(RESECTION_ROUNDS):
+        if keep.sum() < FEWEST_POINTS:
             return None
         P = _linear(points[keep], uv[keep])
-        error = np.linalg.norm(_seen(P, points) - uv, axis=1)
-        limit = settings.outlier_sigmas * MAD_TO_SIGMA * float(np.median(error))
+        x = points @ P[:, :3].T + P[:, 3]
+        error = np.linalg.norm(x[:, :2] / x[:, 2:] - uv, axis=1)
+        limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * float(np.median(error))
         again: Bool[ndarray, n] = error <= max(limit, 1e-9)
         if (again == keep).all():
             break
@@ -389,11 +378,6 @@ def _normalising(points: Float64[ndarray, "n d"]) -> Float64[ndarray, "e e"]:
     return T
 
 
-def _seen(P: Float64[ndarray, "3 4"], points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
-    x = points @ P[:, :3].T + P[:, 3]
-    return x[:, :2] / x[:, 2:]
-
-
 def _device_of(
     P: Float64[ndarray, "3 4"], points: Float64[ndarray, "n 3"], projector: Device
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
@@ -415,24 +399,20 @@ def _device_of(
 
 
 def place_known(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
-    settings: ResectionSettings = STATIC_DEFAULTS.resection,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device
 ) -> Float64[ndarray, "4 4"] | None:
     """Pose of a projector with known intrinsics; None where no pose fits most of the points."""
     d = directions(projector, uv)
     usable = np.isfinite(d[:, 0]) & (d[:, 2] < -1e-3)
-    if usable.sum() < 20:
+    if usable.sum() < FEWEST_POINTS:
         return None
     return posed(points[usable], d[usable], 6.0 / projector.fl_x, 0.3)
 
 
 # Bundle adjustment of cameras, one projector and points; points are eliminated (Schur complement).
 #
-# The projector is one more device, whose intrinsics may be free. Residuals are pixels of each device, divided by
-# the
-# noise of its kind. Increments: `T_world_device <- T_world_device exp(v, w)`.
+# The projector is one more device, whose intrinsics may be free. Residuals are pixels of each device, divided by the
+# noise of all. Increments: `T_world_device <- T_world_device exp(v, w)`, then the free intrinsics.
 
 
 @dataclass(frozen=True)
@@ -446,12 +426,16 @@ class StaticScene:
 
 @dataclass(frozen=True)
 class CellSightings:
-    """Where devices see points."""
+    """Pixels at which devices see points."""
 
     device: Int64[ndarray, "n"]
     point: Int64[ndarray, "n"]
     uv: Float64[ndarray, "n 2"]
     cameras: int  # devices from this number on are projectors
+
+    def chosen(self, rows: Bool[ndarray, "n"]) -> "CellSightings":
+        """Select sightings."""
+        return CellSightings(self.device[rows], self.point[rows], self.uv[rows], self.cameras)
 
 
 @dataclass(frozen=True)
@@ -464,60 +448,34 @@ class AdjustedScene:
 
 
 def adjust_scene(
-    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], settings: StaticSettings
+    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], iterations: int = ITERATIONS
 ) -> AdjustedScene:
-    """Levenberg-Marquardt from a start that is right to within a few pixels."""
-    damping, cost, width = 1e-4, np.inf, np.inf
-    prior = _Prior.of(scene.devices[-1], free, settings)
-    for _ in range(settings.iterations):
-        r = residuals(scene, sightings)
-        width = min(width, settings.kernel_sigmas * _noise(r, scene, settings))
-        cost = _cost(r, sightings, width, prior, scene)
-        equations = _equations(scene, sightings, r, width, free, prior)
-        for _ in range(8):
-            new = _stepped(scene, equations, damping, free)
-            new_cost = _cost(residuals(new, sightings), sightings, width, prior, new)
-            if new_cost <= cost:
-                damping = max(damping / 10, 1e-10)
-                break
-            damping *= 10
-        else:
+    """Levenberg-Marquardt from a start that is right to within a few pixels; the kernel narrows with the residuals."""
+    problem, width = _Adjustment(sightings, free, values_of(scene.devices[-1])), np.inf
+    while iterations > 0:
+        width = min(width, KERNEL_SIGMAS * _noise(residuals(scene, sightings), scene))
+        found = minimise(
+            scene,
+            partial(problem.equations, width=width),
+            problem.moved,
+            partial(problem.cost, width=width),
+            iterations=min(iterations, STEPS_PER_WIDTH),
+            tolerance=CONVERGED,
+        )
+        if not found.iterations:
             break
-        scene, gain = new, cost - new_cost
-        if gain <= settings.converged * cost:
-            break
-    r = residuals(scene, sightings)
-    noise = _noise(r, scene, settings)
-    equations = _equations(scene, sightings, r, settings.kernel_sigmas * noise, free, prior)
-    return AdjustedScene(scene, noise, _covariance(equations, sightings, scene, len(free), settings))
+        scene, iterations = found.state, iterations - found.iterations
+    noise = _noise(residuals(scene, sightings), scene)
+    return AdjustedScene(scene, noise, problem.covariance(scene, KERNEL_SIGMAS * noise))
 
 
-@dataclass(frozen=True)
-class _Prior:
-    mean: Float64[ndarray, "5"]
-    sigma: Float64[ndarray, "5"]
-    free: tuple[int, ...]
-    difference_step: float
-
-    @staticmethod
-    def of(projector: Device, free: tuple[int, ...], settings: StaticSettings) -> "_Prior":
-        return _Prior(values_of(projector), prior_sigma(settings.prior), free, settings.difference_step)
-
-    def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
-        index = list(self.free)
-        return (values_of(scene.devices[-1]) - self.mean)[index] / self.sigma[index]
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """Normal equations in units of the noise: devices and intrinsics, points, and what couples them."""
-
-    H: Float64[ndarray, "m m"]
-    g: Float64[ndarray, "m"]
-    points_H: Float64[ndarray, "points 3 3"]
-    points_g: Float64[ndarray, "points 3"]
-    gradients: Float64[ndarray, "m points"]  # what each point adds to g
-    coupling: Float64[ndarray, "m points*3"]
+def residuals(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 2"]:
+    """Pixels by which devices see the points elsewhere than they should; far off where a point is behind."""
+    p, out = _in_devices(scene, s), np.zeros((len(s.device), 2))
+    for intrinsics, rows in _intrinsics(scene, s):
+        uv, front = project(intrinsics, torch.from_numpy(p[rows]))
+        out[rows] = np.where(front.numpy()[:, None], uv.numpy() - s.uv[rows], 1e6)
+    return out
 
 
 def _in_devices(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 3"]:
@@ -525,10 +483,10 @@ def _in_devices(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 3"]
     return np.einsum("nji,nj->ni", T[:, :3, :3], scene.points[s.point] - T[:, :3, 3])
 
 
-def _intrinsics(devices: Sequence[Device], s: CellSightings) -> list[tuple[Intrinsics, ndarray]]:
-    """Devices that share intrinsics are projected together."""
+def _intrinsics(scene: StaticScene, s: CellSightings) -> list[tuple[Intrinsics, ndarray]]:
+    """Intrinsics, and the sightings of all devices that share them: these are projected together."""
     groups: dict[Device, list[int]] = {}
-    for k, device in enumerate(devices):
+    for k, device in enumerate(scene.devices):
         groups.setdefault(device, []).append(k)
     return [
         (Intrinsics.of(device, torch.float64), np.flatnonzero(np.isin(s.device, index)))
@@ -536,16 +494,7 @@ def _intrinsics(devices: Sequence[Device], s: CellSightings) -> list[tuple[Intri
     ]
 
 
-def residuals(scene: StaticScene, s: CellSightings) -> Float64[ndarray, "n 2"]:
-    """Pixels by which devices see the points elsewhere than they should; far off where a point is behind."""
-    p, out = _in_devices(scene, s), np.zeros((len(s.device), 2))
-    for intrinsics, rows in _intrinsics(scene.devices, s):
-        uv, front = project(intrinsics, torch.from_numpy(p[rows]))
-        out[rows] = np.where(front.numpy()[:, None], uv.numpy() - s.uv[rows], 1e6)
-    return out
-
-
-def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene, settings: StaticSettings) -> float:
+def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene) -> float:
     """Robust standard deviation of one coordinate, of all devices together.
 
     Apart, that of the cameras or that of the projector could fall to nothing, because three numbers of every point are
@@ -553,218 +502,131 @@ def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene, settings: StaticSetti
     """
     free = 3 * len(scene.points)
     lost = np.sqrt(r.size / max(r.size - free, 1))
-    size = float(np.quantile(np.abs(r), settings.noise_quantile))
-    return max(lost * size / float(norm.ppf((1 + settings.noise_quantile) / 2)), settings.noise_floor_px)
+    size = float(np.quantile(np.abs(r), NOISE_QUANTILE))
+    return max(lost * size / float(norm.ppf((1 + NOISE_QUANTILE) / 2)), NOISE_FLOOR_PX)
 
 
-def _cost(r: Float64[ndarray, "n 2"], s: CellSightings, width: float, prior: _Prior, scene: StaticScene) -> float:
-    data = 9 * float(geman_mcclure_cost((r**2).sum(-1) / width**2).sum())
-    return data + float((prior.departure(scene) ** 2).sum())
+@dataclass(frozen=True)
+class _Adjustment:
+    """The least-squares problem: which sightings, which intrinsics of the projector are free, and their prior."""
 
+    sightings: CellSightings
+    free: tuple[int, ...]
+    mean: Float64[ndarray, "5"]  # of the prior
 
-def _equations(
-    scene: StaticScene,
-    s: CellSightings,
-    r: Float64[ndarray, "n 2"],
-    width: float,
-    free: tuple[int, ...],
-    prior: _Prior,
-) -> _Equations:
-    p, n = _in_devices(scene, s), len(s.device)
-    by_p = np.zeros((n, 2, 3))
-    for intrinsics, rows in _intrinsics(scene.devices, s):
-        by_p[rows] = project_jacobian(intrinsics, torch.from_numpy(p[rows])).numpy()
-    x, y, z, o = *p.T, np.zeros(n)
-    hat = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(n, 3, 3)
-    by_pose = np.concatenate([-by_p, by_p @ hat], -1)
-    by_point = by_p @ scene.T_world_device[s.device, :3, :3].transpose(0, 2, 1)
-    w = geman_mcclure_weight((r**2).sum(-1) / width**2) / (width / 3) ** 2
-    D, C, m = len(scene.devices), len(scene.points), 6 * len(scene.devices) + len(free)
-    columns = np.broadcast_to(6 * s.device[:, None] + np.arange(6), (n, 6))
-    J = by_pose
-    if free:
-        by_free = np.zeros((n, 2, len(free)))
-        rows = np.flatnonzero(s.device == D - 1)
-        by_free[rows] = _by_intrinsics(scene.devices[-1], p[rows], free, prior.difference_step)
-        J = np.concatenate([J, by_free], -1)
-        columns = np.concatenate([columns, np.broadcast_to(6 * D + np.arange(len(free)), (n, len(free)))], 1)
-    H, gradients, coupling = np.zeros((m, m)), np.zeros((m, C)), np.zeros((m, 3 * C))
-    JtW = J.transpose(0, 2, 1) * w[:, None, None]
-    np.add.at(H, (columns[:, :, None], columns[:, None, :]), JtW @ J)
-    np.add.at(gradients, (columns, s.point[:, None]), (JtW @ r[..., None])[..., 0])
-    at = 3 * s.point[:, None] + np.arange(3)
-    np.add.at(coupling, (columns[:, :, None], at[:, None, :]), JtW @ by_point)
-    points_H, points_g = np.zeros((C, 3, 3)), np.zeros((C, 3))
-    PtW = by_point.transpose(0, 2, 1) * w[:, None, None]
-    np.add.at(points_H, s.point, PtW @ by_point)
-    np.add.at(points_g, s.point, (PtW @ r[..., None])[..., 0])
-    index, k = 6 * D + np.arange(len(free)), list(free)
-    H[index, index] += 1 / prior.sigma[k] ** 2
-    g = gradients.sum(1)
-    g[index] += prior.departure(scene) / prior.sigma[k]
-    return _Equations(H, g, points_H, points_g, gradients, coupling)
+    @property
+    def sigma(self) -> Float64[ndarray, "free"]:
+        """Standard deviations of the prior."""
+        return prior_sigma(IntrinsicsPrior())[list(self.free)]
 
+    def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
+        """Free intrinsics less their means."""
+        return (values_of(scene.devices[-1]) - self.mean)[list(self.free)]
 
-def _by_intrinsics(
-    projector: Device, p: Float64[ndarray, "n 3"], free: tuple[int, ...], step: float
-) -> Float64[ndarray, "n 2 free"]:
-    values, out = values_of(projector), []
-    for k in free:
-        ahead, behind = (
-            project(
-                Intrinsics.of(device_with(projector, values + sign * step * np.eye(len(values))[k]), torch.float64),
-                torch.from_numpy(p),
-            )[0].numpy()
-            for sign in (1, -1)
-        )
-        out.append((ahead - behind) / (2 * step))
-    return np.stack(out, -1)
+    def cost(self, scene: StaticScene, width: float) -> float:
+        """Half the robust cost in units of the noise, which is a third of the kernel's width, and that of the prior."""
+        r = residuals(scene, self.sightings)
+        data = 9 * float(geman_mcclure_cost((r**2).sum(-1) / width**2).sum())
+        return (data + float(((self.departure(scene) / self.sigma) ** 2).sum())) / 2
 
+    def moved(
+        self, scene: StaticScene, step: tuple[Float64[ndarray, "m"], Float64[ndarray, "points 3"]]
+    ) -> StaticScene:
+        """The scene after increments of the devices, the intrinsics and the points."""
+        devices, T, D = scene.devices, scene.T_world_device.copy(), len(scene.devices)
+        v, w = np.split(step[0][: 6 * D].reshape(D, 6), 2, axis=1)
+        T[:, :3, 3] += np.einsum("dij,dj->di", T[:, :3, :3], v)
+        T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(w).as_matrix()
+        if self.free:
+            values = values_of(devices[-1])
+            values[list(self.free)] += step[0][6 * D :].clip(-0.3, 0.3)
+            devices = (*devices[:-1], device_with(devices[-1], values))
+        return StaticScene(devices, T, scene.points + step[1])
 
-def _reduced(e: _Equations, damping: float) -> tuple[ndarray, ndarray, ndarray]:
-    """Equations of the devices with points eliminated, and the inverses of the points' blocks."""
-    blocks = (
-        e.points_H
-        + damping * e.points_H * np.eye(3)
-        + 1e-12 * np.eye(3) * e.points_H.trace(axis1=1, axis2=2)[:, None, None]
-    )
-    inverse = np.linalg.inv(np.where(blocks.any((1, 2))[:, None, None], blocks, np.eye(3)))
-    m = len(e.H)
-    by_point = e.coupling.reshape(m, -1, 3)
-    carried = np.einsum("mci,cij->mcj", by_point, inverse).reshape(m, -1)
-    S = e.H - carried @ e.coupling.T
-    return (S + S.T) / 2, e.g - carried @ e.points_g.reshape(-1), inverse
+    def equations(self, scene: StaticScene, width: float) -> BlockEquations:
+        """Normal equations in units of the noise: devices and intrinsics are shared, each point is a block."""
+        m, C = 6 * len(scene.devices) + len(self.free), len(scene.points)
+        H, g, coupling = np.zeros((m, m)), np.zeros(m), np.zeros((C, m, 3))
+        H_point, g_point = np.zeros((C, 3, 3)), np.zeros((C, 3))
+        for columns, point, r, J, weighted, by_point in self._linearised(scene, width):
+            H[np.ix_(columns, columns)] += weighted.reshape(-1, len(columns)).T @ J.reshape(-1, len(columns))
+            g[columns] += r.ravel() @ weighted.reshape(-1, len(columns))
+            # A device sees a point once.
+            coupling[point[:, None], columns] = weighted.transpose(0, 2, 1) @ by_point
+            weighted_point = self._weight(r, width)[:, None, None] * by_point.transpose(0, 2, 1)
+            H_point[point] += weighted_point @ by_point
+            g_point[point] += (weighted_point @ r[..., None])[..., 0]
+        index = np.arange(m - len(self.free), m)
+        H[index, index] += 1 / self.sigma**2
+        g[index] += self.departure(scene) / self.sigma**2
+        return BlockEquations(H, g, H_point, g_point, coupling)
 
+    def _linearised(self, scene: StaticScene, width: float) -> Iterator[tuple[ndarray, ...]]:
+        """For each device: columns of its unknowns, points, residuals, derivatives, these weighted, and by points."""
+        s, last = self.sightings, len(scene.devices) - 1
+        p, r, by_p = _in_devices(scene, s), residuals(scene, s), np.zeros((len(s.device), 2, 3))
+        for intrinsics, rows in _intrinsics(scene, s):
+            by_p[rows] = project_jacobian(intrinsics, torch.from_numpy(p[rows])).numpy()
+        x, y, z, o = *p.T, np.zeros(len(p))
+        hat = np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(-1, 3, 3)
+        by_device = np.concatenate([-by_p, by_p @ hat], -1)
+        by_point = by_p @ scene.T_world_device[s.device, :3, :3].transpose(0, 2, 1)
+        w = self._weight(r, width)[:, None, None]
+        for k in range(last + 1):
+            rows = np.flatnonzero(s.device == k)
+            columns, J = 6 * k + np.arange(6), by_device[rows]
+            if k == last and self.free:
+                columns = np.append(columns, 6 * last + 6 + np.arange(len(self.free)))
+                by_free = [_by_intrinsic(scene.devices[-1], p[rows], one) for one in self.free]
+                J = np.concatenate([J, np.stack(by_free, -1)], -1)
+            yield columns, s.point[rows], r[rows], J, w[rows] * J, by_point[rows]
 
-def _covariance(
-    e: _Equations, s: CellSightings, scene: StaticScene, free: int, settings: StaticSettings
-) -> Float64[ndarray, "free free"]:
-    """Of the projector's intrinsics, cluster-robust: errors of points in one part of the pattern may be shared.
+    @staticmethod
+    def _weight(r: Float64[ndarray, "n 2"], width: float) -> Float64[ndarray, "n"]:
+        return geman_mcclure_weight((r**2).sum(-1) / width**2) / (width / 3) ** 2
 
-    Lenses that are modelled slightly wrong, and edges that are decoded wrong, push neighbouring points the same way.
-    """
-    if not free:
-        return np.zeros((0, 0))
-    S, _, inverse = _reduced(e, 0.0)
-    m, C = len(S), len(scene.points)
-    H_inverse = np.linalg.pinv(S, rcond=1e-13, hermitian=True)
-    pull = np.einsum("mci,cij,cj->mc", e.coupling.reshape(m, C, 3), inverse, e.points_g)
-    part = _parts(s, scene, settings.parts_along)
-    scores = np.stack([np.bincount(part, row) for row in e.gradients - pull], 1)
-    n = len(scores)
-    meat = scores.T @ scores * (n / max(n - m, n / 4))
-    formal, robust = (matrix[m - free :, m - free :] for matrix in (H_inverse, H_inverse @ meat @ H_inverse))
-    growth = np.sqrt(np.maximum(np.diag(robust) / np.diag(formal), 1.0))
-    return growth[:, None] * formal * growth
+    def covariance(self, scene: StaticScene, width: float) -> Float64[ndarray, "free free"]:
+        """Covariance of the free intrinsics, cluster-robust: errors of points in one part of the pattern may be shared.
 
+        Lenses that are modelled slightly wrong, and edges that are decoded wrong, push neighbouring points the same
+        way.
+        """
+        free = len(self.free)
+        if not free:
+            return np.zeros((0, 0))
+        equations, part = self.equations(scene, width), self._parts(len(scene.points))
+        H_inverse = np.linalg.pinv(equations.reduced().H, rcond=1e-13, hermitian=True)
+        gradients = -(equations.coupling @ np.linalg.solve(equations.H_block, equations.g_block[..., None]))[..., 0]
+        for columns, point, r, _, weighted, _ in self._linearised(scene, width):
+            gradients[point[:, None], columns] += np.einsum("nki,nk->ni", weighted, r)
+        scores = np.stack([np.bincount(part, one) for one in gradients.T], 1)
+        n, m = scores.shape
+        meat = scores.T @ scores * (n / max(n - m, n / 4))
+        formal, robust = (matrix[m - free :, m - free :] for matrix in (H_inverse, H_inverse @ meat @ H_inverse))
+        growth = np.sqrt(np.maximum(np.diag(robust) / np.diag(formal), 1.0))
+        return growth[:, None] * formal * growth
 
-def _parts(s: CellSightings, scene: StaticScene, along: int) -> Int64[ndarray, "points"]:
-    """Number of the square part of the projector's image in which each point lies; one part without a projector."""
-    part = np.zeros(len(scene.points), dtype=np.int64)
-    beam = s.device >= s.cameras
-    uv = s.uv[beam]
-    if len(uv):
+    def _parts(self, points: int) -> Int64[ndarray, "points"]:
+        """Number of the square part of the projector's image in which each point lies."""
+        part, beam = np.zeros(points, dtype=np.int64), self.sightings.device >= self.sightings.cameras
+        uv = self.sightings.uv[beam]
         low, high = uv.min(0), uv.max(0)
-        cell = ((uv - low) / (high - low).max() * along).astype(np.int64).clip(0, along - 1)
-        part[s.point[beam]] = cell[:, 1] * along + cell[:, 0]
-    return part
+        cell = ((uv - low) / (high - low).max() * PARTS_ALONG).astype(np.int64).clip(0, PARTS_ALONG - 1)
+        part[self.sightings.point[beam]] = cell[:, 1] * PARTS_ALONG + cell[:, 0]
+        return part
 
 
-def _stepped(scene: StaticScene, e: _Equations, damping: float, free: tuple[int, ...]) -> StaticScene:
-    S, g, inverse = _reduced(e, damping)
-    S = S + damping * np.diag(np.diag(e.H)) + 1e-12 * np.trace(S) / len(S) * np.eye(len(S))
-    step = -np.linalg.solve(S, g)
-    D, C = len(scene.devices), len(scene.points)
-    pull = e.points_g + (e.coupling.T @ step).reshape(C, 3)
-    points = scene.points - np.einsum("cij,cj->ci", inverse, pull)
-    T = scene.T_world_device.copy()
-    v, w = step[: 6 * D].reshape(D, 6)[:, :3], step[: 6 * D].reshape(D, 6)[:, 3:]
-    T[:, :3, 3] += np.einsum("dij,dj->di", T[:, :3, :3], v)
-    T[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec(w).as_matrix()
-    devices = scene.devices
-    if free:
-        values = values_of(devices[-1])
-        values[list(free)] += step[6 * D :].clip(-0.3, 0.3)
-        devices = (*devices[:-1], device_with(devices[-1], values))
-    return replace(scene, devices=devices, T_world_device=T, points=points)
-
-
-Fault = Literal["no pair", "no projector", "uncertain"]
-_MODELS = (
-    (LOG_FOCAL, CX, CY),
-    (LOG_FOCAL, CX, CY, K1),
-    (LOG_FOCAL, LOG_ASPECT, CX, CY),
-    (LOG_FOCAL, LOG_ASPECT, CX, CY, K1),
-)
-
-
-@dataclass(frozen=True)
-class StaticPlacement:
-    """Poses in one world; the baseline of the first two cameras' pair is about one."""
-
-    T_world_camera: Float64[ndarray, "frames 4 4"]  # NaN where a camera could not be placed
-    projector: Device
-    T_world_projector: Float64[ndarray, "4 4"]
-    covariance: Float64[ndarray, "5 5"]  # of the projector's `parameters.NAMES`; zero where not free
-    noise_px: float  # robust standard deviation of one coordinate, pixels of all devices
-
-
-@dataclass(frozen=True)
-class NoPlacement:
-    """What could not be found."""
-
-    fault: Fault
-    common: int  # squares that the best two cameras have in common
-    sigma_focal: float = np.inf  # share of the focal length
-
-
-@one_library_thread()
-def place_under_static_projector(
-    coords: Sequence[Float32[ndarray, "_ _ 2"]],
-    cameras: Sequence[Device],
-    projector: Device,
-    known: bool,
-    stated: bool,
-    settings: StaticSettings = STATIC_DEFAULTS,
-) -> StaticPlacement | NoPlacement:
-    """Camera poses from the codes as matches; the projector's intrinsics too, unless they are `known`.
-
-    `stated`: the projector is at least a start for them.
-    """
-    cells = find_cells(coords, projector, settings.cells)
-    rays = rays_of(cells, cameras)
-    common = np.isfinite(rays[..., 0]).astype(np.float64)
-    most = int((common @ common.T - np.diag(common.sum(1))).max(initial=0)) if len(rays) > 1 else 0
-    start = first_pair(rays, cameras, settings.chain)
-    if start is None:
-        return NoPlacement("no pair", most)
-    a, b, T_a_b = start
-    T = np.full((len(cameras), 4, 4), np.nan)
-    T[a], T[b] = np.eye(4), T_a_b
-    T = _grown(T, rays, cells, cameras, settings)
-    points = triangulated(rays, T, settings.chain.least_angle_deg)
-    firm = _spread(np.isfinite(points[:, 0]), settings.most_points)
-    found = _projector(points[firm], cells.uv_projector[firm], projector, known, stated, settings)
-    if found is None:
-        return NoPlacement("no projector", most)
-    device, T_projector = found
-    placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    scene = StaticScene(
-        (*(cameras[k] for k in placed), device), np.concatenate([T[placed], T_projector[None]]), points[firm]
+def _by_intrinsic(projector: Device, p: Float64[ndarray, "n 3"], k: int) -> Float64[ndarray, "n 2"]:
+    """Derivative of the projector's pixels by one of its intrinsics."""
+    step = DIFFERENCE_STEP * np.eye(len(values_of(projector)))[k]
+    ahead, behind = (
+        project(Intrinsics.of(device_with(projector, values_of(projector) + x), torch.float64), torch.from_numpy(p))[0]
+        for x in (step, -step)
     )
-    sightings = _sightings(cells.chosen(firm), placed, with_projector=True)
-    adjusted, free = _best_model(scene, sightings, known, projector.model == "DOE", settings)
-    if adjusted.noise_px > settings.largest_noise_share * projector.w:
-        return NoPlacement("no projector", most)
-    T[placed] = adjusted.scene.T_world_device[:-1]
-    covariance = np.zeros((5, 5))
-    covariance[np.ix_(free, free)] = settings.dependence**2 * adjusted.covariance
-    sigma = float(np.sqrt(covariance[LOG_FOCAL, LOG_FOCAL]))
-    if sigma > settings.largest_sigma:
-        return NoPlacement("uncertain", most, sigma)
-    return StaticPlacement(
-        T, adjusted.scene.devices[-1], adjusted.scene.T_world_device[-1], covariance, adjusted.noise_px
-    )
+    return (ahead - behind).numpy() / (2 * DIFFERENCE_STEP)
+
+
+# The steps of the placement.
 
 
 def _grown(
@@ -772,21 +634,20 @@ def _grown(
     rays: Float64[ndarray, "frames cells 3"],
     cells: PatternCells,
     cameras: Sequence[Device],
-    settings: StaticSettings,
 ) -> Float64[ndarray, "frames 4 4"]:
     """Cameras added one by one, those that see most known points first; everything is adjusted as the set doubles."""
     T, failed, adjusted_with = T.copy(), set(), 0
     while True:
         placed = np.isfinite(T[:, 0, 0])
         if placed.sum() >= 2 * adjusted_with or placed.all():
-            T = _adjusted_cameras(T, rays, cells, cameras, settings)
+            T = _adjusted_cameras(T, rays, cells, cameras)
             adjusted_with = int(placed.sum())
-        points = triangulated(rays, T, settings.chain.least_angle_deg)
+        points = triangulated(rays, T)
         seen = (np.isfinite(rays[..., 0]) & np.isfinite(points[:, 0])).sum(1)
         left = sorted((int(k) for k in np.flatnonzero(~placed) if k not in failed), key=lambda k: -seen[k])
         if not left:
-            return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras, settings)
-        pose = place_next(left[0], rays[left[0]], points, cameras[left[0]], settings.chain)
+            return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras)
+        pose = place_next(rays[left[0]], points, cameras[left[0]])
         if pose is None:
             failed.add(left[0])
         else:
@@ -799,27 +660,26 @@ def _adjusted_cameras(
     rays: Float64[ndarray, "frames cells 3"],
     cells: PatternCells,
     cameras: Sequence[Device],
-    settings: StaticSettings,
 ) -> Float64[ndarray, "frames 4 4"]:
     """The placed cameras adjusted with the points that they see, without a projector."""
     placed = np.flatnonzero(np.isfinite(T[:, 0, 0]))
-    points = triangulated(rays, T, settings.chain.least_angle_deg)
-    firm = _spread(np.isfinite(points[:, 0]), settings.most_points)
+    points = triangulated(rays, T)
+    firm = _spread(np.isfinite(points[:, 0]))
     scene = StaticScene(tuple(cameras[k] for k in placed), T[placed], points[firm])
-    found = adjust_scene(scene, _sightings(cells.chosen(firm), placed, with_projector=False), (), settings).scene
+    found = adjust_scene(scene, _sightings(cells.chosen(firm), placed, with_projector=False), ()).scene
     T = T.copy()
     T[placed] = found.T_world_device
     return T
 
 
-def _spread(good: Bool[ndarray, "cells"], most: int) -> Int64[ndarray, "m"]:
-    """At most `most` of the good cells, evenly among them."""
+def _spread(good: Bool[ndarray, "cells"]) -> Int64[ndarray, "m"]:
+    """At most MOST_POINTS of the good cells, evenly among them."""
     index = np.flatnonzero(good)
-    return index if len(index) <= most else index[np.linspace(0, len(index) - 1, most).astype(np.int64)]
+    return index if len(index) <= MOST_POINTS else index[np.linspace(0, len(index) - 1, MOST_POINTS).astype(np.int64)]
 
 
 def _sightings(cells: PatternCells, placed: Int64[ndarray, "m"], *, with_projector: bool) -> CellSightings:
-    frame, cell = np.nonzero(cells.seen[placed])
+    frame, cell = np.nonzero(np.isfinite(cells.uv_camera[placed, :, 0]))
     uv = cells.uv_camera[placed][frame, cell]
     if with_projector:
         every = np.arange(len(cells.uv_projector))
@@ -829,44 +689,45 @@ def _sightings(cells: PatternCells, placed: Int64[ndarray, "m"], *, with_project
 
 
 def _projector(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"],
-    projector: Device,
-    known: bool,
-    stated: bool,
-    settings: StaticSettings,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"], projector: Device, known: bool, stated: bool
 ) -> tuple[Device, Float64[ndarray, "4 4"]] | None:
     """Intrinsics and pose to start from."""
-    if known or projector.model == "DOE":
-        T = place_known(points, uv, projector)
-        return None if T is None else (projector, T)
-    found = resect(points, uv, projector, settings.resection)
-    if found is None and stated:
+    fixed = known or projector.model == "DOE"
+    found = None if fixed else resect(points, uv, projector)
+    if found is None and (fixed or stated):
         T = place_known(points, uv, projector)
         return None if T is None else (projector, T)
     return found
 
 
+_MODELS = (
+    (LOG_FOCAL, CX, CY),
+    (LOG_FOCAL, CX, CY, K1),
+    (LOG_FOCAL, LOG_ASPECT, CX, CY),
+    (LOG_FOCAL, LOG_ASPECT, CX, CY, K1),
+)
+
+
 def _best_model(
-    scene: StaticScene, sightings: CellSightings, known: bool, doe: bool, settings: StaticSettings
+    scene: StaticScene, sightings: CellSightings, known: bool, doe: bool
 ) -> tuple[AdjustedScene, tuple[int, ...]]:
     """The smallest model that no larger one beats on left-out points by more than chance."""
     if known:
-        return adjust_scene(scene, sightings, (), settings), ()
+        return adjust_scene(scene, sightings, ()), ()
     models = _MODELS[:1] if doe else _MODELS
-    best = adjust_scene(scene, sightings, models[0], settings)
+    best = adjust_scene(scene, sightings, models[0])
     chosen, best_loss = models[0], None
     for model in models[1:]:
-        larger = adjust_scene(_restarted(best.scene, scene, model), sightings, model, settings)
+        larger = adjust_scene(_restarted(best.scene, scene, model), sightings, model)
         extra = [k for k in model if k not in models[0]]
-        away = np.abs(_further(larger.scene.devices[-1], extra) - _further(scene.devices[-1], extra))
+        away = np.abs(values_of(larger.scene.devices[-1]) - values_of(scene.devices[-1]))[extra]
         sigma = np.sqrt(np.diag(larger.covariance))[[model.index(k) for k in extra]]
-        if (away < settings.standard_errors * settings.dependence * sigma).any():
+        if (away < STANDARD_ERRORS * DEPENDENCE * sigma).any():
             continue  # what does not differ from its usual value by more than chance cannot help
-        base = _left_out(best.scene, sightings, chosen, settings) if best_loss is None else best_loss
-        loss = _left_out(larger.scene, sightings, model, settings)
+        base = _left_out(best.scene, sightings, chosen) if best_loss is None else best_loss
+        loss = _left_out(larger.scene, sightings, model)
         gain = base - loss
-        if gain.sum() > settings.standard_errors * np.sqrt((gain**2).sum()):
+        if gain.sum() > STANDARD_ERRORS * np.sqrt((gain**2).sum()):
             best, chosen, best_loss = larger, model, loss
     return best, chosen
 
@@ -878,33 +739,14 @@ def _restarted(found: StaticScene, start: StaticScene, free: tuple[int, ...]) ->
     return replace(found, devices=(*found.devices[:-1], device_with(start.devices[-1], values)))
 
 
-def _further(device: Device, names: Sequence[int]) -> Float64[ndarray, "m"]:
-    values = {LOG_ASPECT: np.log(device.fl_y / device.fl_x), K1: device.k1}
-    return np.array([values[k] for k in names])
-
-
-def _left_out(
-    scene: StaticScene, sightings: CellSightings, free: tuple[int, ...], settings: StaticSettings
-) -> Float64[ndarray, "points"]:
+def _left_out(scene: StaticScene, sightings: CellSightings, free: tuple[int, ...]) -> Float64[ndarray, "points"]:
     """Error of the projector's view of every point (capped), when its coordinate takes no part in the fit."""
     out = np.zeros(len(scene.points))
     projector = sightings.device == sightings.cameras
-    short = replace(settings, iterations=5)
-    for fold in range(settings.folds):
-        left = projector & (sightings.point % settings.folds == fold)
-        kept = CellSightings(sightings.device[~left], sightings.point[~left], sightings.uv[~left], sightings.cameras)
-        found = adjust_scene(scene, kept, free, short)
-        loss = view_error(found.scene, sightings, left, settings.kernel_sigmas * found.noise_px)
-        out[sightings.point[left]] = loss
+    for fold in range(FOLDS):
+        left = projector & (sightings.point % FOLDS == fold)
+        found = adjust_scene(scene, sightings.chosen(~left), free, FOLD_ITERATIONS)
+        r = residuals(found.scene, sightings.chosen(left))
+        width = KERNEL_SIGMAS * found.noise_px
+        out[sightings.point[left]] = geman_mcclure_cost((r**2).sum(-1) / width**2)
     return out
-
-
-def view_error(
-    scene: StaticScene, sightings: CellSightings, rows: Bool[ndarray, "n"], width: float
-) -> Float64[ndarray, "m"]:
-    """Robust cost of some sightings, 0 to 1."""
-    r = residuals(
-        scene, CellSightings(sightings.device[rows], sightings.point[rows], sightings.uv[rows], sightings.cameras)
-    )
-    x = (r**2).sum(-1) / width**2
-    return x / (1 + x)

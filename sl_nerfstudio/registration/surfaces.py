@@ -1,13 +1,12 @@
 """The surface of a frame as a small image of points and normals, in which points of other frames are looked up."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
@@ -15,17 +14,40 @@ from sl_nerfstudio.geometry.devices import MODELS, Device, Intrinsics, for_loops
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, nearest_distances, solve_plane
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.parallel import compiled_range
-from sl_nerfstudio.registration.settings import (
-    FRAME_CLOUD_DEFAULTS,
-    REGISTRATION_DEFAULTS,
-    EmptyPlaceSettings,
-    FrameCloudSettings,
-    SurfaceMapSettings,
-    ToneSettings,
-)
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, agreeing_coords
 from sl_nerfstudio.relative_pose.intrinsics import camera_depth_by_pose
+
+FEWEST_POINTS = 50  # that a frame must have
+
+# The lattice on which a frame's points are averaged.
+LARGEST_SIDE = 200  # map pixels along the longer side: registration needs no more, and poses are refined later
+HALF_WINDOW = 2  # map pixels on each side of the centre of a plane fit
+FEWEST_PIXELS = 8  # map pixels in a plane fit
+LARGEST_RELIEF = 0.03  # RMS departure from the plane, as a share of the depth, beyond which a window holds an edge
+LEAST_COSINE = 0.15  # between ray and normal, below which a surface is seen too obliquely
+LARGEST_SIGMA_RATIO = 4.0  # uncertainty of a point over the frame's median, beyond which it is left out
+LATTICE_ERROR = 0.25  # of a point that no averaging removes, map pixels
+ORIENTATIONS = 150  # directions that normals are sorted into, about 15 degrees apart
+
+# What other frames may see too.
+CENTRE_DEPTH = 0.4  # radii from the centroid of the visible points to about the centre of the object behind them
+MIDDLE = 0.15  # distance from the image's centre, as a share of its shorter side, where the object may be expected
+FEWEST_CENTRAL = 200  # map pixels in the middle; with fewer, the middle is larger
+NEAR_QUANTILE = 0.3  # of the depths in the middle at which the object is expected: a table may be behind it
+NEARNESS = 0.1  # share of that depth by which the object's centre lies behind its surface at most
+EMPTY_MARGIN = 0.02  # distance within which nothing of the pattern may be seen, as a share of the image's longer side
+PROJECTOR_SIDE = 100  # places along the longer side of the pattern at which it is known how far its light went
+
+# Tone: what of a frame's brightness belongs to its surface.
+TONE_WINDOW = 0.06  # sigma of the window in which brightness is compared, as a share of the map's longer side
+TONE_COSINE = 0.35  # of the normal with the ray of either device, below which it is seen or lit too obliquely
+# Angles of the normal to light, camera and the middle of both, between which brightness is linear: gloss is narrow.
+TONE_KNOTS_DEG = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 37.0, 45.0, 54.0, 63.0, 72.0, 81.0, 90.0)
+TONE_RIDGE = 1e-4  # weight of the squares of those functions, relative to one pixel's
+TONE_BORDER = 2  # map pixels along the border of what is known that have no tone
+TONE_FEWEST_PIXELS = 60  # of a connected part of the surface that has a tone
+TONE_LARGEST = 3.0  # in robust standard deviations of the frame's, beyond which it is cut off: a highlight
 
 # The surface of one frame in camera axes, in units of its own baseline, with the uncertainty of every point.
 
@@ -48,7 +70,7 @@ class FrameCloud:
     alternatives: tuple["FrameCloud", ...] = ()  # with other poses that explain the coordinates nearly as well
 
     def with_pose(self, projector: Device, pose: RelativePose) -> "FrameCloud":
-        """The same coordinates with another projector, or another pose of it. Raises as `frame_cloud` does."""
+        """Triangulate with another projector, or another pose of it. Raises as `frame_cloud` does."""
         return frame_cloud(self.name, self.coords, self.camera, projector, pose, light=self.light, seen=self.seen)
 
     @property
@@ -78,7 +100,6 @@ def frame_cloud(
     camera: Device,
     projector: Device,
     pose: RelativePose,
-    settings: FrameCloudSettings = FRAME_CLOUD_DEFAULTS,
     light: Float32[ndarray, "h w"] | None = None,
     seen: Bool[ndarray, "h w"] | None = None,
 ) -> FrameCloud:
@@ -91,9 +112,9 @@ def frame_cloud(
     """
     uv_camera, uv_projector = correspondences_of(coords)
     keep = pose.inliers
-    if keep.sum() < settings.fewest_points:
+    if keep.sum() < FEWEST_POINTS:
         raise RelativePoseError(
-            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {settings.fewest_points})\n"
+            f"{name}: only {keep.sum()} points agree with the projector's pose (at least {FEWEST_POINTS})\n"
             "    cause:  too little of the pattern was decoded\n"
             "    remedy: capture this view again"
         )
@@ -106,8 +127,12 @@ def frame_cloud(
         T,
         torch.from_numpy(uv_projector[keep]),
     )
-    # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
-    points = directions(camera, uv_camera[keep]) * found.depth_camera.numpy()[:, None]
+    d_camera, d_projector = directions(camera, uv_camera[keep]), directions(projector, uv_projector[keep])
+    # Changes of depth by one sigma of the pose along each principal axis of its covariance.
+    slopes = camera_depth_by_pose(
+        pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3], d_camera, d_projector
+    )
+    variance, axes = np.linalg.eigh(pose.covariance)
     return FrameCloud(
         name,
         camera,
@@ -115,31 +140,18 @@ def frame_cloud(
         pose,
         agreeing_coords(coords, camera, projector, pose),
         uv_camera[keep],
-        points,
+        # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
+        points=d_camera * found.depth_camera.numpy()[:, None],
         sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
-        pose_errors=_pose_errors(uv_camera[keep], uv_projector[keep], camera, projector, pose),
+        pose_errors=slopes @ (axes * np.sqrt(variance.clip(0))),
         light=light,
         seen=seen,
         alternatives=tuple(
-            frame_cloud(name, coords, camera, projector, other, settings, light, seen)
+            frame_cloud(name, coords, camera, projector, other, light, seen)
             for other in pose.alternatives
-            if other.inliers.sum() >= settings.fewest_points
+            if other.inliers.sum() >= FEWEST_POINTS
         ),
     )
-
-
-def _pose_errors(
-    uv_camera: Float[ndarray, "n 2"],
-    uv_projector: Float[ndarray, "n 2"],
-    camera: Device,
-    projector: Device,
-    pose: RelativePose,
-) -> Float64[ndarray, "n 5"]:
-    """Changes of depth by one sigma of the pose along each principal axis of its covariance."""
-    R, t = pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3]
-    slopes = camera_depth_by_pose(R, t, directions(camera, uv_camera), directions(projector, uv_projector))
-    variance, axes = np.linalg.eigh(pose.covariance)
-    return slopes @ (axes * np.sqrt(variance.clip(0)))
 
 
 def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
@@ -157,18 +169,14 @@ def motion_by_pose_errors(cloud: FrameCloud) -> Float64[ndarray, "7 5"]:
     return np.linalg.lstsq(similarity.reshape(-1, 7), moved.reshape(-1, 5), rcond=None)[0]
 
 
-def reliable_points(
-    cloud: FrameCloud, largest_ratio: float = REGISTRATION_DEFAULTS.surface_map.largest_sigma_ratio
-) -> Bool[ndarray, "n"]:
+def reliable_points(cloud: FrameCloud) -> Bool[ndarray, "n"]:
     """Points whose uncertainty is not far above the frame's median: those next to an epipole are left out."""
     sigma = cloud.sigma
-    return sigma < largest_ratio * np.median(sigma)
+    return sigma < LARGEST_SIGMA_RATIO * np.median(sigma)
 
 
-# How much darker or brighter a surface is than around it: prints, grain and dirt, which stay where they are on it.
-#
-# A vase may be turned about its axis without its shape telling. Its tone tells, because hardly any real surface is
-# equally bright everywhere.
+# How much darker or brighter a surface is than around it: prints, grain and dirt, which stay where they are on it. A
+# vase may be turned about its axis without its shape telling; its tone tells.
 
 
 def surface_tone(
@@ -176,7 +184,6 @@ def surface_tone(
     point: Float64[ndarray, "h w 3"],
     normal: Float64[ndarray, "h w 3"],
     p_projector: Float64[ndarray, "3"],
-    settings: ToneSettings,
 ) -> Float32[ndarray, "h w"]:
     """Logarithm of the reflectance against its surroundings, NaN where unknown; all vectors in camera axes.
 
@@ -191,29 +198,25 @@ def surface_tone(
     to_camera = -point / np.maximum(np.linalg.norm(point, axis=-1, keepdims=True), 1e-300)
     cosine = (to_light * normal).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        known = (light > 0) & (cosine > settings.least_cosine) & ((to_camera * normal).sum(-1) > settings.least_cosine)
-        known = _inside(known, settings.border)
+        known = (light > 0) & (cosine > TONE_COSINE) & ((to_camera * normal).sum(-1) > TONE_COSINE)
+        # Along the border the light was measured beside something else.
+        square = np.ones((2 * TONE_BORDER + 1,) * 2, dtype=np.uint8)
+        known = cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
         tone = np.where(known, np.log(light * distance**2 / cosine), np.nan)
-    if known.sum() < settings.fewest_pixels:
+    if known.sum() < TONE_FEWEST_PIXELS:
         return np.full(light.shape, np.nan, dtype=np.float32)
-    tone = _cut(tone, settings.largest)
-    tone[known] -= _explained(tone[known], normal[known], to_light[known], to_camera[known], settings)
-    tone = _against_surroundings(tone, settings)
-    return _cut(tone, settings.largest).astype(np.float32)
+    tone = _cut(tone)
+    tone[known] -= _explained(tone[known], normal[known], to_light[known], to_camera[known])
+    tone = _against_surroundings(tone)
+    return _cut(tone).astype(np.float32)
 
 
-def _inside(known: Bool[ndarray, "h w"], border: int) -> Bool[ndarray, "h w"]:
-    """Without a strip along the border, where the light was measured beside something else."""
-    square = np.ones((2 * border + 1,) * 2, dtype=np.uint8)
-    return cv2.erode(known.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)) > 0
-
-
-def _cut(tone: Float64[ndarray, "h w"], largest: float) -> Float64[ndarray, "h w"]:
+def _cut(tone: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
     """Less the median, and at most so many robust standard deviations."""
     if np.isnan(tone).all():
         return tone
     centred = tone - np.nanmedian(tone)
-    reach = largest * MAD_TO_SIGMA * float(np.nanmedian(np.abs(centred)))
+    reach = TONE_LARGEST * MAD_TO_SIGMA * float(np.nanmedian(np.abs(centred)))
     return np.clip(centred, -reach, reach)
 
 
@@ -222,32 +225,31 @@ def _explained(
     normal: Float64[ndarray, "n 3"],
     to_light: Float64[ndarray, "n 3"],
     to_camera: Float64[ndarray, "n 3"],
-    settings: ToneSettings,
 ) -> Float64[ndarray, "n"]:
     """What the directions of light and camera against the normal explain: a sum of three functions, least squares."""
     middle = to_light + to_camera
     middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
     angles = (np.degrees(np.arccos((normal * v).sum(-1).clip(-1, 1))) for v in (to_light, to_camera, middle))
-    terms = np.concatenate([_hats(angle, settings.knots_deg) for angle in angles], 1)
-    H = terms.T @ terms + settings.ridge * len(tone) * np.eye(terms.shape[1])
+    terms = np.concatenate([_hats(angle) for angle in angles], 1)
+    H = terms.T @ terms + TONE_RIDGE * len(tone) * np.eye(terms.shape[1])
     return terms @ np.linalg.solve(H, terms.T @ tone)
 
 
-def _hats(angle: Float64[ndarray, "n"], knots: Sequence[float]) -> Float64[ndarray, "n k"]:
+def _hats(angle: Float64[ndarray, "n"]) -> Float64[ndarray, "n k"]:
     """Piecewise linear functions of angles, each 1 at its knot and 0 at the others."""
-    number = np.arange(len(knots))
-    return np.maximum(1 - np.abs(np.interp(angle, knots, number)[:, None] - number), 0)
+    number = np.arange(len(TONE_KNOTS_DEG))
+    return np.maximum(1 - np.abs(np.interp(angle, TONE_KNOTS_DEG, number)[:, None] - number), 0)
 
 
-def _against_surroundings(tone: Float64[ndarray, "h w"], settings: ToneSettings) -> Float64[ndarray, "h w"]:
+def _against_surroundings(tone: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
     """The tone less its mean around each place, on the same connected part of the surface."""
     known = np.isfinite(tone)
-    sigma = settings.window * max(tone.shape)
+    sigma = TONE_WINDOW * max(tone.shape)
     count, label = cv2.connectedComponents(known.astype(np.uint8), connectivity=4)
     out = np.full(tone.shape, np.nan)
     for number in range(1, count):
         part: Bool[ndarray, "h w"] = label == number
-        if part.sum() < settings.fewest_pixels:
+        if part.sum() < TONE_FEWEST_PIXELS:
             continue
         weight = part.astype(np.float32)
         values = np.where(part, tone, 0).astype(np.float32)
@@ -258,16 +260,14 @@ def _against_surroundings(tone: Float64[ndarray, "h w"], settings: ToneSettings)
     return out
 
 
-# Where a frame saw nothing of the pattern, although it would have fallen on a surface there.
-#
-# A camera that looks into empty space says as much of an object as one that sees its surface. Two faces of a box
-# agree
-# wherever one lies on the other; but where the larger one ends, the frame of the smaller one saw nothing.
+# Where a frame saw nothing of the pattern, although it would have fallen on a surface there: a camera that looks into
+# empty space says as much of an object as one that sees its surface. Two faces of a box agree wherever one lies on the
+# other; but where the larger one ends, the frame of the smaller one saw nothing.
 
 
 @dataclass(frozen=True)
 class EmptyPlaces:
-    """Of one frame; lengths in units of its baseline."""
+    """Where one frame saw nothing; lengths in units of its baseline."""
 
     empty: Bool[ndarray, "h w"]  # places of the surface map around which the camera saw nothing of the pattern
     projector: Device  # of the lattice of `reach`: the frame's projector, scaled
@@ -280,29 +280,29 @@ class EmptyPlaces:
         return *for_loops(self.projector), self.T_projector_camera, self.reach
 
 
-def find_empty_places(cloud: FrameCloud, camera: Device, settings: EmptyPlaceSettings) -> EmptyPlaces:
-    """Of a frame on the lattice of `camera`; none if it is not known where the frame saw the pattern.
+def find_empty_places(cloud: FrameCloud, camera: Device) -> EmptyPlaces:
+    """Find them on the lattice of `camera`; none if it is not known where the frame saw the pattern.
 
     `reach` is infinite where the camera saw nothing of what the projector lit, and 0 beside the pattern: there, and
     behind what was seen, a surface may be dark.
     """
     T = np.linalg.inv(cloud.pose.T_camera_projector)
-    factor = min(1.0, settings.projector_side / max(cloud.projector.w, cloud.projector.h))
+    factor = min(1.0, PROJECTOR_SIDE / max(cloud.projector.w, cloud.projector.h))
     projector = cloud.projector.scaled(factor)
     if cloud.seen is None:
         nowhere = np.zeros((camera.h, camera.w), dtype=bool)
         return EmptyPlaces(nowhere, projector, T, np.zeros((projector.h, projector.w)))
-    empty = _empty(cloud.seen, camera, settings.margin)
+    empty = _empty(cloud.seen, camera)
     return EmptyPlaces(empty, projector, T, _reach(cloud, projector, T, factor))
 
 
-def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device, margin: float) -> Bool[ndarray, "h w"]:
+def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device) -> Bool[ndarray, "h w"]:
     seen = np.zeros((camera.h, camera.w), dtype=bool)
     factor = max(camera.w, camera.h) / max(pattern_seen.shape)
     row, column = np.nonzero(pattern_seen)
     seen[_cell(row + 0.5, factor, camera.h), _cell(column + 0.5, factor, camera.w)] = True
     around = np.pad(seen, 1, constant_values=True)  # what is beside the image is not known
-    return np.asarray(distance_transform_edt(~around))[1:-1, 1:-1] > margin * max(camera.w, camera.h)
+    return np.asarray(distance_transform_edt(~around))[1:-1, 1:-1] > EMPTY_MARGIN * max(camera.w, camera.h)
 
 
 def _reach(
@@ -386,16 +386,14 @@ def tangent_planes(
     return np.concatenate([normal, (normal * point).sum(-1, keepdims=True), sigma[..., None]], -1)
 
 
-def build_surface_map(
-    cloud: FrameCloud, settings: SurfaceMapSettings = REGISTRATION_DEFAULTS.surface_map
-) -> SurfaceMap:
+def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
     """Average a cloud on a lattice of camera pixels and fit planes to windows of inverse depth.
 
     The inverse depth of a plane is linear in the pixel, so steep parts are not biased by the averaging.
     """
-    factor = min(1.0, settings.largest_side / max(cloud.camera.w, cloud.camera.h))
+    factor = min(1.0, LARGEST_SIDE / max(cloud.camera.w, cloud.camera.h))
     camera = cloud.camera.scaled(factor)
-    keep = reliable_points(cloud, settings.largest_sigma_ratio)
+    keep = reliable_points(cloud)
     column, row = np.floor(cloud.uv_camera[keep] * factor).astype(np.int64).T
     index = np.minimum(row, camera.h - 1) * camera.w + np.minimum(column, camera.w - 1)
     size = camera.w * camera.h
@@ -408,14 +406,8 @@ def build_surface_map(
         for values in (cloud.sigma_noise[keep], *cloud.pose_errors[keep].T)
     )
     fitted = np.full((camera.h, camera.w, 3), np.nan)
-    _fit_inverse_depth(
-        camera.h,
-        inverse_depth.astype(np.float32),
-        settings.half_window,
-        settings.fewest_pixels,
-        settings.largest_relief,
-        fitted,
-    )
+    planes_of = inverse_depth.astype(np.float32)
+    _fit_inverse_depth(camera.h, planes_of, HALF_WINDOW, FEWEST_PIXELS, LARGEST_RELIEF, fitted)
     uv = np.stack(np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5), -1).reshape(-1, 2)
     ray = directions(camera, uv).reshape(camera.h, camera.w, 3)
     ray = ray / -ray[..., 2:]
@@ -423,12 +415,12 @@ def build_surface_map(
     normal = _normals(fitted, ray, camera)
     cosine = -(normal * ray).sum(-1) / np.linalg.norm(ray, axis=-1)
     with np.errstate(invalid="ignore"):
-        valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > settings.least_cosine)
+        valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > LEAST_COSINE)
     depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
     points, place = (point[valid], uv.reshape(*shape, 2)[valid]) if valid.any() else (cloud.points, None)
     centroid, radius = _centre_and_radius(points)
     along_normal = np.nan_to_num(np.abs(cosine))
-    sigma = np.hypot(sigma_noise * along_normal, settings.lattice_error * depth / camera.fl_x)
+    sigma = np.hypot(sigma_noise * along_normal, LATTICE_ERROR * depth / camera.fl_x)
     if valid.any():
         errors = np.stack(pose_errors, -1)[valid] * along_normal[valid][:, None]
         shape_errors = _beyond_similarity(errors, (point[valid] - centroid) / radius, normal[valid])
@@ -438,12 +430,12 @@ def build_surface_map(
         np.ascontiguousarray(np.nan_to_num(point)),
         tangent_planes(np.nan_to_num(point), np.nan_to_num(normal), sigma),
         valid,
-        _tone(cloud, keep, index, point, normal, valid, settings),
-        find_empty_places(cloud, camera, settings.empty),
-        _orientation_weights(normal[valid], settings.orientations),
+        _tone(cloud, keep, index, point, normal, valid),
+        find_empty_places(cloud, camera),
+        _orientation_weights(normal[valid]),
         centroid,
         radius,
-        _views(points, place, camera, settings),
+        _views(points, place, camera),
     )
 
 
@@ -454,7 +446,6 @@ def _tone(
     point: Float64[ndarray, "h w 3"],
     normal: Float64[ndarray, "h w 3"],
     valid: Bool[ndarray, "h w"],
-    settings: SurfaceMapSettings,
 ) -> Float32[ndarray, "h w"]:
     """The surface's tone on the lattice; `index` is the place in the lattice of each point that is kept."""
     if cloud.light is None:
@@ -465,7 +456,7 @@ def _tone(
     count = np.bincount(index[known], minlength=valid.size)
     mean = np.bincount(index[known], light[known], valid.size) / np.maximum(count, 1)
     light = np.where(valid & (count.reshape(valid.shape) > 0), mean.reshape(valid.shape), np.nan)
-    return surface_tone(light, point, normal, cloud.pose.T_camera_projector[:3, 3], settings.tone)
+    return surface_tone(light, point, normal, cloud.pose.T_camera_projector[:3, 3])
 
 
 def _beyond_similarity(
@@ -480,15 +471,15 @@ def _beyond_similarity(
     return errors - moves @ np.linalg.lstsq(moves, errors, rcond=None)[0]
 
 
-def _orientation_weights(normal: Float64[ndarray, "m 3"], count: int) -> Float64[ndarray, "m"]:
+def _orientation_weights(normal: Float64[ndarray, "m 3"]) -> Float64[ndarray, "m"]:
     """One over the square root of how many normals have about the same direction."""
     if not len(normal):
         return np.zeros(0)
-    k = np.arange(count) + 0.5
-    height, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k  # a lattice of directions (Vogel's spiral)
+    k = np.arange(ORIENTATIONS) + 0.5
+    height, turn = 1 - 2 * k / ORIENTATIONS, np.pi * (1 + 5**0.5) * k  # a lattice of directions (Vogel's spiral)
     flat = np.sqrt(1 - height**2)
     nearest = (normal @ np.stack([flat * np.cos(turn), flat * np.sin(turn), height])).argmax(1)
-    return 1 / np.sqrt(np.bincount(nearest, minlength=count)[nearest])
+    return 1 / np.sqrt(np.bincount(nearest, minlength=ORIENTATIONS)[nearest])
 
 
 def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "3"], float]:
@@ -497,10 +488,7 @@ def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray
 
 
 def _views(
-    points: Float64[ndarray, "n 3"],
-    uv: Float64[ndarray, "n 2"] | None,
-    camera: Device,
-    settings: SurfaceMapSettings,
+    points: Float64[ndarray, "n 3"], uv: Float64[ndarray, "n 2"] | None, camera: Device
 ) -> tuple[FrameView, ...]:
     """Everything that the frame sees; and what lies in the middle of its image, at what depth that is.
 
@@ -509,17 +497,17 @@ def _views(
     same, and are about equally far from it.
     """
     centroid, radius = _centre_and_radius(points)
-    behind = settings.centre_depth * radius
+    behind = CENTRE_DEPTH * radius
     views = [FrameView(centroid * (1 + behind / np.linalg.norm(centroid)), radius)]
     if uv is None:
         return tuple(views)
     off = np.abs(uv - (camera.cx, camera.cy)).max(-1) / min(camera.w, camera.h)
-    central = np.sort(off)[min(len(off), settings.fewest_central) - 1]
-    middle = points[off <= max(central, settings.middle)]
+    central = np.sort(off)[min(len(off), FEWEST_CENTRAL) - 1]
+    middle = points[off <= max(central, MIDDLE)]
     depth = np.linalg.norm(middle, axis=1)
     place = np.median(middle / depth[:, None], axis=0)
-    near = float(np.quantile(depth, settings.near_quantile))
-    views.append(FrameView(place / np.linalg.norm(place) * (near + min(behind, settings.nearness * near)), near))
+    near = float(np.quantile(depth, NEAR_QUANTILE))
+    views.append(FrameView(place / np.linalg.norm(place) * (near + min(behind, NEARNESS * near)), near))
     return tuple(views)
 
 

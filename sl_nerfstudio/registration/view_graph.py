@@ -12,84 +12,84 @@ from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
-from sl_nerfstudio.registration.agreement import Side, Tolerance, agreement_at
+from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.assembly import (
+    SAME_SIDE_DEG,
     Assembly,
     Component,
-    Nodes,
     Pivots,
     PoseGraphSolution,
     optimise_pose_graph,
+    see_same_side,
 )
-from sl_nerfstudio.registration.pairs import PairMatch, edge_weights, is_accepted, quality, register_pair, search_score
-from sl_nerfstudio.registration.settings import (
-    REGISTRATION_DEFAULTS,
-    PairSettings,
-    RegistrationSettings,
+from sl_nerfstudio.registration.pairs import (
+    ANYWHERE,
+    NEARBY,
+    ROUGH,
+    SAME_ROTATION_DEG,
+    SAME_SHIFT,
+    PairMatch,
     Search,
-    StartSettings,
+    edge_weights,
+    is_accepted,
+    quality,
+    register_pair,
+    search_score,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
-# Pairs that only tones hold, confirmed by a third frame.
-#
-# Where the shape leaves a turn open, two tones may agree by accident anywhere. Three pairs that close a cycle do
-# not.
+EXPECTED_OVERLAP = 0.25  # share of common surface that makes a pair worth registering
+OVERLAP_TOLERANCE = 0.12  # radii within which surfaces count as overlapping before cycles are closed
+PARTNERS = 8  # pairs of each frame that are tried for closing cycles
+COMPARED_FRAMES = 40  # with which each frame is compared to find those: the nearest lines of sight, or random ones
+LIKELY_PARTNERS = 8  # frames with which each is registered where no order is known: those that look most alike
+BRIDGED = 4  # components, the largest ones, that are bridged with all others
+BRIDGES = 8  # pairs of frames across two components that are registered in order to join them
+BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are chosen
+BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
+LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for its rough pose to be used
+
+# Pairs that only tones hold: where the shape leaves a turn open, two tones may agree by accident anywhere. Three pairs
+# that close a cycle do not.
 
 
-def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots, settings: PairSettings) -> list[PairMatch]:
+def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots) -> list[PairMatch]:
     """The pairs in their order; those that tones hold and no cycle of three confirms are taken to slip."""
-    if not any(e.by_tone for e in edges):
-        return list(edges)
     held: defaultdict[int, dict[int, PairMatch]] = defaultdict(dict)
     for e in edges:
-        if e.slip_deg <= settings.bounded_slip_deg:
+        if e.holds:
             held[e.source][e.target] = held[e.target][e.source] = e
-    return [
-        e.without_tone() if e.by_tone and not _confirmed(e, held[e.source], held[e.target], pivots, settings) else e
-        for e in edges
-    ]
+
+    def confirmed(e: PairMatch) -> bool:
+        """Whether the way over a third frame leads to the same similarity."""
+        here, there = held[e.source], held[e.target]
+        around = (there[k].between(k, e.target) @ here[k].between(e.source, k) for k in here.keys() & there.keys())
+        return any(_same(e.S_target_source, S, pivots, e.source) for S in around)
+
+    return [e.without_tone() if e.by_tone and not confirmed(e) else e for e in edges]
 
 
-def _confirmed(
-    e: PairMatch,
-    of_source: dict[int, PairMatch],
-    of_target: dict[int, PairMatch],
-    pivots: Pivots,
-    settings: PairSettings,
-) -> bool:
-    """Whether the way over a third frame leads to the same similarity."""
-    around = (
-        of_target[k].between(k, e.target) @ of_source[k].between(e.source, k) for k in of_source if k in of_target
-    )
-    return any(_same(e.S_target_source, S, pivots, e.source, settings) for S in around)
-
-
-def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int, settings: PairSettings) -> bool:
+def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int) -> bool:
     """Whether two similarities turn a frame alike, and put its centre at about the same place."""
-    if angle_deg(a.R @ b.R.T) > settings.same_rotation_deg:
+    if angle_deg(a.R @ b.R.T) > SAME_ROTATION_DEG:
         return False
     centre = pivots.centre[frame][None]
     shift = float(np.linalg.norm(a.points(centre) - b.points(centre)))
-    return shift < settings.same_shift * a.scale * float(pivots.radius[frame])
+    return shift < SAME_SHIFT * a.scale * float(pivots.radius[frame])
 
 
 # Camera poses that a user knows roughly, as a start of registration: the baselines that fit them are found here.
 
 
-def starting_similarities(
-    T_world_camera: Float64[ndarray, "n 4 4"],
-    maps: Sequence[SurfaceMap],
-    settings: StartSettings = REGISTRATION_DEFAULTS.start,
-) -> list[Similarity | None]:
-    """`S_world_camera` of frames with known camera poses; None where a pose holds NaN.
+def starting_similarities(T_world_camera: Float64[ndarray, "n 4 4"], maps: Sequence[SurfaceMap]) -> Component:
+    """`S_world_camera` of the frames with known camera poses; a pose that holds NaN is unknown.
 
     The clouds of all frames must lie at about the same place. The baselines are therefore those for which all
     centroids, each on its own ray, come nearest to one point (linear least squares).
     """
     known = [k for k in range(len(maps)) if np.isfinite(T_world_camera[k]).all()]
     if not known:
-        return [None] * len(maps)
+        return {}
     A, b = np.zeros((3 * len(known), len(known) + 3)), np.zeros(3 * len(known))
     for row, k in enumerate(known):
         T, rows = T_world_camera[k], slice(3 * row, 3 * row + 3)
@@ -101,30 +101,23 @@ def starting_similarities(
     distances = np.linalg.lstsq(A, b, rcond=None)[0][: len(known)]
     positive = distances[distances > 0]
     typical = float(np.median(positive)) if len(positive) else 1.0
-    out: list[Similarity | None] = [None] * len(maps)
+    out: Component = {}
     for k, found in zip(known, distances, strict=True):
-        distance = found if found > settings.least_distance * typical else typical
+        distance = found if found > LEAST_DISTANCE * typical else typical
         T = T_world_camera[k]
         out[k] = Similarity(float(distance / np.linalg.norm(maps[k].centroid)), T[:3, :3], T[:3, 3])
     return out
 
 
-def with_common_centre(
-    S_world_camera: Sequence[Similarity | None], maps: Sequence[SurfaceMap]
-) -> list[Similarity | None]:
-    """The same, each moved so that the centres of what the frames see lie in one place.
+def with_common_centre(S_world_camera: Component, maps: Sequence[SurfaceMap]) -> Component:
+    """Move each so that the centres of what the frames see lie in one place.
 
     A camera that is rotated wrongly by a few degrees looks past the object by more than the object's size. Its rotation
     is still a good start.
     """
-    pairs = zip(S_world_camera, maps, strict=True)
-    centres = [None if S is None else S.points(m.views[0].centre[None])[0] for S, m in pairs]
-    known = [p for p in centres if p is not None]
-    common = np.median(known, axis=0) if known else np.zeros(3)
-    return [
-        None if S is None or p is None else Similarity(S.scale, S.R, S.t + common - p)
-        for S, p in zip(S_world_camera, centres, strict=True)
-    ]
+    centres = {k: S.points(maps[k].views[0].centre[None])[0] for k, S in S_world_camera.items()}
+    common = np.median(list(centres.values()), axis=0) if centres else np.zeros(3)
+    return {k: Similarity(S.scale, S.R, S.t + common - centres[k]) for k, S in S_world_camera.items()}
 
 
 Pair = tuple[int, int]
@@ -134,18 +127,15 @@ Snapshot = tuple[dict[Pair, PairMatch | None], list[PairMatch]]  # what pairs sa
 class ViewGraph:
     """Pairs that were tried, with the best result of each."""
 
-    def __init__(
-        self, maps: list[SurfaceMap], start: Nodes, rng: np.random.Generator, settings: RegistrationSettings
-    ) -> None:
+    def __init__(self, maps: list[SurfaceMap], start: Component, rng: np.random.Generator) -> None:
         self.maps = maps
         self.rng = rng
-        self.settings = settings
         self._start = start  # S_world_camera of frames where it is known roughly
         self.pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
-        self.sides = [Side.sampled(m, settings.pair.coarse_points, rng) for m in maps]
+        self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in maps]
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
-        self._aside: list[PairMatch] = []
+        self.put_aside: list[PairMatch] = []  # what put blocks of frames where most of the surface contradicts it
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -155,38 +145,32 @@ class ViewGraph:
     @property
     def edges(self) -> list[PairMatch]:
         """Pairs that agree well enough; what only the tones of two frames say counts if a third frame confirms it."""
-        accepted = [match for match in self.matches if is_accepted(match, self.settings.edge)]
-        return with_confirmed_tones(accepted, self.pivots, self.settings.pair)
-
-    @property
-    def put_aside(self) -> list[PairMatch]:
-        """Pairs that put blocks of frames where most of the surface contradicts it."""
-        return list(self._aside)
+        accepted = [match for match in self.matches if is_accepted(match)]
+        return with_confirmed_tones(accepted, self.pivots)
 
     @property
     def said(self) -> list[PairMatch]:
-        """All that pairs say or said, right or not: at which sides of the object frames fit."""
-        return [*self.matches, *self._aside]
+        """All results of pairs, right or not: at which sides of the object frames fit."""
+        return [*self.matches, *self.put_aside]
 
     def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
         """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
-        largest = self.settings.symmetry.same_rotation_deg
         for pair in sorted({(min(p), max(p)) for p in pairs}):
             match = self._tried.get(pair)
             if match is None:
                 continue
             placed = S_world_camera[match.target].inverse() @ S_world_camera[match.source]
-            if _turned_deg(match, placed) > largest:
-                self._aside.append(match)
+            if _turned_deg(match, placed) > SAME_SIDE_DEG:
+                self.put_aside.append(match)
                 del self._tried[pair]
 
     def snapshot(self) -> Snapshot:
         """What pairs say now, to come back to."""
-        return dict(self._tried), list(self._aside)
+        return dict(self._tried), list(self.put_aside)
 
     def restore(self, known: Snapshot) -> None:
         """Make pairs say what they said."""
-        self._tried, self._aside = dict(known[0]), list(known[1])
+        self._tried, self.put_aside = dict(known[0]), list(known[1])
 
     def connected(self, component: Component, used: Bool[ndarray, "edges"]) -> bool:
         """Whether those of the pairs that hold a component which are `used` lead to every frame of it."""
@@ -198,54 +182,51 @@ class ViewGraph:
         new = [p for p in pairs if (p, search) not in self._searched]
         self._searched |= {(p, search) for p in new}
         guesses = [_relative(self._start, p) for p in new]
-        trials = [(p, self.settings.pair.rough if g else search, g) for p, g in zip(new, guesses, strict=True)]
+        trials = [(p, ROUGH if g else search, g) for p, g in zip(new, guesses, strict=True)]
         self._register(trials, "registering pairs")
 
-    def try_overlapping(self, S_world_camera: Nodes, within_deg: float = 180.0) -> None:
+    def try_overlapping(self, S_world_camera: Component, within_deg: float = 180.0) -> None:
         """Register pairs that should overlap by the given poses, starting from there.
 
         What ends turned against its start by more than `within_deg` degrees counts for nothing.
         """
         pairs = self._overlapping(S_world_camera)
         guesses = [_relative(S_world_camera, p) for p in pairs]
-        nearby = self.settings.pair.nearby
-        trials = [(p, nearby, g) for p, g in zip(pairs, guesses, strict=True) if g]
+        trials = [(p, NEARBY, g) for p, g in zip(pairs, guesses, strict=True) if g]
         self._register(trials, "closing loops", within_deg)
 
     def try_all(self) -> None:
         """Register every frame with those that look most like it, wherever they are in the order."""
-        n, likely = len(self.maps), self.settings.selection.likely_partners
+        n = len(self.maps)
         likeness = np.full((n, n), -np.inf)
-        most = self.settings.selection.compared_frames
-        rank = np.zeros((n, n)) if n - 1 <= most else self.rng.random((n, n))
-        compared = compared_pairs(rank, most)
+        rank = np.zeros((n, n)) if n - 1 <= COMPARED_FRAMES else self.rng.random((n, n))
+        compared = compared_pairs(rank, COMPARED_FRAMES)
         for (i, j), score in zip(compared, self._likeness(compared), strict=True):
             likeness[i, j] = likeness[j, i] = score
         pairs = {
             (min(i, j), max(i, j))
             for i in range(n)
-            for j in np.argsort(-likeness[i], kind="stable")[:likely].tolist()
+            for j in np.argsort(-likeness[i], kind="stable")[:LIKELY_PARTNERS].tolist()
             if i != j
         }
-        self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
+        self.try_pairs(sorted(pairs), ANYWHERE)
 
     def bridge(self, components: Sequence[Component]) -> None:
         """Search between the largest components and all others, everywhere: one may be upside down."""
         pairs: set[Pair] = set()
-        for number, first in enumerate(components[: self.settings.selection.bridged]):
+        for number, first in enumerate(components[:BRIDGED]):
             for second in components[number + 1 :]:
                 pairs |= set(self.bridges(first, second))
-        self.try_pairs(sorted(pairs), self.settings.pair.anywhere)
+        self.try_pairs(sorted(pairs), ANYWHERE)
 
     def bridges(self, first: Component, second: Component) -> list[Pair]:
         """Pairs across two components: those taken one soon after the other, and those that look most alike."""
-        selection = self.settings.selection
         pairs = [(min(i, j), max(i, j)) for i in first for j in second]
-        nearby = sorted(pairs, key=lambda p: p[1] - p[0])[: selection.bridges_nearby]
+        nearby = sorted(pairs, key=lambda p: p[1] - p[0])[:BRIDGES_NEARBY]
         others = [p for p in pairs if p not in nearby]
-        some = [others[k] for k in self.rng.permutation(len(others))[: selection.most_compared]]
+        some = [others[k] for k in self.rng.permutation(len(others))[:BRIDGES_COMPARED]]
         alike = np.argsort(-np.array(self._likeness(some)), kind="stable")
-        return nearby + [some[k] for k in alike[: selection.bridges - len(nearby)]]
+        return nearby + [some[k] for k in alike[: BRIDGES - len(nearby)]]
 
     def assemble(self) -> list[Component]:
         """Components of frames whose connection is certain, the largest first.
@@ -253,77 +234,67 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        firm, slipping = split_by_slip(self.edges, self.settings.pair.bounded_slip_deg)
-        components = Assembly(self.sides, self.pivots, firm, self.settings, None, slipping).grow()
+        firm, slipping = [e for e in self.edges if e.holds], [e for e in self.edges if not e.holds]
+        components = Assembly(self.sides, self.pivots, firm, slipping).grow()
         if len(components[0]) > 1:
             return components
-        return Assembly(self.sides, self.pivots, self.edges, self.settings).grow()
+        return Assembly(self.sides, self.pivots, self.edges).grow()
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together."""
         edges = self.holding(component)
-        weight = edge_weights(edges, self.settings.edge)
-        return optimise_pose_graph(edges, self.pivots, component, weight, self.settings.pose_graph)
+        return optimise_pose_graph(edges, self.pivots, component, edge_weights(edges))
 
     def holding(self, component: Component) -> list[PairMatch]:
         """The pairs, without those inside a component that may slip, if the others hold it together."""
-        return without_slipping(self.edges, component, self.settings.pair.bounded_slip_deg)
-
-    def see_same_side(self, a: Similarity, b: Similarity) -> bool:
-        """Whether the lines of sight of two cameras differ little enough to see a common surface."""
-        largest = np.radians(self.settings.selection.largest_view_angle_deg)
-        return bool(a.R[:, 2] @ b.R[:, 2] > np.cos(largest))
+        return without_slipping(self.edges, component)
 
     def _register(
         self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str, within_deg: float = 180.0
     ) -> None:
         """Register pairs, and keep the better result of a pair that was tried before."""
-        settings, rngs = self.settings, self.rng.spawn(len(trials))
+        rngs = self.rng.spawn(len(trials))
         tasks = [
-            partial(register_pair, self._maps(pair), pair, search, rng, guess, settings.pair)
+            partial(register_pair, self._maps(pair), pair, search, rng, guess)
             for (pair, search, guess), rng in zip(trials, rngs, strict=True)
         ]
         for (pair, _, guess), match in zip(trials, tracked(tasks, words), strict=True):
             if match is not None and guess is not None and _turned_deg(match, guess) > within_deg:
                 continue
             known = self._tried.get(pair)
-            if known is None or (match is not None and quality(match, settings.edge) > quality(known, settings.edge)):
+            if known is None or (match is not None and quality(match) > quality(known)):
                 self._tried[pair] = match
 
     def _likeness(self, pairs: Sequence[Pair]) -> list[float]:
-        """How well the best of all starts agrees, of each pair."""
-        search, rngs = self.settings.pair.anywhere, self.rng.spawn(len(pairs))
-        tasks = [
-            partial(search_score, self._maps(pair), search, rng, self.settings.pair)
-            for pair, rng in zip(pairs, rngs, strict=True)
-        ]
+        """Score of the best of all starts of each pair."""
+        rngs = self.rng.spawn(len(pairs))
+        tasks = [partial(search_score, self._maps(pair), ANYWHERE, rng) for pair, rng in zip(pairs, rngs, strict=True)]
         return tracked(tasks, "comparing frames")
 
     def _maps(self, pair: Pair) -> tuple[SurfaceMap, SurfaceMap]:
         return self.maps[pair[0]], self.maps[pair[1]]
 
-    def _overlapping(self, S_world_camera: Nodes) -> list[Pair]:
+    def _overlapping(self, S_world_camera: Component) -> list[Pair]:
         """For every frame the pairs with the largest expected overlap, without those that are edges already."""
-        selection, n = self.settings.selection, len(S_world_camera)
-        tolerance = Tolerance(selection.overlap_tolerance, self.settings.pair.tolerance_sigmas)
+        n = len(self.maps)
+        tolerance = Tolerance(OVERLAP_TOLERANCE, AGREEING_SIGMAS)
         shares = np.zeros((n, n))
-        sight = np.array([np.full(3, np.nan) if S is None else S.R[:, 2] for S in S_world_camera])
-        for i, j in compared_pairs(-sight @ sight.T, selection.compared_frames):
-            a, b = S_world_camera[i], S_world_camera[j]
-            if a is not None and b is not None and self.see_same_side(a, b):
+        sight = np.full((n, 3), np.nan)
+        for k, S in S_world_camera.items():
+            sight[k] = S.R[:, 2]
+        for i, j in compared_pairs(-sight @ sight.T, COMPARED_FRAMES):
+            a, b = S_world_camera.get(i), S_world_camera.get(j)
+            if a is not None and b is not None and see_same_side(a, b):
                 maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
-                found = agreement_at(maps, S, self.rng, tolerance, self.settings.pair)
+                found = agreement_at(maps, S, self.rng, tolerance)
                 shares[i, j] = shares[j, i] = found.agreeing[0]
         pairs: set[Pair] = set()
         for i in range(n):
-            for j in np.argsort(-shares[i], kind="stable")[: selection.partners].tolist():
-                if shares[i, j] > selection.least_overlap:
+            for j in np.argsort(-shares[i], kind="stable")[:PARTNERS].tolist():
+                if shares[i, j] > EXPECTED_OVERLAP:
                     pairs.add((min(i, j), max(i, j)))
-        return sorted(p for p in pairs if not self._is_edge(p))
-
-    def _is_edge(self, pair: Pair) -> bool:
-        match = self._tried.get(pair)
-        return match is not None and is_accepted(match, self.settings.edge)
+        edges = {pair for pair, match in self._tried.items() if match is not None and is_accepted(match)}
+        return sorted(pairs - edges)
 
 
 def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
@@ -338,18 +309,11 @@ def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
     return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
-def split_by_slip(edges: Sequence[PairMatch], bounded_deg: float) -> tuple[list[PairMatch], list[PairMatch]]:
-    """Pairs that hold their frames in place to within an angle, and pairs that may slip by more."""
-    return [e for e in edges if e.slip_deg <= bounded_deg], [e for e in edges if e.slip_deg > bounded_deg]
-
-
-def without_slipping(edges: Sequence[PairMatch], component: Component, bounded_deg: float) -> list[PairMatch]:
-    """The pairs without those inside a component that may slip by more than an angle, if it is connected without."""
-    firm, slipping = split_by_slip(edges, bounded_deg)
-    if not _connected(component, firm):
+def without_slipping(edges: Sequence[PairMatch], component: Component) -> list[PairMatch]:
+    """The pairs without those inside a component that may slip, if the others connect it."""
+    if not _connected(component, [e for e in edges if e.holds]):
         return list(edges)
-    dropped = {id(e) for e in slipping if e.source in component and e.target in component}
-    return [e for e in edges if id(e) not in dropped]
+    return [e for e in edges if e.holds or e.source not in component or e.target not in component]
 
 
 def _connected(component: Component, edges: Sequence[PairMatch]) -> bool:
@@ -369,7 +333,7 @@ def _turned_deg(match: PairMatch, guess: Similarity) -> float:
     return angle_deg(match.S_target_source.R @ guess.R.T)
 
 
-def _relative(nodes: Nodes, pair: Pair) -> Similarity | None:
+def _relative(nodes: Component, pair: Pair) -> Similarity | None:
     """The second frame of a pair from the first, where both are known."""
-    a, b = nodes[pair[0]], nodes[pair[1]]
+    a, b = nodes.get(pair[0]), nodes.get(pair[1])
     return None if a is None or b is None else b.inverse() @ a

@@ -7,10 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from benchmarks.another_renderer.alignment import Similarity, angle_deg, by_cameras, by_points
-from benchmarks.another_renderer.captures import CaptureSet, lenses, walk
-from benchmarks.another_renderer.optics import into_device
-from benchmarks.another_renderer.scoring import score
+from benchmarks.another_renderer.photograph import into_device
+from benchmarks.another_renderer.scoring import Similarity, angle_deg, by_cameras, by_points, score
+from benchmarks.another_renderer.sets import CaptureSet, lenses, walk
 
 MOTION = Similarity(0.01, Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix(), np.array([3.0, 1.0, -2.0]))
 

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.baselines.depth import drop_islands, triangulated_depth
-from benchmarks.baselines.icp_registration import register
-from benchmarks.baselines.tsdf import TsdfConfig, backprojected, fuse
+from benchmarks.baselines.poses import register
+from benchmarks.baselines.tsdf import backprojected, drop_islands, fuse, triangulated_depth
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
@@ -64,10 +63,9 @@ def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repair
     mesh_path = read_ground_truth(disturbed).mesh_path
     assert mesh_path is not None
     reference = mesh_reference(read_mesh(mesh_path), disturbed, true, 20_000)
-    config = TsdfConfig(voxel=1 / 120)
     rmse = {}
     for name, poses in (("initial", initial), ("registered", registered), ("true", true)):
-        surface = IndexedMesh(fuse(disturbed, poses, config))
+        surface = IndexedMesh(fuse(disturbed, poses, 1 / 120))
         rmse[name] = score_alignments(surface, reference, poses, true, samples=20_000)["rigid"].accuracy.median
     assert rmse["true"] < 0.1
     assert rmse["registered"] < 3 * rmse["true"] < rmse["initial"]

@@ -5,13 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.baselines.depth import DepthMap, triangulated_depth
-from benchmarks.baselines.icp_registration import RegistrationConfig, register
-from benchmarks.baselines.tsdf import backprojected, depth_maps, fuse, object_size
+from benchmarks.baselines.tsdf import backprojected, triangulated_depth
 from benchmarks.baselines.window_matching import match_windows
 from sl_nerfstudio.decoding.grid_graph import one_hot, turned_pattern
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.pattern.codes import code_array
 from sl_nerfstudio.scan import Scan, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -48,43 +45,6 @@ def test_depth_maps_are_those_of_an_ideal_pinhole(distorted: Scan) -> None:
     footprint = np.median(-points[:, 2]) / frame.camera.fl_x
     assert np.percentile(on_truth(distorted, p_world), 95) < footprint
     assert (depth.depth > 0).sum() == pytest.approx(frame.read_mask().sum(), rel=0.1)
-
-
-@given(st.floats(50, 500), st.floats(0.2, 2))
-def test_backprojected_points_project_onto_their_pixels(focal: float, z: float) -> None:
-    camera = Device(8, 6, focal, 1.1 * focal, 3.7, 2.9)
-    depth = np.zeros((6, 8))
-    depth[1, 2], depth[4, 7] = z, 2 * z
-    p = backprojected(DepthMap(depth, camera))
-    u, v = camera.fl_x * p[:, 0] / -p[:, 2] + camera.cx, -camera.fl_y * p[:, 1] / -p[:, 2] + camera.cy
-    np.testing.assert_allclose(np.stack([u, v], 1), [[2.5, 1.5], [7.5, 4.5]])
-    np.testing.assert_allclose(-p[:, 2], [z, 2 * z])
-
-
-def test_the_size_of_the_object_scales_with_the_world(distorted: Scan) -> None:
-    size = object_size(depth_maps(distorted, distorted.poses))
-    S = Similarity(3.0, np.diag([1.0, -1.0, -1.0]), np.array([5.0, 0.0, 100.0]))
-    assert object_size(depth_maps(distorted, distorted.poses.mapped(S))) == pytest.approx(3 * size, rel=1e-6)
-    assert 60 < size < 130  # the object measures 80 x 56 x 52 mm
-    assert object_size([]) == 0.0
-
-
-def test_fusion_moves_with_its_poses(distorted: Scan) -> None:
-    S = Similarity(0.5, np.diag([-1.0, -1.0, 1.0]), np.array([10.0, 20.0, -30.0]))
-    here, there = fuse(distorted, distorted.poses), fuse(distorted, distorted.poses.mapped(S))
-    back = there.mapped(S.inverse())
-    assert np.percentile(on_truth(distorted, here.vertices), 90) < 1.0
-    assert back.face_areas().sum() == pytest.approx(here.face_areas().sum(), rel=0.05)
-    np.testing.assert_allclose(back.vertices.min(0), here.vertices.min(0), atol=1.5)  # the voxels lie elsewhere
-
-
-def test_registration_leaves_true_poses_and_moves_frames_as_a_whole(distorted: Scan) -> None:
-    found = register(distorted, distorted.poses, RegistrationConfig(rounds=1))
-    np.testing.assert_allclose(found.T_world_camera[0], distorted.poses.T_world_camera[0], atol=1e-9)
-    np.testing.assert_allclose(found.T_camera_projector, distorted.poses.T_camera_projector, atol=1e-9)
-    moved = found.T_world_camera @ np.linalg.inv(distorted.poses.T_world_camera)
-    at_origin = np.linalg.norm(moved[:, :3, 3], axis=1)  # where the object is
-    assert at_origin.max() < 2.0
 
 
 def test_windows_of_the_pattern_are_found_in_every_turn() -> None:

@@ -1,10 +1,13 @@
 """The coded grid: nodes where they should be, gaps as the symbols say, and nothing else."""
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sl_nerfstudio.pattern.codes import rotate_codes
-from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.grid import GridPattern, gaussian_window, normalise_locally, projected_light, sample_bilinear
 
 _PERIOD, _GAP, _WIDTH = 20.0, 6.0, 4.0
 
@@ -99,3 +102,187 @@ def test_dark_level():
 def test_grids_that_cannot_be_drawn(options, message):
     with pytest.raises(ValueError, match=message):
         GridPattern(**options)
+
+
+# Bilinear look-up: exact for what bilinear functions are, by the scan's pixel convention.
+
+
+@given(st.integers(0, 10_000))
+def test_a_bilinear_image_is_reproduced_between_its_pixels(seed):
+    rng = np.random.default_rng(seed)
+    h, w = rng.integers(2, 12, 2)
+    a, b, c, d = rng.uniform(-1, 1, 4)
+
+    def value(x, y):
+        return a + b * x + c * y + d * x * y
+
+    x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+    uv = rng.uniform((0.5, 0.5), (w - 0.5, h - 0.5), (50, 2))
+    image = value(x, y).astype(np.float32)
+    np.testing.assert_allclose(sample_bilinear(image, uv), value(*uv.T), atol=2e-4)
+
+
+def test_pixel_centres_are_at_one_half_and_rims_are_kept():
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+    uv = np.array([[0.5, 0.5], [3.5, 2.5], [1.0, 0.5], [-5.0, 0.5], [99.0, 99.0]])
+    assert sample_bilinear(image, uv).tolist() == [0, 11, 0.5, 0, 11]
+
+
+def test_unknown_places_stay_unknown_and_shapes_are_kept():
+    uv = np.full((2, 3, 2), 1.0)
+    uv[0, 1, 0] = np.nan
+    out = sample_bilinear(np.ones((4, 4), np.float32), uv)
+    assert out.shape == (2, 3)
+    assert np.isnan(out[0, 1]) and np.isfinite(out).sum() == 5
+
+
+# The projector's light that a surface returns, measured in an image under the pattern.
+
+
+GRID = GridPattern(w=800, h=800)
+PICTURE = GRID.render()
+SIZE, PIXELS = 240, 12.0  # of the image; of a period in it
+SIGMA = 0.5 * PIXELS
+
+
+def upright() -> np.ndarray:
+    """Coordinates of an image that shows the pattern enlarged, a little turned."""
+    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+    scale = GRID.period / PIXELS
+    return (np.stack([0.98 * x + 0.2 * y, -0.2 * x + 0.98 * y + 60], -1) * scale).astype(np.float32)
+
+
+def seen(coords: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    return cv2.remap(picture, coords[..., 0] - 0.5, coords[..., 1] - 0.5, cv2.INTER_LINEAR)
+
+
+def inner(values: np.ndarray) -> np.ndarray:
+    return values[20:-20, 20:-20]
+
+
+def waves(length: float) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
+    return np.cos(2 * np.pi * x / length) * np.cos(2 * np.pi * y / length)
+
+
+def test_light_is_found_whatever_the_room_adds():
+    coords = upright()
+    albedo, room = 0.5 + 0.2 * waves(90), 0.2 + 0.15 * waves(140)
+    image = albedo * seen(coords, PICTURE) + room
+    found = projected_light(image, coords, [PICTURE], SIGMA)
+    assert np.abs(inner(found) / inner(albedo) - 1).mean() < 0.03
+    assert np.corrcoef(inner(found).ravel(), inner(albedo).ravel())[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_light_is_in_the_unit_of_the_image(factor):
+    coords = upright()
+    image = seen(coords, PICTURE) * (0.5 + 0.1 * waves(60))
+    once, scaled = (projected_light(f * image, coords, [PICTURE], SIGMA) for f in (1.0, factor))
+    np.testing.assert_allclose(scaled, factor * once, rtol=1e-4, atol=1e-5)
+
+
+def test_a_soft_image_is_compared_with_the_pattern_as_soft():
+    """With a sharp one, thin lines would seem darker than wide ones, and the code would be taken for the surface."""
+    coords = upright()
+    sharp, soft = PICTURE, cv2.GaussianBlur(PICTURE, (0, 0), 0.15 * GRID.period)
+    image = 0.6 * seen(coords, soft)
+    wrong, right = (projected_light(image, coords, some, SIGMA) for some in ([sharp], [sharp, soft]))
+    assert np.abs(inner(right) - 0.6).max() < 0.01
+    assert inner(wrong).std() > 10 * inner(right).std()
+
+
+def test_nothing_is_said_where_nothing_was_decoded():
+    coords = upright()
+    coords[:, 100:] = np.nan
+    found = projected_light(0.5 * np.nan_to_num(seen(upright(), PICTURE)), coords, [PICTURE], SIGMA)
+    assert np.isnan(found[:, 100:]).all()
+    np.testing.assert_allclose(found[20:-20, 20:99], 0.5, atol=0.02)
+    assert np.isnan(projected_light(np.ones((SIZE, SIZE)), np.full_like(coords, np.nan), [PICTURE], SIGMA)).all()
+
+
+# Local normalisation: the pattern is recovered under any light, albedo and exposure.
+
+
+@pytest.fixture(scope="module")
+def pattern():
+    return GridPattern(w=240, h=240, seed=1).render()
+
+
+def _disc(pattern):
+    y, x = np.mgrid[: pattern.shape[0], : pattern.shape[1]]
+    return (x - 120) ** 2 + (y - 110) ** 2 < 90**2
+
+
+def test_albedo_shading_and_room_light_are_taken_out(pattern):
+    y, x = np.mgrid[:240, :240] / 240
+    shading = 0.15 + 0.8 * x * (0.6 + 0.4 * np.cos(9 * y))
+    mask = _disc(pattern)
+    out = normalise_locally(0.03 + shading * pattern, mask, 16.0, float(pattern.mean()), float(pattern.std()))
+    inner = mask & np.roll(mask, 8, 0) & np.roll(mask, -8, 0) & np.roll(mask, 8, 1) & np.roll(mask, -8, 1)
+    a, b = out[inner], pattern[inner]
+    assert np.corrcoef(a, b)[0, 1] > 0.97
+    assert (a @ b) / np.linalg.norm(a) / np.linalg.norm(b) > 0.985
+    assert np.corrcoef(shading[inner] * b, b)[0, 1] < 0.93  # what there was to be taken out
+
+
+def test_gain_and_offset_change_nothing(pattern):
+    mask = _disc(pattern)
+    once = normalise_locally(pattern, mask, 12.0)
+    np.testing.assert_allclose(normalise_locally(0.2 * pattern + 0.1, mask, 12.0), once, atol=2e-3)
+
+
+def test_outside_is_zero_and_does_not_leak_in(pattern):
+    mask = _disc(pattern)
+    noise = np.random.default_rng(0).uniform(0, 100, pattern.shape)
+    out = normalise_locally(np.where(mask, pattern, noise), mask, 12.0)
+    assert (out[~mask] == 0).all()
+    assert np.array_equal(out, normalise_locally(np.where(mask, pattern, 0), mask, 12.0))
+    assert out.min() >= 0 and out.max() <= 1
+
+
+def test_an_empty_mask_and_a_flat_image():
+    flat = np.full((20, 20), 0.4)
+    assert (normalise_locally(flat, np.zeros((20, 20), bool), 3.0) == 0).all()
+    np.testing.assert_allclose(normalise_locally(flat, np.ones((20, 20), bool), 3.0, mean=0.3), 0.3, atol=1e-3)
+
+
+# Means in wide windows are those of the window itself, written as a sum.
+
+
+def direct(values, sigma):
+    """By the definition, one axis after the other, in float64."""
+    for axis, size in enumerate(values.shape[:2]):
+        at = np.arange(size)
+        weight = np.exp(-((at[:, None] - at) ** 2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
+        values = np.moveaxis(np.tensordot(weight, values, (1, axis)), 0, axis)
+    return values
+
+
+@pytest.mark.parametrize("sigma", [2.0, 5.9, 6.0, 11.3, 28.0])
+@pytest.mark.parametrize("shape", [(97, 130), (131, 96, 3)])
+def test_means_are_those_of_the_definition(sigma, shape):
+    """A step, a corner and noise: also across the border of the image, where it continues with zeros."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(0.5, 0.3, shape).astype(np.float32)
+    values[:40, 60:] += 1
+    found, expected = gaussian_window(values, sigma), direct(values.astype(float), sigma)
+    assert found.shape == shape and found.dtype == np.float32
+    assert np.abs(found - expected).max() < 0.03 * np.ptp(expected)
+    assert np.abs(found - expected).mean() < 0.004 * np.ptp(expected)
+
+
+@pytest.mark.parametrize("sigma", [4.0, 19.0])
+def test_a_linear_image_keeps_its_values_inside(sigma):
+    y, x = np.mgrid[:300, :300].astype(np.float32)
+    found = gaussian_window(np.dstack([2 * x + y, np.ones_like(x)]), sigma)
+    inner = np.s_[100:200, 100:200]
+    np.testing.assert_allclose(found[..., 0][inner], (2 * x + y)[inner], rtol=1e-3)
+    np.testing.assert_allclose(found[..., 1][inner], 1, rtol=1e-3)
+
+
+def test_quotients_are_means_over_a_part():
+    inside = np.zeros((120, 120), dtype=np.float32)
+    inside[30:90, 30:90] = 1
+    means = gaussian_window(np.dstack([inside, 7 * inside]), 15.0)
+    np.testing.assert_allclose((means[..., 1] / means[..., 0])[25:95, 25:95], 7, rtol=1e-5)

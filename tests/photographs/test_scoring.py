@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.photographs.__main__ import chosen_sets, row_of, summary, text_of
-from benchmarks.photographs.scoring import decoding_figures, pose_errors
-from benchmarks.photographs.sets import SETS, CaptureSet, captures_of, frame_names
-from benchmarks.photographs.truth import read_truth
-from sl_nerfstudio.errors import UserError
+from benchmarks.photographs.__main__ import row_of, summary
+from benchmarks.photographs.scoring import decoding_figures, pose_errors, read_truth
+from benchmarks.photographs.sets import CaptureSet, captures_of, frame_names
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.scan.types import PoseSigma
 
 _SET = CaptureSet("cone-and-cylinder", "table", "plain", 3, shuffled=True)
@@ -102,21 +99,6 @@ def test_strays_that_agree_with_each_other_are_still_strays(captures, truth):
     assert {e.name for e in errors if not e.right} == set(moved)
 
 
-def test_the_error_over_sigma_is_that_of_one_axis(captures, truth):
-    moved = {name: _turned(angle) for name, angle in zip(sorted(truth.frames), [0.3, *[0.0] * 6], strict=True)}
-    error = next(e for e in pose_errors(_scan(captures, moved), truth) if e.name == sorted(truth.frames)[0])
-    assert error.over_sigma == pytest.approx(error.camera_deg / np.sqrt(3) / 0.05)
-    assert 0.2 < error.camera_deg < 0.3, "a seventh of it goes into the alignment"
-
-
-def test_images_are_shuffled_and_the_truth_knows_how(captures, truth):
-    assert sorted(truth.frames) == [f"photo_{n:03d}" for n in range(7)]
-    numbers = [frame_names(_SET, 7)[name] for name in sorted(truth.frames)]
-    assert sorted(numbers) == list(range(7)) and numbers != sorted(numbers)
-    for name, frame in truth.frames.items():
-        assert np.array_equal(read_image(captures / "images" / f"{name}.png"), frame.frame.read_image())
-
-
 def test_decoded_pixels_of_the_object_are_counted(captures, truth, tmp_path):
     """A quarter of the pixels missing, one in ten off by 5 pattern pixels, the rest off by 0.3; one frame refused."""
     rng = np.random.default_rng(0)
@@ -149,24 +131,5 @@ def test_a_row_counts_frames_and_a_failed_run_has_none_right(captures, truth):
     row = row_of(_SET, truth, kept, pose_errors(scan, truth), None, "good", 1.0, "")
     assert (row.right, row.wrong, row.left_out, row.usable) == (4, ("photo_001",), 2, 7)
     assert "1 of them under good or acceptable" in summary([row])
-    failed = row_of(_SET, truth, (), [], None, "-", 1.0, "error: 1 of 7 frames could be used\nmore")
+    failed = row_of(_SET, truth, (), [], None, "-", 1.0, "error: 1 of 7 frames could be used")
     assert (failed.right, failed.wrong, failed.left_out) == (0, (), 7)
-    assert text_of(failed).endswith("\n    error: 1 of 7 frames could be used")
-
-
-def test_the_sets_cover_what_they_should():
-    assert len({one.name for one in SETS}) == len(SETS) >= 12
-    count = {a: sum(one.appearance == a for one in SETS) for a in ("plain", "realistic", "hard")}
-    assert count["plain"] >= 4 and count["realistic"] >= 5 and count["hard"] >= 3
-    assert {one.background for one in SETS} == {"none", "table", "walls"}
-    assert any(one.shuffled and one.unordered for one in SETS) and any(one.shuffled > one.unordered for one in SETS)
-    assert [one.scene for one in chosen_sets(("medal",))] == ["medal"] and chosen_sets(()) == list(SETS)
-    with pytest.raises(UserError, match="--sets teapot: no set is named so"):
-        chosen_sets(("frog", "teapot"))
-    names = ("cone-and-cylinder-walls-hard-9", "head-none-plain-10-shuffled")
-    new = chosen_sets(("medal", *names))[1:]  # those of the benchmark come first
-    assert tuple(one.name for one in new) == names
-    assert new[0] == CaptureSet("cone-and-cylinder", "walls", "hard", 9) and not new[1].unordered
-    for wrong in ("teapot-none-plain-1", "head-none-plain", "head-nowhere-plain-1", "head-none-plain-1-sorted"):
-        with pytest.raises(UserError, match="SCENE-BACKGROUND-APPEARANCE-SEED"):
-            chosen_sets((wrong,))

@@ -15,13 +15,12 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 def test_launches_and_waits_of_a_step_are_counted(tiny_root, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(launches, "_COUNTED", 2)
     output = tmp_path / "launches.json"
-    config = launches.Config(tiny_root, ("paper",), ("warp",), rays=16, details=True, output=output)
+    config = launches.Config(tiny_root, ("paper",), ("warp",), rays=16, output=output)
     (row,) = launches.main(config)
     assert row.waits == 0 and 0 < row.of_warp < row.launches <= row.most < 100
     assert row.with_graph < 20 and row.between < 5
     assert json.loads(output.read_text())["rows"][0]["launches"] == row.launches == sum(row.by_name.values())
-    said = capsys.readouterr().out
-    assert f"paper     warp     {row.launches:9d}{row.most:6d}" in said and "warp encode" in said
+    assert "warp encode" in capsys.readouterr().out
 
 
 @pytest.mark.slow

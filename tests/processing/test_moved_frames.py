@@ -13,8 +13,7 @@ from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
-from tests.registration.shaped_clouds import rendered
-from tests.registration.symmetry.turned_scan import write_bar
+from tests.registration.shaped_clouds import rendered, write_bar
 
 pytestmark = pytest.mark.slow
 

@@ -3,8 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
@@ -34,14 +36,7 @@ def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100
     points = ray / -ray[:, 2:] * depth(x, y)[:, None]
     even = np.full(len(uv), sigma / np.sqrt(2))
     errors = np.outer(even, np.eye(5)[0])
-    return replace(
-        _template(),
-        camera=camera,
-        uv_camera=uv,
-        points=points,
-        sigma_noise=even,
-        pose_errors=errors,
-    )
+    return replace(_template(), camera=camera, uv_camera=uv, points=points, sigma_noise=even, pose_errors=errors)
 
 
 def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:
@@ -123,3 +118,13 @@ def rendered(
         pose = known_pose(T, *correspondences_of(coords), camera, projector)
         out.append(frame_cloud(f"{scene} {k}", coords, camera, projector, pose, light=light))
     return RenderedClouds(tuple(out), setup, tuple(frames))
+
+
+def write_bar(path: Path) -> None:
+    """A bar of 90 mm with a boss on each end, 22 and 12 mm high: nearly the same after half a turn."""
+    parts = [trimesh.creation.box((90, 40, 24))]
+    for x, height in ((30, 22), (-30, 12)):
+        boss = trimesh.creation.box((16, 20, height))
+        boss.apply_translation((x, 0, 12 + height / 2))
+        parts.append(boss)
+    trimesh.util.concatenate(parts).export(path)

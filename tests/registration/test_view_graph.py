@@ -1,21 +1,33 @@
-"""Which pairs of frames are compared with each other: all of a few frames, some of many."""
+"""Which pairs of frames are compared, which hold, and what rough poses of cameras say."""
 
 from itertools import combinations
 
 import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration.assembly import Pivots
 from sl_nerfstudio.registration.pairs import PairMatch
-from sl_nerfstudio.registration.view_graph import compared_pairs, without_slipping
+from sl_nerfstudio.registration.surfaces import build_surface_map
+from sl_nerfstudio.registration.view_graph import (
+    compared_pairs,
+    starting_similarities,
+    with_common_centre,
+    with_confirmed_tones,
+    without_slipping,
+)
+from tests.bundle_adjustment.analytic import rig_of
+from tests.registration.analytic_clouds import clouds_of
+
+# Which pairs are compared.
 
 
-def test_of_a_few_frames_all_pairs_are_compared_in_order():
-    rank = np.random.default_rng(0).random((7, 7))
-    assert compared_pairs(rank, 6) == list(combinations(range(7), 2))
+def test_of_a_few_frames_all_pairs_are_compared_and_of_many_those_that_see_nearly_the_same():
+    assert compared_pairs(np.random.default_rng(0).random((7, 7)), 6) == list(combinations(range(7), 2))
     assert compared_pairs(np.zeros((1, 1)), 40) == []
-
-
-def test_each_of_many_frames_is_compared_with_those_that_see_nearly_the_same():
     turn = np.radians(np.arange(0, 360, 3.6))
     sight = np.stack([np.cos(turn), np.sin(turn), np.zeros(100)], 1)
     pairs = compared_pairs(-sight @ sight.T, 6)
@@ -28,20 +40,121 @@ def test_frames_without_a_pose_come_last():
     assert all(2 in pair for pair in set(combinations(range(5), 2)) - set(compared_pairs(rank, 3)))
 
 
-def pair(source: int, target: int, slip_deg: float = 0.0) -> PairMatch:
-    return PairMatch(source, target, Similarity.identity(), np.eye(7), 0.5, 0.9, 0.02, (), 0.5, slip_deg, np.zeros(7))
+# Pairs that slip, and pairs that only tones hold: frames of one walk about an axis, `deg` apart.
+
+AXIS = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the motion along which frames slip: about y
+CENTRE = np.array([0.1, 0.0, -3.0])
+PIVOTS = Pivots(np.tile(CENTRE, (4, 1)), np.ones(4))
 
 
-COMPONENT = dict.fromkeys((0, 1, 2), Similarity.identity())
+def pair(source: int, target: int, deg: float = 20.0, slip: float = 0.0, shape_slip: float = 0.0) -> PairMatch:
+    """Two frames; tones hold them if their shapes slip by more than the pair."""
+    R = Rotation.from_rotvec([0, np.radians(deg), 0]).as_matrix()
+    S = Similarity(1.0, R, CENTRE - R @ CENTRE)
+    return PairMatch(source, target, S, 1e4 * np.eye(7), 0.6, 0.98, 0.01, (), 0.5, slip, AXIS, max(shape_slip, slip))
 
 
-def test_pairs_that_slip_say_nothing_about_frames_that_others_hold():
+def toned(source: int, target: int, deg: float) -> PairMatch:
+    return pair(source, target, deg, shape_slip=12.0)
+
+
+def test_pairs_that_slip_count_only_where_nothing_else_holds_a_frame():
     """Bounded slips hold; slips to frames that are not in the component stay."""
-    firm, bounded, slipping, outside = pair(0, 1), pair(2, 1, 4.0), pair(0, 2, 12.0), pair(3, 0, 12.0)
-    assert without_slipping([firm, slipping, bounded, outside], COMPONENT, 4.0) == [firm, bounded, outside]
+    component = dict.fromkeys((0, 1, 2), Similarity.identity())
+    firm, bounded, slipping, outside = pair(0, 1), pair(2, 1, slip=4.0), pair(0, 2, slip=12.0), pair(3, 0, slip=12.0)
+    assert without_slipping([firm, slipping, bounded, outside], component) == [firm, bounded, outside]
+    edges = [pair(0, 1), pair(0, 2, slip=12.0), pair(1, 2, slip=8.0)]
+    assert without_slipping(edges, component) == edges
+    assert without_slipping([], {0: Similarity.identity()}) == []
 
 
-def test_pairs_that_slip_stay_where_nothing_else_holds_a_frame():
-    edges = [pair(0, 1), pair(0, 2, 12.0), pair(1, 2, 8.0)]
-    assert without_slipping(edges, COMPONENT, 4.0) == edges
-    assert without_slipping([], {0: Similarity.identity()}, 4.0) == []
+@pytest.mark.parametrize("last", [toned(0, 2, 45), toned(2, 0, -45)], ids=["forwards", "backwards"])
+def test_three_pairs_that_close_a_cycle_confirm_each_other_and_others_slip(last):
+    edges = [toned(0, 1, 20), toned(1, 2, 25), last, toned(0, 3, 60), toned(1, 3, 100)]
+    found = with_confirmed_tones(edges, PIVOTS)
+    assert found[:3] == edges[:3] and all(e.by_tone for e in found[:3])
+    assert [(e.by_tone, e.slip_deg) for e in found[3:]] == [(False, 12.0)] * 2
+
+
+def test_pairs_that_surfaces_hold_confirm_tones_and_pairs_that_slip_do_not():
+    firm, slipping = pair(1, 2, 25), pair(1, 2, 25, slip=12.0)
+    for third, confirmed in ((firm, True), (slipping, False)):
+        found = with_confirmed_tones([toned(0, 1, 20), third, toned(0, 2, 45)], PIVOTS)
+        assert [e.by_tone for e in found] == [confirmed, False, confirmed]
+    assert with_confirmed_tones([firm], PIVOTS) == [firm]
+
+
+def test_a_pair_without_its_tone_is_as_uncertain_as_its_surfaces_leave_it():
+    """Variances of independent motions add: along the slip it is larger by the slip's square, elsewhere the same."""
+    held = toned(0, 1, 20)
+    free = held.without_tone()
+    before, after = np.linalg.inv(held.information), np.linalg.inv(free.information)
+    np.testing.assert_allclose(after, before + np.radians(12) ** 2 * np.outer(AXIS, AXIS), atol=1e-9)
+    assert free.rotation_sigma_deg == pytest.approx(np.hypot(12, np.degrees(0.01)), rel=1e-6)
+    assert free.slip_deg == 12 and not free.by_tone and held.by_tone
+
+
+# Rough camera poses as a start: baselines, and a common centre.
+
+FRAMES = 6
+RIG = rig_of(FRAMES, 60)
+POSES = RIG.T_world_camera.numpy()
+MAPS = [build_surface_map(c) for c in clouds_of(RIG, 60)]
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.floats(0.01, 100))
+def test_baselines_are_about_right_whatever_the_axes_and_the_unit(seed, unit):
+    """Centroids of the visible parts differ, so lengths are only about right."""
+    reference = starting_similarities(POSES, MAPS)
+    true = RIG.T_camera_projector[:, :3, 3].norm(dim=-1).numpy()
+    np.testing.assert_allclose([S.scale for S in reference.values()], true, rtol=0.25)
+    T = POSES.copy()
+    T[:, :3, 3] *= unit
+    world = np.eye(4)
+    world[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    world[:3, 3] = unit * np.random.default_rng(seed).normal(size=3)
+    T = world @ T
+    found = starting_similarities(T, MAPS)
+    assert list(found) == list(range(FRAMES))
+    for k, S in found.items():
+        np.testing.assert_array_equal(S.R, T[k, :3, :3])
+        np.testing.assert_array_equal(S.t, T[k, :3, 3])
+        assert S.scale == pytest.approx(unit * reference[k].scale, rel=1e-9)
+
+
+def test_frames_without_a_pose_have_no_start():
+    T = POSES.copy()
+    T[2] = np.nan
+    T[4, 0, 0] = np.nan
+    found = starting_similarities(T, MAPS)
+    assert list(found) == list(with_common_centre(found, MAPS)) == [0, 1, 3, 5]
+    none = starting_similarities(np.full_like(POSES, np.nan), MAPS)
+    assert none == with_common_centre(none, MAPS) == {}
+
+
+def test_a_camera_that_looks_away_gets_the_distance_of_the_others():
+    T = POSES.copy()
+    T[1, :3, :3] = T[1, :3, :3] @ np.diag([1.0, -1, -1])  # the object is behind it
+    found = starting_similarities(T, MAPS)
+    distances = [S.scale * np.linalg.norm(m.centroid) for S, m in zip(found.values(), MAPS, strict=True)]
+    assert distances[1] == pytest.approx(np.median(np.delete(distances, 1)), rel=0.2)
+    assert min(distances) > 0
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6))
+def test_all_frames_look_at_one_centre_and_keep_their_rotations(seed):
+    T = POSES.copy()
+    turns = Rotation.from_rotvec(np.random.default_rng(seed).normal(0, np.radians(8), (FRAMES, 3))).as_matrix()
+    T[:, :3, :3] = T[:, :3, :3] @ turns
+    rough = starting_similarities(T, MAPS)
+    found = with_common_centre(rough, MAPS)
+    before, after = (
+        np.array([S.points(m.views[0].centre[None])[0] for S, m in zip(some.values(), MAPS, strict=True)])
+        for some in (rough, found)
+    )
+    np.testing.assert_allclose(after, np.tile(np.median(before, axis=0), (FRAMES, 1)), atol=1e-9)
+    for k, S in found.items():
+        np.testing.assert_array_equal(S.R, rough[k].R)
+        assert S.scale == rough[k].scale

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from training.edge_captures import edge_capture
-from training.objects import SIZE, random_object
-from training.rendered_captures import rendered_captures
+from training.rendered_captures import SIZE, random_object, rendered_captures
 
 
 @pytest.mark.parametrize("seed", range(12))

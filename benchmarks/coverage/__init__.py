@@ -1,1 +1,0 @@
-"""Does the stated uncertainty of poses and lengths cover the errors?"""

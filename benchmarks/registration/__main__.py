@@ -1,5 +1,0 @@
-"""`python -m benchmarks.registration`: see `walks`."""
-
-from benchmarks.registration.walks import main
-
-main()

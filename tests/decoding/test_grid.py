@@ -1,0 +1,135 @@
+"""Captures with exact truth, decoded by the shipped networks."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import sl_nerfstudio.decoding
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.pattern.grid import GridPattern, projected_light
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import make_setup
+
+PIXELS_A_PERIOD = 7.0
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return make_setup(SynthConfig(resolution=280, frames=2, seed=3))
+
+
+@pytest.fixture(scope="module")
+def decoder():
+    return GridImageDecoder(GridPattern())
+
+
+@pytest.fixture(scope="module")
+def truth(setup):
+    return setup.render(0, 2)
+
+
+@pytest.fixture(scope="module")
+def image(truth):
+    return disturb_image(truth.radiance, 1.05, 0.012, np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def decoded(decoder, image):
+    return decoder.decode(image)
+
+
+def test_most_lit_pixels_are_decoded_and_hardly_any_wrongly(decoded, truth):
+    both = decoded.decoded & truth.mask
+    error = np.linalg.norm(decoded.coords[both] - truth.coords[both], axis=-1)
+    assert both.sum() > 0.85 * truth.mask.sum()
+    assert np.median(error) < 0.4
+    assert (error > 10).mean() < 0.01  # half a period
+    assert (decoded.decoded & ~truth.mask).sum() < 0.03 * both.sum()
+
+
+def test_mask_and_pattern_are_what_they_say(decoded, truth):
+    assert (decoded.mask | ~decoded.decoded).all()
+    assert (decoded.mask & truth.mask).sum() > 0.93 * truth.mask.sum()
+    assert (decoded.mask & ~truth.mask).sum() < 0.08 * truth.mask.sum()
+    assert decoded.pattern.min() >= 0 and decoded.pattern.max() <= 1 and not decoded.pattern[~decoded.mask].any()
+    assert decoded.pattern[decoded.mask].std() > 0.1
+
+
+def test_light_is_what_the_surface_returns_of_the_projectors(decoder, decoded, truth, image):
+    """As measured without noise and with the true coordinates; more room light does not change it."""
+    expected = projected_light(truth.radiance, truth.coords, [decoder.pattern.render()], 0.5 * PIXELS_A_PERIOD)
+    brighter = decoder.decode(np.clip(image.astype(np.int16) + 30, 0, 255).astype(np.uint8))
+    both = np.isfinite(expected) & np.isfinite(decoded.light) & np.isfinite(brighter.light)
+    assert both.sum() > 0.95 * decoded.decoded.sum() and not np.isfinite(decoded.light[~decoded.decoded]).any()
+    assert np.corrcoef(decoded.light[both], expected[both])[0, 1] > 0.9
+    dark = both & (image < 220)
+    np.testing.assert_allclose(np.median(brighter.light[dark] / decoded.light[dark]), 1, atol=0.03)
+
+
+def test_the_shipped_weights_are_small():
+    weights = Path(sl_nerfstudio.decoding.__file__).parent / "weights"
+    assert 0 < sum(path.stat().st_size for path in weights.iterdir()) < 15e6
+
+
+def test_the_same_capture_gives_the_same_result(decoder, image, decoded):
+    again = decoder.decode(image)
+    assert np.array_equal(again.coords, decoded.coords, equal_nan=True)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_camera_held_on_its_side_or_upside_down(decoder, image, truth, turns):
+    turned = decoder.decode(np.ascontiguousarray(np.rot90(image, turns)))
+    coords = np.rot90(turned.coords, -turns)
+    both = np.isfinite(coords[..., 0]) & truth.mask
+    error = np.linalg.norm(coords[both] - truth.coords[both], axis=-1)
+    assert both.sum() > 0.85 * truth.mask.sum() and np.median(error) < 0.4 and (error > 10).mean() < 0.01
+
+
+def test_colour_and_sixteen_bits_mean_the_same(decoder, image, decoded):
+    deep = image.astype(np.uint16) * 257
+    assert np.array_equal(decoder.decode(deep).decoded, decoded.decoded)
+    colour = decoder.decode(np.repeat(image[..., None], 3, -1))
+    both = colour.decoded & decoded.decoded
+    assert both.sum() > 0.98 * decoded.decoded.sum()
+    assert np.median(np.abs(colour.coords[both] - decoded.coords[both])) < 0.01
+
+
+@pytest.mark.parametrize("value", [0, 130, 255])
+def test_a_blank_image_is_refused(decoder, value):
+    with pytest.raises(DecodingError, match=r"blank.*\n.*projector was off.*\n.*capture it again"):
+        decoder.decode(np.full((240, 320), value, np.uint8))
+
+
+@pytest.mark.parametrize("kind", ["noise", "smooth", "stripes"])
+def test_an_image_without_the_grid_is_refused(decoder, kind):
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (240, 320)).astype(np.uint8)
+    picture = {
+        "noise": noise,
+        "smooth": cv2.GaussianBlur(noise, (0, 0), 12),
+        "stripes": np.broadcast_to((np.arange(320) % 16 < 4) * np.uint8(200), (240, 320)).copy(),
+    }[kind]
+    with pytest.raises(DecodingError, match=r"cause:.*\n *remedy:"):
+        decoder.decode(picture)
+
+
+def test_another_pattern_is_refused(image):
+    other = GridImageDecoder(
+        GridPattern(seed=77, codes=np.random.default_rng(8).integers(0, 5, (40, 40)).astype(np.int8))
+    )
+    with pytest.raises(DecodingError, match=r"crossings.*, but only(.|\n)*another pattern(.|\n)*pattern\.json"):
+        other.decode(image)
+
+
+def test_a_mirrored_image_is_refused(decoder, image):
+    with pytest.raises(DecodingError, match="mirrored"):
+        decoder.decode(np.ascontiguousarray(image[:, ::-1]))
+
+
+def test_a_tiny_image_is_refused(decoder):
+    with pytest.raises(DecodingError):
+        decoder.decode(np.random.default_rng(0).integers(0, 255, (20, 30)).astype(np.uint8))

@@ -1,0 +1,294 @@
+"""Which node is which: the graph network, window matching, and consensus among neighbours."""
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.baselines.window_matching import match_windows
+from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.decoding.grid_detection import (
+    MIRRORED_SYMBOL,
+    NodeRecogniser,
+    edge_width,
+    line_blur,
+    measure_exposure,
+    measure_noise,
+    mirrored,
+    shows_readable_symbols,
+)
+from sl_nerfstudio.decoding.grid_graph import (
+    OFFSETS,
+    GridGraph,
+    agree,
+    believe,
+    neighbourhoods,
+    one_hot,
+    turned_pattern,
+)
+from sl_nerfstudio.decoding.grid_phases import GridAppearance, rectify
+from sl_nerfstudio.pattern.codes import code_array, rotate_codes
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.devices import disturb_image
+from sl_nerfstudio.synthesis.synthesise import make_setup
+from tests.decoding.test_grid_graph import lattice
+from tests.decoding.test_grid_phases import maps_of
+from training.graphs import Damage, damage_graph
+
+CODES = code_array(20, 24, seed=5)
+
+
+@pytest.fixture(scope="module")
+def recogniser():
+    return NodeRecogniser(GridPattern(w=480, h=400, codes=CODES))
+
+
+def graphs(damage, count=6):
+    for index in range(count):
+        rng = np.random.default_rng([9, index])
+        yield damage_graph(rng, CODES, damage, index % 4, 0.5)
+
+
+def test_turned_pattern_lists_every_node_of_every_turn():
+    pattern = turned_pattern(CODES)
+    assert len(pattern.symbol) == 4 * CODES.size
+    for turn in range(4):
+        mine = pattern.turn == turn
+        turned = rotate_codes(CODES, turn)
+        assert (pattern.symbol[mine] == turned[tuple(pattern.place[mine].T)]).all()
+        for k, (di, dj) in enumerate(OFFSETS):
+            around = pattern.around[mine, k]
+            assert (pattern.place[around[around >= 0]] == pattern.place[mine][around >= 0] + (di, dj)).all()
+            assert (pattern.turn[around[around >= 0]] == turn).all()
+
+
+@pytest.mark.parametrize(
+    "damage, most_wrong",
+    [
+        (Damage(0, 0, 0), 0.002),
+        (Damage(0.1, 0.2), 0.005),
+        (Damage(0.2, 0.2), 0.01),
+        (Damage(0.2, 0.1, torn=True), 0.06),
+    ],
+)
+def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(recogniser, damage, most_wrong):
+    right = wrong = total = 0
+    for graph in graphs(damage):
+        assignment = recogniser.assign(graph.as_grid())
+        assert assignment.turn == graph.turn
+        same = (assignment.place == graph.place).all(-1)
+        right, total = right + same.sum(), total + len(same)
+        wrong += (~same & assignment.known).sum()
+    assert right > 0.93 * total and wrong <= most_wrong * total
+
+
+def test_the_graph_network_beats_window_matching_on_damaged_graphs(recogniser):
+    pattern = turned_pattern(CODES)
+    for misread in (0.1, 0.2, 0.3):
+        network = windows = total = 0
+        for graph in graphs(Damage(misread, 0.2)):
+            around = neighbourhoods(graph.neighbour)
+            judged = recogniser.logits(graph.as_grid()).argmax(1).numpy()
+            true = (pattern.turn == graph.turn) & (pattern.place[:, None] == graph.place).all(-1).T  # node, candidate
+            rows = np.arange(len(graph.place))
+            network += true[rows, judged].sum()
+            matched = match_windows(graph.score, around, pattern)
+            windows += (true[rows, matched] & (matched >= 0)).sum()
+            total += len(rows)
+        assert network > windows + 0.1 * total
+
+
+def test_window_matching_corrects_one_symbol_and_is_certain_without_damage():
+    pattern = turned_pattern(CODES)
+    rng = np.random.default_rng(0)
+    graph = damage_graph(rng, CODES, Damage(0, 0, 0), 1, 1.0)
+    around = neighbourhoods(graph.neighbour)
+    score = one_hot(rotate_codes(CODES, 1)[tuple(graph.place.T)]).numpy()
+    hurt = score.copy()
+    hurt[100] = np.roll(hurt[100], 1)
+    for scores in (score, hurt):
+        matched = match_windows(scores, around, pattern)
+        assert (matched >= 0).mean() > 0.99
+        assert (pattern.place[matched[matched >= 0]] == graph.place[matched >= 0]).all()
+        assert (pattern.turn[matched[matched >= 0]] == 1).all()
+
+
+def test_small_pieces_that_fit_several_places_are_dropped():
+    codes = np.tile(np.arange(4, dtype=np.int8).reshape(2, 2), (6, 6))  # the same windows everywhere
+    index = np.arange(9).reshape(3, 3)
+    neighbour = np.full((9, 4), -1, dtype=np.int32)
+    neighbour[index[:, :-1], 0], neighbour[index[:, 1:], 2] = index[:, 1:], index[:, :-1]
+    neighbour[index[:-1], 1], neighbour[index[1:], 3] = index[1:], index[:-1]
+    score = np.eye(5, dtype=np.float32)[codes[4:7, 4:7].reshape(-1)]
+    belief = np.full((9, 12, 12), -8, dtype=np.float32)
+    for k in range(9):
+        belief[k, 4 + k // 3, 4 + k % 3] = 0  # every node is certain, and all agree
+    graph = GridGraph(np.zeros((9, 2), np.float32), neighbour, score)
+    assert (agree(believe(belief, neighbour), graph, codes) < 0).all()
+    unique = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
+    certain = GridGraph(graph.place, neighbour, np.eye(5, dtype=np.float32)[unique[4:7, 4:7].reshape(-1)])
+    settled = agree(believe(belief, neighbour), certain, unique)
+    assert (settled >= 0).all() and (settled[0] == (4, 4)).all()
+
+
+# A refused capture is told the causes that it has, each by its own measurement, and no others.
+
+
+CAUSES = {
+    "another pattern": "it shows another pattern",
+    "mirrored": "is mirrored:",
+    "blurred": "is blurred:",
+    "too dark": "is too dark",
+    "saturated": "is saturated:",
+    "out of view": "is out of view",
+    "too weak": "is too weak",
+}
+
+
+@pytest.fixture(scope="module")
+def radiance():
+    return make_setup(SynthConfig(resolution=280, frames=2, seed=3)).render(0, 2).radiance
+
+
+@pytest.fixture(scope="module")
+def right():
+    return GridImageDecoder(GridPattern())
+
+
+@pytest.fixture(scope="module")
+def other():
+    codes = np.random.default_rng(8).integers(0, 5, (40, 40)).astype(np.int8)
+    return GridImageDecoder(GridPattern(codes=codes))
+
+
+def capture(radiance, gain=1.05, blur=0.0, turned=False):
+    light = cv2.GaussianBlur(radiance, (0, 0), blur) if blur > 0 else radiance
+    image = disturb_image(light, gain, 0.012, np.random.default_rng(0))
+    return np.ascontiguousarray(image[:, ::-1]) if turned else image
+
+
+def causes_told(decoder, image):
+    with pytest.raises(DecodingError) as caught:
+        decoder.decode(image)
+    assert caught.value.remedy
+    words = caught.value.cause
+    found = {name for name, part in CAUSES.items() if part in words}
+    assert found or "not known" in words
+    return found
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ({"turned": True}, {"mirrored"}),
+        ({"blur": 3.0}, {"blurred"}),
+        ({"gain": 0.012}, {"too dark"}),
+        ({"gain": 40.0}, {"saturated"}),
+    ],
+)
+def test_one_fault_is_told_alone(right, radiance, fault, told):
+    assert causes_told(right, capture(radiance, **fault)) == told
+
+
+def test_another_pattern_is_told_alone(other, radiance):
+    assert causes_told(other, capture(radiance)) == {"another pattern"}
+
+
+def test_a_scene_without_the_pattern_is_out_of_view(right):
+    scene = np.full((240, 300), 60, np.uint8)
+    cv2.circle(scene, (120, 100), 60, (150,), -1)
+    cv2.rectangle(scene, (200, 30), (260, 200), (20,), -1)
+    noise = np.random.default_rng(0).normal(0, 1.5, scene.shape)
+    assert causes_told(right, np.clip(scene + noise, 0, 255).astype(np.uint8)) == {"out of view"}
+
+
+def test_two_faults_are_both_told(right, other, radiance):
+    assert causes_told(right, capture(radiance, gain=10.0, turned=True)) == {"mirrored", "saturated"}
+    assert causes_told(other, capture(radiance, gain=10.0)) <= {"another pattern", "saturated"}
+
+
+def test_of_two_faults_one_may_hide_the_other_but_none_is_made_up(right, other, radiance):
+    assert causes_told(right, capture(radiance, gain=0.02, blur=3.0)) <= {"too dark", "blurred"}
+    assert causes_told(other, capture(radiance, gain=0.012)) == {"too dark"}  # its symbols cannot be read
+    assert causes_told(other, capture(radiance, turned=True)) == {"another pattern"}
+
+
+@pytest.mark.parametrize("texture", ["checks", "noise", "bricks"])
+def test_texture_behind_the_object_is_no_reason_to_refuse(right, texture):
+    truth = make_setup(SynthConfig(resolution=280, frames=2, seed=3)).render(1, 2)
+    y, x = np.mgrid[:280, :280]
+    behind = {
+        "checks": (x // 7 + y // 7) % 2,
+        "noise": cv2.GaussianBlur(np.random.default_rng(0).normal(0.5, 2, (280, 280)), (0, 0), 1.5),
+        "bricks": ((x + 9 * (y // 10 % 2)) % 18 > 2) & (y % 10 > 1),
+    }[texture]
+    light = np.where(truth.mask, truth.radiance, 0.25 + 0.35 * np.clip(behind, 0, 1)).astype(np.float32)
+    decoded = right.decode(disturb_image(light, 1.05, 0.012, np.random.default_rng(0)))
+    both = decoded.decoded & truth.mask
+    error = np.linalg.norm(decoded.coords[both] - truth.coords[both], axis=-1)
+    assert both.sum() > 0.75 * truth.mask.sum() and (error > 10).mean() < 0.02
+    assert (decoded.decoded & ~truth.mask).sum() < 0.08 * both.sum()
+
+
+def test_noise_and_contrast_are_measured():
+    rng, x = np.random.default_rng(0), np.arange(300, dtype=np.float32)
+    wave = np.broadcast_to(0.4 + 0.1 * np.sin(2 * np.pi * x / 14), (300, 300)).astype(np.float32)
+    noisy = wave + rng.normal(0, 0.02, wave.shape).astype(np.float32)
+    assert measure_noise(noisy) == pytest.approx(0.02, rel=0.1)
+    exposure = measure_exposure(noisy)
+    assert exposure.contrast == pytest.approx(0.1 / np.sqrt(2), rel=0.15)
+    assert exposure.saturated == 0 and exposure.bright == pytest.approx(0.5, abs=0.06)
+    noisy[:75] = 1
+    assert measure_exposure(noisy).saturated == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_the_width_of_edges_is_measured(sigma):
+    image = np.zeros((200, 200), np.float32)
+    image[:, 100:] = 0.7
+    blurred = cv2.GaussianBlur(image, (0, 0), sigma) + np.random.default_rng(0).normal(0, 0.004, image.shape)
+    assert edge_width(blurred.astype(np.float32)) == pytest.approx(sigma, rel=0.2)
+
+
+@pytest.mark.parametrize("sigma", [0.06, 0.12, 0.2])
+def test_the_blur_of_lines_is_measured(sigma):
+    pattern = GridPattern(w=400, h=400)
+    drawn = cv2.GaussianBlur(pattern.render(), (0, 0), sigma * pattern.period)
+    image = (0.1 + 0.6 * drawn + np.random.default_rng(0).normal(0, 0.01, drawn.shape)).astype(np.float32)
+    rectified = rectify(image, GridAppearance(pattern.period, 0.0))
+    maps = maps_of(rectified, 14.0, 0.0)
+    shift = np.pi * np.ones((2, *maps.mask.shape), np.float32)  # the first node lies half a period from the corner
+    vector = maps.vector * np.cos(shift[0])
+    measured = line_blur(rectified, type(maps)(maps.mask, vector, maps.symbol, maps.gradient), maps.mask > 0, pattern)
+    assert measured == pytest.approx(sigma, abs=0.03)
+
+
+def test_a_mirrored_grid_has_mirrored_symbols():
+    codes = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
+    swapped = np.array(MIRRORED_SYMBOL, dtype=np.int8)[codes[:, ::-1]]
+    one, two = (GridPattern(w=240, h=240, codes=c).render() for c in (codes, swapped))
+    np.testing.assert_allclose(one[:, ::-1], two, atol=1e-5)
+
+
+def test_mirroring_twice_changes_nothing():
+    _, cells, neighbour = lattice(4, 5)
+    score = np.random.default_rng(0).random((len(cells), 5)).astype(np.float32)
+    graph = GridGraph(np.array(cells, dtype=np.float32)[:, ::-1], neighbour, score)
+    once, twice = mirrored(graph), mirrored(mirrored(graph))
+    assert not np.array_equal(once.neighbour, graph.neighbour)
+    for a, b in zip(
+        (twice.place, twice.neighbour, twice.score), (graph.place, graph.neighbour, graph.score), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_symbols_are_readable_only_in_a_consistent_grid_of_all_five():
+    _, cells, neighbour = lattice(8, 9)
+    place = np.array(cells, dtype=np.float32)[:, ::-1]
+    symbol = np.random.default_rng(1).integers(0, 5, len(cells))
+    certain = np.eye(5, dtype=np.float32)[symbol]
+    assert shows_readable_symbols(GridGraph(place, neighbour, certain))
+    assert not shows_readable_symbols(GridGraph(place, neighbour, 0.2 + 0.2 * (certain - 0.2)))  # uncertain
+    assert not shows_readable_symbols(GridGraph(place, neighbour, np.eye(5, dtype=np.float32)[symbol % 2]))
+    assert not shows_readable_symbols(GridGraph(place, np.full_like(neighbour, -1), certain))
