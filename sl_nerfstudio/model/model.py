@@ -16,7 +16,6 @@ from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration, constrained
-from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
 from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
@@ -163,7 +162,7 @@ class SLModel(Model):
         self.cache = CachedGrid()
         self._cache_is_old = False  # True after a checkpoint was loaded for inspection
         rig = scene_rig(self.scan, self.S_scene_world)
-        self.device_poses = self._pose_parameters(rig)
+        self.device_poses = pose_parameters(self.config, rig.T_world_camera, rig.T_world_projector)
         self.measured = MeasuredCoordinates(self.scan)
         projector = Intrinsics.of(self.scan.projector)
         self._projector_kind: DeviceKind = projector.model
@@ -188,24 +187,6 @@ class SLModel(Model):
         self.register_load_state_dict_post_hook(_read_step)
         self.history_table = History(("loss", "coordinate_px", "pattern_cosine", "eikonal", "surface"))
         self.viewed_frame = 0
-
-    def _pose_parameters(self, rig: Rig) -> PoseParameters:
-        """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
-        free, independent = self.config.refine_poses, self.config.pose_method == "render-independently"
-        moves: ProjectorMoves = "relative pose"
-        if free == "static-projector":
-            moves = "nothing"
-        elif independent and free not in ("known-rig", "rigid-rig"):
-            moves = "own pose"
-        return PoseParameters(
-            rig.T_world_camera,
-            rig.T_world_projector,
-            refine=self.config.renders_poses,
-            refine_projector=free not in ("known-rig", "static-projector"),
-            shared_projector=free == "rigid-rig",
-            about_scene=free == "static-projector" or not independent,
-            projector_moves_by=moves,
-        )
 
     # ---- for other parts of the package
 
@@ -487,6 +468,27 @@ class SLModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Rendered and captured images side by side, for one whole frame."""
         return image_metrics_and_images(outputs, batch)
+
+
+def pose_parameters(
+    config: SLModelConfig, T_scene_camera: Float[Tensor, "frames 4 4"], T_scene_projector: Float[Tensor, "frames 4 4"]
+) -> PoseParameters:
+    """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
+    free, independent = config.refine_poses, config.pose_method == "render-independently"
+    moves: ProjectorMoves = "relative pose"
+    if free == "static-projector":
+        moves = "nothing"
+    elif independent and free not in ("known-rig", "rigid-rig"):
+        moves = "own pose"
+    return PoseParameters(
+        T_scene_camera,
+        T_scene_projector,
+        refine=config.renders_poses,
+        refine_projector=free not in ("known-rig", "static-projector"),
+        shared_projector=free == "rigid-rig",
+        about_scene=free == "static-projector" or not independent,
+        projector_moves_by=moves,
+    )
 
 
 def _read_step(model: SLModel, _: object) -> None:

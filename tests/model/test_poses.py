@@ -1,6 +1,5 @@
 """Poses as parameters: increments, derivatives, other base poses, and what each choice keeps fixed."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.geometry.lie import exp_se3, inverse
-from sl_nerfstudio.model.model import SLModel, SLModelConfig
+from sl_nerfstudio.model.model import SLModelConfig, pose_parameters
 from sl_nerfstudio.model.poses import PoseParameters
 
 FRAMES = 3
@@ -134,8 +133,7 @@ def test_every_choice_moves_what_it_says_and_keeps_the_rest_fixed(free, method):
     """One choice of what is free and one of how it is refined: no combination contradicts itself."""
     settings = SLModelConfig(refine_poses=free, pose_method=method)
     start, light = random_poses(0), random_poses(1)
-    rig = SimpleNamespace(T_world_camera=start, T_world_projector=light)
-    poses = SLModel._pose_parameters(SimpleNamespace(config=settings), rig).double()
+    poses = pose_parameters(settings, start, light).double()
     moves = free != "off" and method != "adjust"
     assert settings.renders_poses == moves and settings.adjusts_poses == (free != "off" and method == "adjust")
     assert poses.camera_step.requires_grad == moves
