@@ -32,7 +32,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     restore,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, hat, inverse, log_se3
 from sl_nerfstudio.synthesis.config import SynthConfig

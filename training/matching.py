@@ -1,4 +1,4 @@
-"""Fit the logistic model that tells right matches from wrong ones (`sl_nerfstudio/matching/confidence.py`).
+"""Fit the logistic model that tells right matches from wrong ones (`sl_nerfstudio/matching/matcher.py`).
 
     python -m training.matching --output outputs/training/matching [--objects 40] [--frames 3] [--jobs 2] [--seed 0]
 
@@ -19,8 +19,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.grid import GridImageDecoder
-from sl_nerfstudio.matching.lines import MATCHING_DEFAULTS, EpipolarLines, pixels_a_period
-from sl_nerfstudio.matching.matcher import FEATURES, DecodedImage, LineMatcher, Logistic
+from sl_nerfstudio.matching.lines import EpipolarLines, pixels_a_period
+from sl_nerfstudio.matching.matcher import FEATURES, NEAR, DecodedImage, LineMatcher, Logistic
 from sl_nerfstudio.parallel import only_one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
@@ -97,7 +97,7 @@ def _samples(seed: int, number: int, frames: int) -> Iterator[Sample]:
             continue
         features, error, seen = found
         index = rng.permutation(np.flatnonzero(seen.ravel()))[:_SAMPLES]
-        right = error.ravel()[index] < MATCHING_DEFAULTS.keeping.near * capture.grid.period  # False for NaN
+        right = error.ravel()[index] < NEAR * capture.grid.period  # False for NaN
         yield features.reshape(-1, len(FEATURES))[index], right
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from benchmarks.baselines.tsdf import backprojected, depth_maps, object_size
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.console import track
 from sl_nerfstudio.dataparser.dataparser import load_scan
 from sl_nerfstudio.geometry.lie import DevicePoses

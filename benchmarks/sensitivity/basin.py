@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.common.measuring import Rows, options
 from benchmarks.common.runs import made_once
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan

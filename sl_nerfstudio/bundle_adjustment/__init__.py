@@ -1,4 +1,4 @@
-"""Joint adjustment of all poses, and of the intrinsics on request, by second-order steps on decoded coordinates.
+"""Bundle adjustment: all poses together, and the intrinsics on request, from decoded coordinates.
 
 In: a `Rig` of starting poses, the coordinate images of all frames, a prior with the stated uncertainties, and which
 parameters are free. Out: the adjusted `Rig`, its covariance, and how well the intrinsics agree with the captures; facts

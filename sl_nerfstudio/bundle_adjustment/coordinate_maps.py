@@ -8,18 +8,30 @@ the adjustment would turn that offset into wrong poses.)
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt64
+from jaxtyping import Bool, Float, Float64, Int, Int64, UInt64
 from numpy import ndarray
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
-from sl_nerfstudio.parallel import compiled, compiled_range
+from sl_nerfstudio.parallel import compiled, compiled_range, results
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
-# Which entries of an array belong to the same frame or the same anchor.
+HALF_WINDOW = 3  # camera pixels to each side of the window in which a paraboloid is fitted
+WIDE_HALF_WINDOW = 12  # for derivatives that say how much residuals know: about a period of the pattern, within which
+# errors of coordinates are shared; derivatives of smaller windows are noisy, which looks like information
+_LEAST_PIXELS = 24  # decoded pixels that a window of HALF_WINDOW must hold
+_LEAST_PIVOT = 1e-3  # share of a pivot that elimination must leave; below it the window's pixels lie on a conic
+_ROUGHNESS_PX = 2.0  # RMS distance of a window from its paraboloid, pattern pixels: beyond, the map is discontinuous
+_ROUGHNESS_MEDIANS = 3.0  # the same limit in roughnesses of the median window; the larger limit applies
+FARTHEST = 255  # steps from the border of what was decoded: larger distances are not told apart
+_SAMPLED_WINDOWS = 200  # windows of each frame from which that median is taken
+
+# Groups of the entries of an array, such as the rows of each frame or each anchor.
 
 
 @dataclass(frozen=True)
@@ -31,7 +43,7 @@ class Groups:
 
     @staticmethod
     def of(key: Int64[ndarray, "n"], groups: int) -> "Groups":
-        """From the group of each entry."""
+        """Group entries by a key."""
         first, entries = np.zeros(groups + 1, dtype=np.int64), np.empty(len(key), dtype=np.int64)
         _group(np.ascontiguousarray(key), first, entries)
         return Groups(first, entries)
@@ -50,7 +62,7 @@ def _group(key, first, entries):
         place[key[n]] += 1
 
 
-# Random bits from a number, the same in any order and on any number of threads.
+# Random bits that depend on a number alone: the same in any order and on any number of threads.
 
 
 @compiled
@@ -68,8 +80,6 @@ def uniform(bits):
     return np.float64(bits >> np.uint64(11)) / 9007199254740992.0
 
 
-# Which pixels of many images have a coordinate, and where it is among all that there are.
-#
 # Only decoded pixels are stored: most of an image shows something else. A bit for each pixel says whether it has a
 # coordinate; with the number of those before each word of 64 bits, its place follows from a count of bits (rank:
 # Jacobson, "Space-efficient static trees and graphs", 1989).
@@ -92,7 +102,7 @@ class PixelIndex:
 
     @staticmethod
     def of(known: Sequence[UInt64[ndarray, "_h _words"]], widths: Sequence[int]) -> "PixelIndex":
-        """From the words of each frame's rows (`packed`)."""
+        """Index the words of each frame's rows (`packed`)."""
         counts = np.array([part.size for part in known], dtype=np.int64)
         words = np.empty((int(counts.sum()), 2), dtype=np.uint64)
         np.concatenate([part.ravel() for part in known], out=words[:, 0])
@@ -102,18 +112,14 @@ class PixelIndex:
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """For compiled loops."""
+        """The parts for compiled loops."""
         return self.words, self.first, self.widths, self.heights
 
-    def image(self, values: Float32[ndarray, "decoded 2"], frame: int) -> Float32[ndarray, "h w 2"]:
-        """One frame, NaN where nothing is known."""
+    def known(self, frame: int) -> Bool[ndarray, "h w"]:
+        """Which pixels of a frame have a coordinate."""
         w, h, first = self.widths[frame], self.heights[frame], self.first[frame]
         rows = self.words[first : first + h * words_of(w), 0].reshape(h, -1)
-        known = np.unpackbits(rows.astype("<u8").view(np.uint8), axis=1, count=w, bitorder="little").view(np.bool_)
-        out = np.full((h, w, 2), np.nan, dtype=np.float32)
-        start = int(self.words[first, 1])
-        out[known] = values[start : start + int(known.sum())]
-        return out
+        return np.unpackbits(rows.astype("<u8").view(np.uint8), axis=1, count=w, bitorder="little").view(np.bool_)
 
 
 def packed(known: Bool[ndarray, "h w"]) -> UInt64[ndarray, "h words"]:
@@ -176,126 +182,35 @@ def _count_before(words):
         total += _bits_of(words[k, 0])
 
 
-# How far pixels are from the border of what was decoded, in compiled loops.
-
-FARTHEST = 255
-
-
-@compiled_range
-def border_distances(first, last, index, starts, entries, pixel, found):
-    """Steps (also diagonal ones) to the nearest pixel without a coordinate or outside, up to `FARTHEST`.
-
-    `entries[starts[f] : starts[f + 1]]` are the positions in frame f, at `pixel` of it, or outside where that is
-    negative.
-    """
-    words, first_words, widths, heights = index
-    for f in range(first, last):
-        if starts[f] == starts[f + 1]:
-            continue
-        steps = np.zeros(widths[f] * heights[f], dtype=np.uint8)
-        _steps(words, first_words[f], widths[f], heights[f], steps)
-        for k in entries[starts[f] : starts[f + 1]]:
-            found[k] = steps[pixel[k]] if pixel[k] >= 0 else 0
-
-
 @compiled
-def _steps(words, first_word, w, h, out):
-    """Of one frame, by two passes over it (Rosenfeld and Pfaltz, Pattern Recognition, 1968)."""
-    for y in range(h):
-        row_word = first_word + y * words_of(w)
-        for x in range(w):
-            pixel = y * w + x
-            if not is_known(words, row_word, x):
-                continue
-            least = 0
-            if 0 < x < w - 1 and y > 0:
-                above = pixel - w
-                least = min(out[above - 1], out[above], out[above + 1], out[pixel - 1])
-            out[pixel] = min(least + 1, FARTHEST)
-    for y in range(h - 1, -1, -1):
-        for x in range(w - 1, -1, -1):
-            pixel = y * w + x
-            if out[pixel] == 0:
-                continue
-            least = 0
-            if 0 < x < w - 1 and y < h - 1:
-                below = pixel + w
-                least = min(out[below - 1], out[below], out[below + 1], out[pixel + 1])
-            out[pixel] = min(out[pixel], least + 1)
+def pixels_of_squares(words, first_word, w, h, step, seed, frame):
+    """One decoded pixel of each occupied square of a lattice, and random bits by which to choose among the squares.
 
-
-# Random decoded pixels, spread over the decoded part of each frame.
-
-
-@compiled_range
-def draw_pixels(first, last, frames, index, seed, pixels, counts):
-    """Up to `pixels.shape[1]` pixels of each frame, one of each occupied square of a lattice; `counts` says how many.
-
-    Both the pixel of a square and the squares are chosen by random bits of the pixels' numbers.
+    Both are random by the pixels' numbers.
     """
-    words, first_words, widths, heights = index
-    most = pixels.shape[1]
-    for k in range(first, last):
-        f = frames[k]
-        w, h, first_word = widths[f], heights[f], first_words[f]
-        decoded = known_pixels(words, first_word, w, h)
-        counts[k] = 0
-        if decoded == 0 or most == 0:
-            continue
-        step = max(1, int((decoded / most) ** 0.5))
-        across = w // step + 1
-        chosen = np.full(across * (h // step + 1), -1)
-        smallest = np.zeros(len(chosen), dtype=np.uint64)
-        for row in range(h):
-            row_word = first_word + row * words_of(w)
-            for column in range(w):
-                if is_known(words, row_word, column):
-                    n, square = row * w + column, row // step * across + column // step
-                    bits = mixed(mixed(seed, f), n)
-                    if chosen[square] < 0 or bits < smallest[square]:
-                        chosen[square], smallest[square] = n, bits
-        count = 0
-        for square in range(len(chosen)):
-            if chosen[square] >= 0:
-                chosen[count] = chosen[square]
-                smallest[count] = mixed(mixed(seed + 1, f), chosen[square])
-                count += 1
-        counts[k] = min(most, count)
-        _sort_together(smallest, chosen, count)
-        for n in range(counts[k]):
-            pixels[k, n] = chosen[n]
+    across = w // step + 1
+    chosen = np.full(across * (h // step + 1), -1)
+    smallest = np.zeros(len(chosen), dtype=np.uint64)
+    for row in range(h):
+        row_word = first_word + row * words_of(w)
+        for column in range(w):
+            if is_known(words, row_word, column):
+                n, square = row * w + column, row // step * across + column // step
+                bits = mixed(mixed(seed, frame), n)
+                if chosen[square] < 0 or bits < smallest[square]:
+                    chosen[square], smallest[square] = n, bits
+    count = 0
+    for square in range(len(chosen)):
+        if chosen[square] >= 0:
+            chosen[count] = chosen[square]
+            smallest[count] = mixed(mixed(seed + 1, frame), chosen[square])
+            count += 1
+    return chosen[:count], smallest[:count]
 
 
-@compiled
-def _sort_together(keys, values, count):
-    """Sort the first `count` keys, and values with them (heapsort); numba takes 1.5 s to compile numpy's `argsort`."""
-    start, end = count // 2, count
-    while end > 1:
-        if start > 0:  # make a heap, then take its largest again and again
-            start -= 1
-        else:
-            end -= 1
-            keys[end], keys[0] = keys[0], keys[end]
-            values[end], values[0] = values[0], values[end]
-        parent = start
-        while 2 * parent + 1 < end:
-            child = 2 * parent + 1
-            if child + 1 < end and keys[child] < keys[child + 1]:
-                child += 1
-            if not keys[parent] < keys[child]:
-                break
-            keys[parent], keys[child] = keys[child], keys[parent]
-            values[parent], values[child] = values[child], values[parent]
-            parent = child
-
-
-# Paraboloids fitted to small windows of a coordinate image, in compiled loops.
-#
-# A fit belongs to the pixel at the window's centre and serves every position within that pixel. Positions that stay
-# in
-# their pixel need no new fit: a `WindowMemory` keeps the last one of each position. Windows are fitted frame by
-# frame: if
-# the images are in a file, each of them is read once.
+# A paraboloid belongs to the pixel at its window's centre and serves every position within that pixel. Positions that
+# stay in their pixel need no new fit: a `WindowMemory` keeps the last one of each position. Windows are fitted frame by
+# frame: if the images are in a file, each of them is read once.
 
 
 @dataclass(frozen=True)
@@ -309,7 +224,7 @@ class WindowMemory:
 
     @staticmethod
     def empty(frame: Int64[ndarray, "n"]) -> "WindowMemory":
-        """Without any fit, for positions in these frames."""
+        """A memory without any fit, for positions in these frames."""
         count, frames = len(frame), int(frame.max(initial=-1)) + 1
         order = Groups.of(frame, frames).entries
         return WindowMemory(order, np.full(count, -2), np.zeros((count, 6, 2)), np.full(count, np.inf))
@@ -478,26 +393,18 @@ class MapSample:
 
 
 @dataclass(frozen=True)
-class DrawnPixels:
-    """Centres of some pixels of some frames."""
-
-    frame: Int[Tensor, "n"]
-    uv_camera: Float[Tensor, "n 2"]
-
-
-@dataclass(frozen=True)
 class CoordinateMaps:
     """Coordinate images of all frames; sizes may differ."""
 
     values: Float[Tensor, "decoded 2"]  # those that are known: all frames one after the other, rows first
     index: PixelIndex
-    settings: LookUpSettings
+    half_window: int  # camera pixels
+    least_pixels: int  # decoded pixels that a window must hold
     max_roughness: float  # projector pixels; rougher windows are discontinuous
 
     @staticmethod
-    def of(images: Iterable[Float[Tensor, "_h _w 2"]], settings: LookUpSettings | None = None) -> "CoordinateMaps":
-        """From one image per frame; sizes may differ. What is too large for memory is kept in a file."""
-        settings = settings or LookUpSettings()
+    def of(images: Iterable[Float[Tensor, "_h _w 2"]]) -> "CoordinateMaps":
+        """Maps of one image per frame; sizes may differ. What is too large for memory is kept in a file."""
         values, known, widths = GrowingArray(largest_in_memory()), [], []
         for image in images:
             coords = image.float().numpy()
@@ -505,48 +412,59 @@ class CoordinateMaps:
             values.append(coords[finite])
             known.append(packed(finite))
             widths.append(image.shape[1])
-        maps = CoordinateMaps(
-            values=torch.from_numpy(values.whole()),
-            index=PixelIndex.of(known, widths),
-            settings=settings,
-            max_roughness=settings.roughness_px,
-        )
-        return maps._with_usual_roughness(settings)
-
-    def _with_usual_roughness(self, settings: LookUpSettings) -> "CoordinateMaps":
-        """With other settings; windows count as discontinuous that are much rougher than the median one."""
-        maps = replace(self, settings=settings)
-        return replace(
-            maps, max_roughness=max(settings.roughness_px, settings.roughness_medians * maps._median_roughness())
-        )
+        index = PixelIndex.of(known, widths)
+        maps = CoordinateMaps(torch.from_numpy(values.whole()), index, HALF_WINDOW, _LEAST_PIXELS, _ROUGHNESS_PX)
+        return maps.with_windows(HALF_WINDOW)
 
     def with_windows(self, half_window: int) -> "CoordinateMaps":
-        """The same images, looked up in windows of another size, as full of decoded pixels as before."""
-        growth = (2 * half_window + 1) / (2 * self.settings.half_window + 1)
-        least = round(self.settings.least_pixels * growth**2)
-        return self._with_usual_roughness(replace(self.settings, half_window=half_window, least_pixels=least))
+        """Look the same images up in windows of another size, as full of decoded pixels as before.
+
+        Windows that are much rougher than the median one count as discontinuous.
+        """
+        growth = (2 * half_window + 1) / (2 * self.half_window + 1)
+        maps = replace(self, half_window=half_window, least_pixels=round(self.least_pixels * growth**2))
+        drawn = maps.draw(torch.arange(self.frames), _SAMPLED_WINDOWS, torch.Generator().manual_seed(0))
+        _, roughness = maps._fit(*drawn, WindowMemory.empty(drawn[0].numpy()))
+        found = roughness[torch.isfinite(roughness)]
+        usual = float(found.median()) if len(found) else 0.0
+        return replace(maps, max_roughness=max(_ROUGHNESS_PX, _ROUGHNESS_MEDIANS * usual))
 
     @property
     def frames(self) -> int:
         """Number of frames."""
         return len(self.index.first)
 
-    def draw(self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator) -> "DrawnPixels":
-        """Up to `count` random decoded pixel centres of some frames each, at most one in each square of a lattice."""
-        pixels, counts = np.zeros((len(frames), count), dtype=np.int64), np.zeros(len(frames), dtype=np.int64)
-        draw_pixels(len(frames), frames.numpy(), self.index.arrays, seed_from(generator), pixels, counts)
-        frame = torch.repeat_interleave(frames, torch.from_numpy(counts))
-        pixel = torch.from_numpy(pixels[np.arange(count) < counts[:, None]])
+    def draw(
+        self, frames: Int[Tensor, "m"], count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
+        """Up to `count` random decoded pixels of each frame, at most one in each square of a lattice.
+
+        Returns their frames and their centres.
+        """
+        seed, words = seed_from(generator), self.index.words
+
+        def pixels(frame: int) -> Int64[ndarray, "_"]:
+            w, h, first = (int(part[frame]) for part in (self.index.widths, self.index.heights, self.index.first))
+            step = max(1, int((known_pixels(words, first, w, h) / max(count, 1)) ** 0.5))
+            chosen, bits = pixels_of_squares(words, first, w, h, step, seed, frame)
+            return chosen[np.argsort(bits)[:count]]
+
+        found = results([partial(pixels, frame) for frame in frames.tolist()])
+        frame = torch.repeat_interleave(frames, torch.tensor([len(part) for part in found], dtype=torch.int64))
+        pixel = torch.from_numpy(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
         w = self._sizes[0][frame]
-        return DrawnPixels(frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double())
+        return frame, torch.stack([pixel % w + 0.5, pixel // w + 0.5], -1).double()
 
     def image(self, frame: int) -> Float[Tensor, "h w 2"]:
         """The coordinate image of a frame, NaN where not decoded."""
-        return torch.from_numpy(self.index.image(self.values.numpy(), frame))
+        known, start = self.index.known(frame), int(self.index.words[self.index.first[frame], 1])
+        out = torch.full((*known.shape, 2), torch.nan)
+        out[torch.from_numpy(known)] = self.values[start : start + int(known.sum())]
+        return out
 
     @property
     def arrays(self) -> tuple[ndarray, tuple[ndarray, ...]]:
-        """For compiled loops: values, index."""
+        """Values and index for compiled loops."""
         return self.values.numpy(), self.index.arrays
 
     @property
@@ -554,13 +472,17 @@ class CoordinateMaps:
         return torch.from_numpy(self.index.widths), torch.from_numpy(self.index.heights)
 
     def border_distance(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-        """Pixels to the nearest one without a coordinate, from positions in `frame`; 0 outside the image."""
+        """Steps, also diagonal ones, to the nearest pixel without a coordinate (up to `FARTHEST`); 0 outside."""
         w, h = (size[frame] for size in self._sizes)
         x, y = (uv_camera[:, k].nan_to_num(-1.0).clamp(-1, 2**30).floor().long() for k in range(2))
         inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
         pixel = torch.where(inside, y * w + x, torch.full_like(x, -1)).numpy()
         groups, found = Groups.of(frame.numpy(), self.frames), np.zeros(len(frame))
-        border_distances(self.frames, self.index.arrays, groups.first, groups.entries, pixel, found)
+        for f, (first, last) in enumerate(pairwise(groups.first.tolist())):
+            mine = groups.entries[first:last]
+            if len(mine):
+                steps = distance_transform_cdt(np.pad(self.index.known(f), 1), "chessboard")[1:-1, 1:-1].ravel()
+                found[mine] = np.where(pixel[mine] >= 0, np.minimum(steps[pixel[mine]], FARTHEST), 0)
         return torch.from_numpy(found)
 
     def look_up(
@@ -578,23 +500,15 @@ class CoordinateMaps:
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory
     ) -> tuple[Float[Tensor, "n 3 2"], Float[Tensor, "n"]]:
         """Value, derivatives by x and y, and the window's RMS distance from the paraboloid (infinite without a fit)."""
-        s, at, uv = self.settings, frame.numpy(), uv_camera.detach().double().numpy()
+        at, uv = frame.numpy(), uv_camera.detach().double().numpy()
         values, index = self.arrays
         n, moved, found = len(at), np.empty(len(at), dtype=np.bool_), np.zeros((len(at), 3, 2))
         mark_moved(n, index, at, uv, memory.pixel, moved)
         chosen = memory.order[moved[memory.order]]
-        limits = s.half_window, s.least_pixels, s.least_pivot
+        limits = self.half_window, self.least_pixels, _LEAST_PIVOT
         fit_windows(len(chosen), chosen, values, index, at, memory.pixel, limits, memory.fit, memory.roughness)
         evaluate_windows(n, self.index.widths, at, uv, memory.pixel, memory.fit, memory.roughness, found)
         return torch.from_numpy(found), torch.from_numpy(memory.roughness.copy())
-
-    def _median_roughness(self) -> float:
-        """Median roughness of windows all over the frames; 0 if nothing is decoded."""
-        generator = torch.Generator().manual_seed(0)
-        drawn = self.draw(torch.arange(self.frames), self.settings.sampled_windows, generator)
-        _, roughness = self._fit(drawn.frame, drawn.uv_camera, WindowMemory.empty(drawn.frame.numpy()))
-        found = roughness[torch.isfinite(roughness)]
-        return float(found.median()) if len(found) else 0.0
 
 
 def seed_from(generator: torch.Generator) -> int:

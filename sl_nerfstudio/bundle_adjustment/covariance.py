@@ -1,4 +1,4 @@
-"""Covariance of the adjusted poses.
+"""Covariance of the adjusted poses and of the intrinsics, in any axes and unit.
 
 The inverse of the normal matrix assumes independent residuals. Those of one corner of one image are not independent: a
 lens that is modelled slightly wrong, or a systematic error of the decoding, pushes all of them the same way. So the
@@ -29,12 +29,7 @@ from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import Groups
-from sl_nerfstudio.bundle_adjustment.normal_equations import (
-    DepthCouplings,
-    NormalEquations,
-    block_sums,
-    normal_equations,
-)
+from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, block_sums, normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import Kernel
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
@@ -53,16 +48,11 @@ from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.lie import Similarity, exp_se3, exp_so3, inverse, log_se3
 from sl_nerfstudio.parallel import results, split, threads
 
-# Covariances as products `F F^T`: exact ones of small scans, and of large ones the mean of random draws.
-#
-# The covariance of 1,000 frames has 72 million different entries, and none of them is zero: frames that never see
-# the
-# same surface are held by the same others. Its factor from D random columns has as many rows as there are unknowns,
-# and
-# D columns. A sigma that follows is off by about `1 / sqrt(2 D)` of itself, 3 % here, and what follows from it
-# needs time
-# and memory by the number of frames (Hutchinson, Communications in Statistics 1990; Halko, Martinsson and Tropp,
-# SIAM
+# Covariances are products `F F^T`: exact ones of small scans, and of large ones the mean of random draws. The
+# covariance of 1,000 frames has 72 million different entries, and none of them is zero: frames that never see the same
+# surface are held by the same others. Its factor from D random columns has as many rows as there are unknowns, and D
+# columns. A sigma that follows is off by about `1 / sqrt(2 D)` of itself, 3 % here, and what follows from it needs time
+# and memory by the number of frames (Hutchinson, Communications in Statistics 1990; Halko, Martinsson and Tropp, SIAM
 # Review 2011).
 
 EXACT_UNKNOWNS = 1280  # of a scan, so many as 106 frames have: up to there, nothing is random
@@ -103,8 +93,6 @@ def as_stored(factor: Float[Tensor, "unknowns k"]) -> Float[Tensor, "unknowns c"
     return torch.linalg.qr(factor.T, mode="r").R.T
 
 
-# Cholesky's factorisation of one large matrix, and products with its inverse.
-
 _FEWEST_TOGETHER = 32  # columns that a thread solves at once
 
 
@@ -116,7 +104,7 @@ class Cholesky:
 
     @staticmethod
     def in_place(H: Float[Tensor, "k k"]) -> "Cholesky":
-        """The factor overwrites the matrix: large ones are in memory once.
+        """Factorise a matrix, which is overwritten: large ones are in memory once.
 
         Raises ArithmeticError if rounding has left it not positive definite.
         """
@@ -135,7 +123,7 @@ class Cholesky:
         return self._solved("potrs", x)
 
     def _solved(self, routine: str, x: Float[Tensor, "k c"]) -> Float[Tensor, "k c"]:
-        """Some columns at a time, on all threads."""
+        """Solve for some columns at a time, on all threads."""
         (solve,) = get_lapack_funcs((routine,), (self.upper,))
         out = np.array(x.numpy(), order="F")
 
@@ -146,8 +134,8 @@ class Cholesky:
         return torch.from_numpy(out)
 
 
-# Residuals at the result of an adjustment, and their gradient by blocks of images.
-
+_IMAGE_BLOCKS = 4  # along each side of the decoded part of an image: residuals within a block may depend on each other
+_LEAST_CURVATURE = 0.2  # of the kernel, as a share of its weights: with less, most residuals do not fit at all
 _FRAMES_AT_ONCE = 16  # whose blocks are summed together: bounds memory
 
 
@@ -161,25 +149,21 @@ class CovarianceEvidence:
     linear: Linearisation
     smooth: Linearisation  # the same with derivatives of wide windows, where there are any
     kernel: Kernel
-    image_blocks: int  # along each side of the decoded part of an image
-    least_curvature: float  # of the kernel
 
     @property
     def blocks(self) -> int:
         """Number of blocks of all images."""
-        return self.rig.frames * self.image_blocks**2
+        return self.rig.frames * _IMAGE_BLOCKS**2
 
 
-@dataclass(frozen=True)
-class BlockGradients:
-    """Gradients whose squares add up to those of all blocks of images, or on average do."""
+def block_gradients(
+    e: CovarianceEvidence, depths: DepthCouplings, weights: tuple[Tensor, Tensor]
+) -> tuple[Float[Tensor, "unknowns c"], int]:
+    """Columns whose squares add up to those of the gradients of all blocks of images, or on average do.
 
-    columns: Float[Tensor, "unknowns c"]
-    blocks: int  # that hold any residual
-
-
-def block_gradients(e: CovarianceEvidence, depths: DepthCouplings, weights: tuple[Tensor, Tensor]) -> BlockGradients:
-    """Of small scans one column for each block, of large ones sums of all blocks with random signs."""
+    Small scans have one column for each block, large ones sums of all blocks with random signs. Returned with the
+    number of blocks that hold any residual.
+    """
     groups = tuple(Groups.of(array(block), e.blocks) for block in _blocks_of(e))
     r, unknowns, blocks = e.linear.residuals, e.linear.unknowns, 0
     own, cross = (
@@ -201,7 +185,7 @@ def block_gradients(e: CovarianceEvidence, depths: DepthCouplings, weights: tupl
             exact.append(gradient)
         else:
             found.addmm_(gradient.T, unit_columns(len(part), unknowns, seed=int(part[0])))
-    return BlockGradients(torch.cat(exact).T if exact else found, blocks)
+    return torch.cat(exact).T if exact else found, blocks
 
 
 def _blocks_of(e: CovarianceEvidence) -> tuple[Int[Tensor, "anchors"], Int[Tensor, "rows"]]:
@@ -217,25 +201,19 @@ def _blocks_of(e: CovarianceEvidence) -> tuple[Int[Tensor, "anchors"], Int[Tenso
 
     def block(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
         share = (uv - low[frame]) / (high - low).clamp_min(1e-9)[frame]
-        cell = (share * e.image_blocks).nan_to_num().clamp(0, e.image_blocks - 1).long()
-        return (frame * e.image_blocks + cell[:, 0]) * e.image_blocks + cell[:, 1]
+        cell = (share * _IMAGE_BLOCKS).nan_to_num().clamp(0, _IMAGE_BLOCKS - 1).long()
+        return (frame * _IMAGE_BLOCKS + cell[:, 0]) * _IMAGE_BLOCKS + cell[:, 1]
 
     return block(e.anchors.frame, at), block(e.rows.frame, seen_at)
-
-
-# The covariance of all poses and of the intrinsics together, in any axes and unit.
-#
-# Increments are those of `residuals`: `T_world_camera <- exp(delta) T_world_camera`,
-# `T_camera_projector <- exp(rho) T_camera_projector`, translation before rotation. Intrinsics are shares of the
-# focal
-# length, in the order of `IntrinsicsChange.values`.
 
 
 @dataclass(frozen=True)
 class JointCovariance:
     """Second moments of the errors of delta of all frames, then rho of all frames, then the intrinsics.
 
-    They are `factor @ factor.T`. Of scans with more than 106 frames the columns are random draws (`draws`).
+    They are `factor @ factor.T`; the columns of scans with more than 106 frames are random draws. Increments are those
+    of `residuals`, translation before rotation; intrinsics are shares of the focal length, in the order of
+    `IntrinsicsChange.values`.
     """
 
     factor: Float64[ndarray, "joint k"]
@@ -251,7 +229,7 @@ class JointCovariance:
         return (len(self.factor) - UNKNOWNS) // 12
 
     def mapped(self, S_target_world: Similarity) -> "JointCovariance":
-        """For the same devices in other axes and another unit.
+        """The covariance for the same devices in other axes and another unit.
 
         A motion (v, w) in the world is, in the target, the rotation R w and the translation s R v - (R w) x t; in the
         axes of a camera only the unit changes.
@@ -277,21 +255,15 @@ def joint_of_prior(prior: PosePrior, start: Rig) -> Float[Tensor, "joint k"]:
     return torch.cat([by_kind(frames), prior.intrinsics_sigma[:, None] * unit[-UNKNOWNS:]])
 
 
-# What is uncertain once the scale is fixed by a length, or by many.
-#
-# The covariance of an adjustment says nothing about the scale, which no residual determines. A rule then fixes it:
-# some
-# logarithm of a length, `log l`, is known. An error x of poses and intrinsics becomes `x - g (c . x)`, where g is
-# the
-# growth of everything by a factor, and c the derivative of `log l`, so that `c . g = 1`. Lengths that are badly
-# known
-# relative to the known one become uncertain in this way.
-
-
 def with_known_length(
     factor: Float[Tensor, "joint k"], rig: Rig, log_length: Float[Tensor, "unknowns"]
 ) -> Float[Tensor, "joint k"]:
-    """A factor under the scale at which a length does not err; `log_length` is its derivative by the poses."""
+    """A factor under the scale at which a length does not err; `log_length` is its derivative by the poses.
+
+    The covariance of an adjustment says nothing about the scale, which no residual determines. With a known length l,
+    an error x of poses and intrinsics becomes `x - g (c . x)`, where g is the growth of everything by a factor and c
+    the derivative of `log l`, so that `c . g = 1`. Lengths that are badly known relative to l become uncertain so.
+    """
     growth = torch.zeros(len(factor), dtype=torch.float64)
     growth[: len(log_length)] = gauge_directions(rig)[:, 6]
     known = torch.zeros_like(growth)
@@ -301,7 +273,7 @@ def with_known_length(
 
 
 def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
-    """That of the scale which agrees best with the starting poses (`gauge.agreeing_scale`)."""
+    """Derivative of the logarithm of the scale which agrees best with the starting poses (see `agreeing_scale`)."""
     H, _ = prior_equations(prior, rig, rig)
     G = by_frame(gauge_directions(rig))
     by_step = H @ G
@@ -309,16 +281,11 @@ def of_all_lengths(rig: Rig, prior: PosePrior) -> Float[Tensor, "unknowns"]:
     return torch.linalg.solve(information, by_kind(by_step).T)[6]
 
 
-# Other poses that agree with the captures as well: where nothing holds a frame, the objective has many minima.
-#
-# On a surface that slides along itself (a vase about its axis, parallel planes) errors of the look-ups make small
-# minima wherever a frame may be, and the curvature of one of them says little about how far the others are. Whether
-# a
-# result is one of many shows when it is shaken: steps lead it back, or they do not. If they do not, searches from
-# other
-# starting poses, drawn within their stated uncertainty, show how far the minima spread. (Randomised maximum
-# likelihood:
-# Chen and Oliver, Mathematical Geosciences, 2012; the data stay as they are.)
+# Other minima. On a surface that slides along itself (a vase about its axis, parallel planes) errors of the look-ups
+# make small minima wherever a frame may be, and the curvature of one of them says little about how far the others are.
+# Whether a result is one of many shows when it is shaken: steps lead it back, or they do not. If they do not, searches
+# from other starting poses, drawn within their stated uncertainty, show how far the minima spread. (Randomised maximum
+# likelihood: Chen and Oliver, Mathematical Geosciences, 2012; the data stay as they are.)
 
 
 def shake(factor: Float[Tensor, "joint k"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:
@@ -385,105 +352,70 @@ def _given_intrinsics(factor: Float[Tensor, "joint k"]) -> Float[Tensor, "unknow
     return poses @ poses.T - border @ inner @ border.T
 
 
+# The covariance at the result of an adjustment, as a linear problem.
+
 _EXACT = 1e-9  # used for an uncertainty of zero
 _PRIOR_SEED = 1  # of its random columns, where there are any: they are independent of others
 
 
-@dataclass(frozen=True)
-class PoseCovariance:
-    """Covariance of the poses at the result, and the self-calibration of the intrinsics."""
-
-    factor: Float[Tensor, "joint k"]  # of that of (delta, rho, intrinsics); the gauge is projected out
-    intrinsics: SelfCalibration | None  # None where nothing was adjusted
-
-
 def pose_covariance(
     evidence: CovarianceEvidence, free: FreeParameters, start: Rig, prior: PosePrior, noise: float
-) -> PoseCovariance:
-    """Second moments of the errors of poses that were found with the current intrinsics.
+) -> tuple[Float[Tensor, "joint k"], SelfCalibration | None]:
+    """A factor of the covariance of (delta, rho, intrinsics) without the gauge, and the self-calibration.
 
-    `noise` is that of one look-up in pixels. Intrinsics are eliminated as unknowns. How far the poses would move if the
-    intrinsics followed the captures counts as an error, too.
+    The poses were found with the current intrinsics; `noise` is that of one look-up in pixels. Intrinsics are
+    eliminated as unknowns. How far the poses would move if the intrinsics followed the captures counts as an error,
+    too. The self-calibration is None where nothing was adjusted.
     """
     e, n = evidence, evidence.rig.frames
     if free.count == 0:
         poses_exact = torch.zeros(12 * n, UNKNOWNS, dtype=torch.float64)
-        return PoseCovariance(torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None)
+        return torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None
     weights = e.kernel.weights(e.linear.residuals)
-    equations = normal_equations(e.linear, e.rows, *weights)
-    known = normal_equations(e.smooth, e.rows, *weights)
-    gradients = block_gradients(e, equations.depths, weights)
-    problem = _Linear(e, free, equations, known, gradients, _prior_terms(prior, start, e.rig))
-    found, own = problem.second_moments(noise), slice(12 * n, None)
-    of_intrinsics = found.larger[own, None] * found.formal[own]
-    calibration = SelfCalibration(found.step[own].clone(), of_intrinsics @ of_intrinsics.T)
-    moves = (found.formal[: 12 * n] != 0).any(1)
-    dependence = float(found.larger[: 12 * n][moves].median()) if moves.any() else 1.0
-    found = problem.second_moments(dependence * noise)
-    factor = torch.cat([found.larger[:, None] * found.formal, found.step[:, None]], 1)
-    return PoseCovariance(_by_kind(factor, n), calibration)
-
-
-@dataclass(frozen=True)
-class _PriorTerms:
-    """What the prior adds to the normal equations, for a noise of one pixel."""
-
-    frames_H: Float[Tensor, "frames 12 12"]
-    common_H: Float[Tensor, "common"]  # diagonal
-    g: Float[Tensor, "unknowns"]
-
-    def root(self) -> Float[Tensor, "unknowns c"]:
-        """A factor of the information: `H` is it times its transpose, or on average is."""
-        n, rows = len(self.frames_H), len(self.g)
-        unit = unit_columns(rows, rows, _PRIOR_SEED)
-        frames = torch.linalg.cholesky(self.frames_H) @ unit[: 12 * n].reshape(n, 12, -1)
-        return torch.cat([frames.flatten(0, 1), self.common_H.sqrt()[:, None] * unit[12 * n :]])
-
-
-def _prior_terms(prior: PosePrior, start: Rig, rig: Rig) -> _PriorTerms:
-    H, g = prior_equations(prior, start, rig)
-    weight = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2
+    equations, smooth = (normal_equations(linear, e.rows, *weights) for linear in (e.linear, e.smooth))
+    g = torch.cat([equations.g.flatten(), equations.g_common])
+    H_frames, g_frames = prior_equations(prior, start, e.rig)
+    H_common = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2  # of the prior, diagonal
     change = torch.tensor(prior.intrinsics_change.values, dtype=torch.float64)
-    return _PriorTerms(H, weight, torch.cat([g.flatten(), weight * change]))
+    g_prior = torch.cat([g_frames.flatten(), H_common * change])
+    columns, blocks = block_gradients(e, equations.depths, weights)
+    rows, G = free.count + UNKNOWNS, _gauge(e.rig, len(g))
+    free_blocks = max(blocks - rows, blocks / 4)  # left after the fit of the poses
+    curvature = max(e.kernel.curvature(e.linear.residuals), _LEAST_CURVATURE)
+    spread = (blocks / max(free_blocks, 1.0)) ** 0.5 / curvature * columns
 
+    def moments(noise: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Errors for a noise of one look-up, by the unknowns of each frame, then the intrinsics.
 
-@dataclass(frozen=True)
-class _Moments:
-    """Errors at the result; unknowns are those of the frames one after the other, then the intrinsics."""
-
-    formal: Float[Tensor, "unknowns c"]  # factor of the covariance for independent residuals
-    larger: Float[Tensor, "unknowns"]  # factor by which each sigma is really larger
-    step: Float[Tensor, "unknowns"]  # that is left
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """The adjustment at its result, as a linear problem."""
-
-    evidence: CovarianceEvidence
-    free: FreeParameters
-    equations: NormalEquations
-    known: NormalEquations  # with derivatives of wide windows
-    gradients: BlockGradients
-    prior: _PriorTerms
-
-    def second_moments(self, noise: float) -> _Moments:
-        """For a noise of one look-up."""
-        e, prior, free, gradients = self.evidence, self.prior, self.free, self.gradients
-        prior_H = noise**2 * prior.frames_H, noise**2 * prior.common_H
-        g = torch.cat([self.equations.g.flatten(), self.equations.g_common]) + noise**2 * prior.g
-        G = _gauge(e.rig, len(g))
-        factor = Cholesky.in_place(free.matrix(self.known.matrix(*prior_H)))
-        rows = free.count + UNKNOWNS
+        A factor of the covariance for independent residuals; how much larger each sigma really is; the step that is
+        left.
+        """
+        factor = Cholesky.in_place(free.matrix(smooth.matrix(noise**2 * H_frames, noise**2 * H_common)))
         formal = noise * _increments(free, G, factor.root(unit_columns(rows, len(g))))
-        free_blocks = max(gradients.blocks - rows, gradients.blocks / 4)  # left after the fit of the poses
-        curvature = max(e.kernel.curvature(e.linear.residuals), e.least_curvature)
-        scale = (gradients.blocks / max(free_blocks, 1.0)) ** 0.5 / curvature
-        caused = _together(scale * gradients.columns, noise**2 * prior.root())
-        moved = _increments(free, G, factor.solution(_parameters(free, torch.cat([caused, g[:, None]], 1))))
+        caused = _together(spread, noise**2 * _prior_root(H_frames, H_common))
+        pulls = torch.cat([caused, (g + noise**2 * g_prior)[:, None]], 1)
+        moved = _increments(free, G, factor.solution(_parameters(free, pulls)))
         robust = moved[:, :-1].square().sum(1)
         larger = (robust / formal.square().sum(1).clamp_min(1e-30)).clamp_min(1).sqrt()
-        return _Moments(formal, larger, -moved[:, -1])
+        return formal, larger, -moved[:, -1]
+
+    formal, larger, step = moments(noise)
+    of_intrinsics = larger[12 * n :, None] * formal[12 * n :]
+    calibration = SelfCalibration(step[12 * n :].clone(), of_intrinsics @ of_intrinsics.T)
+    moves = (formal[: 12 * n] != 0).any(1)
+    dependence = float(larger[: 12 * n][moves].median()) if moves.any() else 1.0
+    formal, larger, step = moments(dependence * noise)
+    return _by_kind(torch.cat([larger[:, None] * formal, step[:, None]], 1), n), calibration
+
+
+def _prior_root(
+    H_frames: Float[Tensor, "frames 12 12"], H_common: Float[Tensor, "common"]
+) -> Float[Tensor, "unknowns c"]:
+    """A factor of the prior's information, which is it times its transpose, or on average is."""
+    n, rows = len(H_frames), 12 * len(H_frames) + len(H_common)
+    unit = unit_columns(rows, rows, _PRIOR_SEED)
+    frames = torch.linalg.cholesky(H_frames) @ unit[: 12 * n].reshape(n, 12, -1)
+    return torch.cat([frames.flatten(0, 1), H_common.sqrt()[:, None] * unit[12 * n :]])
 
 
 def _together(a: Float[Tensor, "unknowns c"], b: Float[Tensor, "unknowns d"]) -> Float[Tensor, "unknowns k"]:

@@ -1,4 +1,4 @@
-"""One damped Gauss-Newton step on poses and depths."""
+"""One damped Gauss-Newton step on poses and depths (Levenberg-Marquardt)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +12,15 @@ from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations, no
 from sl_nerfstudio.bundle_adjustment.observations import Kernel
 from sl_nerfstudio.bundle_adjustment.parameters import FreeParameters, PriorTerm
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, residuals_of
-from sl_nerfstudio.bundle_adjustment.settings import StepSettings
 
-# Solutions of the damped normal equations: by factorisation, or for many frames by conjugate gradients.
+DAMPING = 1e-4  # of the first step, as a share of the normal matrix's diagonal
+_RELAX, _TIGHTEN = 5.0, 10.0  # factors by which damping falls after an accepted step, and grows after a rejected one
+_LEAST_DAMPING = 1e-9
+_TRIES = 8  # rejected steps in a row after which the poses are left unchanged
+_LEAST_DEPTH, _MOST_DEPTH = 0.7, 1.4  # factors by which one step may change an anchor's depth
+_FACTORISED_FRAMES = 100  # whose whole normal matrix is factorised; for more, steps are found by conjugate gradients
+_ITERATIVE_STEPS = 150  # of conjugate gradients, at most
+_ITERATIVE_TOLERANCE = 1e-2  # residual of the equations, relative to the first one, at which those end
 
 Solve = Callable[[float], Float[Tensor, "count"] | None]
 """From the damping to the free parameters' step; None if rounding left nothing positive definite."""
@@ -24,81 +30,55 @@ def damped_solver(
     equations: NormalEquations,
     prior: tuple[Float[Tensor, "m 12 12"], Float[Tensor, "m 12"]],
     free: FreeParameters,
-    settings: StepSettings,
 ) -> Solve:
-    """For the normal equations and prior of the frames that move; the damping is a share of the diagonal."""
+    """A solver of the normal equations with the prior; the damping is a share of the diagonal."""
     g = free.vector(equations.g + prior[1])
-    if len(free.frames) <= settings.factorised_frames:
-        return _Factorised(free.matrix(equations.matrix(prior[0], g.new_zeros(0))), g).solve
-    return _Iterative.of(equations, prior[0], free, g, settings).solve
+    if len(free.frames) > _FACTORISED_FRAMES:
+        return _iterative_solver(equations, prior[0], free, g)
+    H = free.matrix(equations.matrix(prior[0], g.new_zeros(0)))
+
+    def solve(damping: float) -> Float[Tensor, "count"] | None:
+        factor = _damped_factor(H, damping)
+        return None if factor is None else torch.cholesky_solve(-g[:, None], factor)[:, 0]
+
+    return solve
 
 
-@dataclass(frozen=True)
-class _Factorised:
-    """The whole matrix."""
+def _iterative_solver(
+    equations: NormalEquations, prior: Float[Tensor, "m 12 12"], free: FreeParameters, g: Float[Tensor, "count"]
+) -> Solve:
+    """Conjugate gradients (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010, section 4).
 
-    H: Float[Tensor, "count count"]
-    g: Float[Tensor, "count"]
+    They start at zero, so every iterate lowers the quadratic model; the blocks on the diagonal precondition: of each
+    frame's own parameters, and of those that frames share.
+    """
 
-    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
-        """By Cholesky's factorisation."""
-        damped = self.H.clone()
-        damped.diagonal().mul_(1 + damping)
-        factor, failed = torch.linalg.cholesky_ex(damped)
-        return None if bool(failed) else torch.cholesky_solve(-self.g[:, None], factor)[:, 0]
+    def product(x: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
+        step = free.step(x)
+        moving = equations.times(step)[free.frames]
+        return free.vector(moving + (prior @ step[free.frames, :, None])[..., 0])
 
+    own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
+    first = own.shape[0] * own.shape[2]
+    shared = torch.zeros(free.count - first, free.count - first, dtype=g.dtype)
+    for k in range(len(shared)):
+        one = torch.zeros_like(g)
+        one[first + k] = 1
+        shared[k] = product(one)[first:]
 
-@dataclass(frozen=True)
-class _Iterative:
-    """Products with the matrix, and its blocks on the diagonal."""
-
-    equations: NormalEquations
-    prior: Float[Tensor, "m 12 12"]
-    free: FreeParameters
-    g: Float[Tensor, "count"]
-    own: Float[Tensor, "m k k"]  # blocks of each frame's own parameters
-    shared: Float[Tensor, "s s"]  # block of those that frames share
-    settings: StepSettings
-
-    @staticmethod
-    def of(
-        equations: NormalEquations,
-        prior: Float[Tensor, "m 12 12"],
-        free: FreeParameters,
-        g: Float[Tensor, "count"],
-        settings: StepSettings,
-    ) -> "_Iterative":
-        """With the blocks that precondition."""
-        own = free.own.transpose(1, 2) @ (equations.H + prior) @ free.own
-        none = _Iterative(equations, prior, free, g, own, torch.zeros(0, 0, dtype=g.dtype), settings)
-        first = own.shape[0] * own.shape[2]
-        columns = [none.product(_unit(free.count, k, g.dtype))[first:] for k in range(first, free.count)]
-        shared = torch.stack(columns) if columns else none.shared
-        return _Iterative(equations, prior, free, g, own, shared, settings)
-
-    def product(self, x: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
-        """The matrix times `x`."""
-        step = self.free.step(x)
-        moving = self.equations.times(step)[self.free.frames]
-        return self.free.vector(moving + (self.prior @ step[self.free.frames, :, None])[..., 0])
-
-    def solve(self, damping: float) -> Float[Tensor, "count"] | None:
-        """By conjugate gradients (Agarwal et al., Bundle Adjustment in the Large, ECCV 2010, section 4).
-
-        They start at zero, so every iterate lowers the quadratic model; the blocks on the diagonal precondition.
-        """
-        diagonal = torch.cat([self.own.diagonal(dim1=1, dim2=2).flatten(), self.shared.diagonal()])
-        factors = [_damped_factor(block, damping) for block in (self.own, self.shared[None])]
+    def solve(damping: float) -> Float[Tensor, "count"] | None:
+        diagonal = torch.cat([own.diagonal(dim1=1, dim2=2).flatten(), shared.diagonal()])
+        factors = [_damped_factor(block, damping) for block in (own, shared[None])]
         if any(factor is None for factor in factors):
             return None
-        x, r = torch.zeros_like(self.g), -self.g
+        x, r = torch.zeros_like(g), -g
         z = _preconditioned(r, factors)
         p, rz = z, float(r @ z)
-        enough = self.settings.iterative_tolerance**2 * rz
-        for _ in range(self.settings.iterative_steps):
+        enough = _ITERATIVE_TOLERANCE**2 * rz
+        for _ in range(_ITERATIVE_STEPS):
             if rz <= enough:
                 break
-            Hp = self.product(p) + damping * diagonal * p
+            Hp = product(p) + damping * diagonal * p
             curvature = float(p @ Hp)
             if not curvature > 0:
                 break
@@ -108,16 +88,12 @@ class _Iterative:
             p = z + rz / before * p
         return x
 
-
-def _unit(count: int, k: int, dtype: torch.dtype) -> Float[Tensor, "count"]:
-    out = torch.zeros(count, dtype=dtype)
-    out[k] = 1
-    return out
+    return solve
 
 
-def _damped_factor(blocks: Float[Tensor, "m k k"], damping: float) -> Float[Tensor, "m k k"] | None:
+def _damped_factor(blocks: Float[Tensor, "*m k k"], damping: float) -> Float[Tensor, "*m k k"] | None:
     damped = blocks.clone()
-    damped.diagonal(dim1=1, dim2=2).mul_(1 + damping)
+    damped.diagonal(dim1=-2, dim2=-1).mul_(1 + damping)
     factor, failed = torch.linalg.cholesky_ex(damped)
     return None if bool(failed.any()) else factor
 
@@ -152,7 +128,6 @@ def lm_step(
     kernel: Kernel,
     prior: PriorTerm,
     free: FreeParameters,
-    settings: StepSettings,
 ) -> LMState:
     """Take a step along the free parameters, damped until it lowers the whole objective (Levenberg-Marquardt).
 
@@ -163,29 +138,29 @@ def lm_step(
         return LMState(rig, anchors, state.damping)
     equations = normal_equations(linear, rows, *kernel.weights(r), free.frames)
     H_prior, g_prior = (part[free.frames] for part in prior.equations(rig))
-    solve = damped_solver(equations, (H_prior, g_prior), free, settings)
+    solve = damped_solver(equations, (H_prior, g_prior), free)
     energy = prior.energy(rig)
     damping = state.damping
-    for _ in range(settings.tries):
+    for _ in range(_TRIES):
         x = solve(damping)
         if x is None:
-            damping = damping * settings.tighten
+            damping = damping * _TIGHTEN
             continue
         step = free.step(x)
-        moved, placed = moved_together(rig, anchors, equations, step, settings)
+        moved, placed = moved_together(rig, anchors, equations, step)
         after = residuals_of(moved, placed, rows, maps)
         both = r.cross_valid & after.cross_valid
         if kernel.cost(after, both) + prior.energy(moved) < kernel.cost(r, both) + energy:
-            damping = max(damping / settings.relax, settings.least_damping)
+            damping = max(damping / _RELAX, _LEAST_DAMPING)
             return LMState(moved, placed, damping, float(step.abs().max()))
-        damping = damping * settings.tighten
+        damping = damping * _TIGHTEN
     return LMState(rig, anchors, damping)
 
 
 def moved_together(
-    rig: Rig, anchors: Anchors, equations: NormalEquations, step: Float[Tensor, "frames 12"], settings: StepSettings
+    rig: Rig, anchors: Anchors, equations: NormalEquations, step: Float[Tensor, "frames 12"]
 ) -> tuple[Rig, Anchors]:
     """The rig after a step of its poses, and the anchors, whose depths follow within bounds."""
     depth = anchors.depth + equations.depth_step(step)
-    depth = depth.clamp(settings.least_depth * anchors.depth, settings.most_depth * anchors.depth)
+    depth = depth.clamp(_LEAST_DEPTH * anchors.depth, _MOST_DEPTH * anchors.depth)
     return rig.moved(step[:, :6], step[:, 6:]), anchors.at(depth)

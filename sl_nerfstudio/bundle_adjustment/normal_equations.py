@@ -21,9 +21,8 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import Groups
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Observations, array
 from sl_nerfstudio.parallel import compiled, compiled_range
 
-# Sums of vectors of 6 and 12 numbers, the unknowns of half a frame and of a frame, as vector instructions.
-#
-# As loops they cost more than twice as much: before each of them, code of numba checks whether its arrays overlap.
+# Sums of vectors of 6 and 12 numbers, the unknowns of half a frame and of a frame, as vector instructions. As loops
+# they cost more than twice as much: before each of them, code of numba checks whether its arrays overlap.
 
 intrinsic: Any = _intrinsic  # callers omit the typing context, which type checkers cannot know
 _NUMBER = 8  # bytes
@@ -65,16 +64,14 @@ def _adding(count: int, lanes: int) -> Any:
 
 add_6, add_12 = _adding(6, 2), _adding(12, 4)
 
-# Sums of the normal equations, in compiled loops: each frame gathers what belongs to its own rows of the matrix.
-#
-# So no two threads write to the same place, and sums do not depend on the number of threads. Unknowns of a frame
-# are its
-# delta and its rho (12); those common to all frames come after all others.
+# Compiled loops: each frame gathers what belongs to its own rows of the matrix. So no two threads write to the same
+# place, and sums do not depend on the number of threads. Unknowns of a frame are its delta and its rho (12); those
+# common to all frames come after all others.
 
 
 @compiled_range
 def depth_couplings(first, last, by_anchor, own, cross, depth_by_own, depth_by_row, depth_by_common, H_depth, g_depth):
-    """What couples the depth of each anchor with the unknowns of its own frame, of those that see it, and of all.
+    """Couplings of the depth of each anchor with the unknowns of its own frame, of those that see it, and of all.
 
     `own` and `cross` are residuals, derivatives by pose and depth, and weights; `by_anchor` the rows of each anchor.
     """
@@ -129,7 +126,7 @@ def _add_12(H, at, w, J, n, first):
 
 @compiled
 def _add_common(border, s, first, w, J, n, second, common):
-    """The same for the columns `second` and later of J, which are those of the common unknowns."""
+    """Add the columns by common unknowns, the last ones of J, to rows `first` to `first + 6` of a frame's border."""
     for x in range(6):
         for y in range(common):
             both = J[n, 0, second + x] * J[n, 0, J.shape[2] - common + y]
@@ -146,7 +143,7 @@ def _subtract(H, at, scale, v, i, u, j):
 
 @compiled
 def _subtract_depth(H, g, border, s, scale, v, i, u, u_g):
-    """What the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
+    """Subtract what the elimination of a depth takes from a frame's own block, its gradient and its common columns."""
     _subtract(H, 144 * s, scale, v, i, v, i)
     for x in range(12):
         g[s, x] -= scale * v[i, x] * u_g
@@ -369,7 +366,7 @@ def _add_scaled(g, at, r, J, first, count):
 
 @compiled
 def _through_depth(g, a, pull, row_first, row_entries, frame, viewer, couplings, common):
-    """What a pull on the depth of an anchor does to the gradient."""
+    """Add to the gradient what a pull on the depth of an anchor does to it."""
     by_own, by_row, by_common, H_depth, _ = couplings
     scale = -pull / H_depth[a]
     _add_scaled(g, 12 * frame[a], scale, by_own[a], 0, 12)
@@ -398,7 +395,7 @@ class DepthCouplings:
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray]:
-        """For compiled loops."""
+        """The parts for compiled loops."""
         return self.by_own, self.by_row, self.by_common, self.H, self.g
 
     def step(
@@ -483,7 +480,10 @@ def normal_equations(
     cross: Sums = (array(r.cross), array(linear.cross), array(linear.cross_depth), array(cross_weight))
     anchor, frame = array(observations.anchor), array(linear.own_frame)
     source, viewer = (array(part) for part in linear.cross_frames)
-    depths = _couplings(own, cross, Groups.of(anchor, len(frame)), frame, viewer, common)
+    rows, n = Groups.of(anchor, len(frame)), len(frame)
+    couplings = np.zeros((n, 12)), np.zeros((len(viewer), 12)), np.zeros((n, common)), np.zeros(n), np.zeros(n)
+    depth_couplings(n, (rows.first, rows.entries), own, cross, *couplings)
+    depths = DepthCouplings(*couplings, rows, frame, viewer)
     frame_of = np.arange(frames) if chosen is None else array(chosen)
     grouped = Groups.of(frame, frames), Groups.of(viewer, frames), depths.rows
     groups = tuple(part for group in grouped for part in (group.first, group.entries))
@@ -495,15 +495,6 @@ def normal_equations(
         frame_of, torch.from_numpy(H), torch.from_numpy(g), torch.from_numpy(border), torch.from_numpy(H_common),
         torch.from_numpy(g_common), (anchor, source, viewer), groups, own, cross, depths,
     )  # fmt: skip
-
-
-def _couplings(
-    own: Sums, cross: Sums, rows: Groups, frame: Int[ndarray, "anchors"], viewer: Int[ndarray, "rows"], common: int
-) -> DepthCouplings:
-    n = len(frame)
-    parts = np.zeros((n, 12)), np.zeros((len(viewer), 12)), np.zeros((n, common)), np.zeros(n), np.zeros(n)
-    depth_couplings(n, (rows.first, rows.entries), own, cross, *parts)
-    return DepthCouplings(*parts, rows, frame, viewer)
 
 
 def _of_common(

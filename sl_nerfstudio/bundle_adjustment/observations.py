@@ -19,7 +19,6 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
     words_of,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array, pixels_of_rows
-from sl_nerfstudio.bundle_adjustment.settings import KernelSettings
 from sl_nerfstudio.geometry.devices import unproject, view_of
 from sl_nerfstudio.geometry.lie import moved, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
@@ -30,6 +29,18 @@ from sl_nerfstudio.geometry.numerics import (
 )
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.parallel import compiled, compiled_range
+
+_ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
+_TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
+_LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
+
+NOISE_FLOOR_PX = 0.01  # smallest plausible noise of one look-up, pattern pixels
+_FASTEST = 1.4  # largest factor by which a kernel narrows in one step
+_OBLIQUENESS_CLASSES = 8  # of look-ups, by the cosine at which the camera sees the surface; each has its own noise
+_LEAST_NOISE_RATIO = 0.5  # of such a class, relative to all look-ups
+_BORDER_CLASSES = 8  # of look-ups, by the distance from the border of what was decoded
+_MOST_BORDER_NOISE = 1.25  # of such a class, relative to all look-ups; beyond, it and those nearer to the border are
+# left out: a decoder continues coordinates up to there, and errs alike in many frames
 
 # Which frames decoded something near an anchor, and which of them look it up.
 
@@ -97,7 +108,7 @@ def count_chosen(first, last, visible, most, counts):
 
 @compiled_range
 def choose_frames(first, last, visible, starts, seed, number, frames):
-    """As many frames as `starts` leaves room for, at random among those that see an anchor, in order.
+    """Choose as many frames as `starts` leaves room for, at random among those that see an anchor, in order.
 
     Selection sampling (Knuth, The Art of Computer Programming 2, algorithm S); `number` identifies each anchor.
     """
@@ -117,15 +128,9 @@ def choose_frames(first, last, visible, starts, seed, number, frames):
                 left -= 1
 
 
-_ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a byte each
-_TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
-_LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
-
-
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
     """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
-    drawn = maps.draw(torch.arange(rig.frames), per_frame, generator)
-    anchors, good = anchors_at(rig, maps, drawn.frame, drawn.uv_camera)
+    anchors, good = anchors_at(rig, maps, *maps.draw(torch.arange(rig.frames), per_frame, generator))
     return anchors.chosen(good)
 
 
@@ -174,7 +179,7 @@ def observe(
     generator: torch.Generator,
     allowed: Bool[Tensor, "frames frames"] | None = None,
 ) -> Observations:
-    """For every anchor, up to `per_anchor` other frames that decoded something near it, within `gate_px` of it.
+    """Choose for every anchor up to `per_anchor` other frames that decoded something near it, within `gate_px`.
 
     Frames whose camera or projector is behind the anchor's surface, or sees it at a cosine below `least_cosine`, are
     left out: they see, or light, another side of the object. `allowed[i, j]` says whether frame j may look up anchors
@@ -197,7 +202,7 @@ def away_from_borders(
     least: float,
     frames: int,
 ) -> tuple[Anchors, Observations]:
-    """Only anchors, and rows, that are at least so many pixels from the border of what was decoded.
+    """Keep anchors and rows that are at least so many pixels from the border of what was decoded.
 
     `distances` are those of anchors in their own frame and of rows in the frame that looks up. Of frames of thin
     things, which are all border, the better half remains.
@@ -220,7 +225,7 @@ def every_other(frames: int) -> Bool[Tensor, "frames frames"]:
 
 
 def involving(frame: int, frames: int) -> Bool[Tensor, "frames frames"]:
-    """Only pairs of one frame and another."""
+    """Pairs of one frame and any other."""
     involved = torch.arange(frames) == frame
     return every_other(frames) & (involved[:, None] | involved)
 
@@ -228,7 +233,7 @@ def involving(frame: int, frames: int) -> Bool[Tensor, "frames frames"]:
 def partners(
     rig: Rig, anchors: Anchors, maps: CoordinateMaps, most: int, least_cosine: float, generator: torch.Generator
 ) -> Bool[Tensor, "frames frames"]:
-    """For each frame about `most` others, at random from those that see the same surface; every other if there are few.
+    """Choose for each frame about `most` others that see the same surface, at random; every other if there are few.
 
     Random partners hold the frames together better than neighbours do: no chain of frames is long.
     """
@@ -296,56 +301,8 @@ def _visible(
     return visible
 
 
-# Medians of the residuals that involve each frame.
-
-
-@compiled_range
-def medians_by_frame(first, last, source_first, source_entries, viewer_first, viewer_entries, values, valid, out):
-    """Lower median over the valid entries of two groupings of the same values; infinite where there are none."""
-    for f in range(first, last):
-        most = source_first[f + 1] - source_first[f] + viewer_first[f + 1] - viewer_first[f]
-        mine = np.empty(most)
-        count = 0
-        for starts, entries in ((source_first, source_entries), (viewer_first, viewer_entries)):
-            for e in range(starts[f], starts[f + 1]):
-                if valid[entries[e]]:
-                    mine[count] = values[entries[e]]
-                    count += 1
-        out[f] = _smallest(mine, count, (count - 1) // 2) if count else np.inf
-
-
-@compiled
-def _smallest(values, count, k):
-    """The k-th smallest (from 0) of the first `count` values, which change places (Hoare's selection).
-
-    numpy's `partition` would do the same, but numba takes 7 s to compile it.
-    """
-    low, high = 0, count - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if k <= j:
-            high = j
-        elif k >= i:
-            low = i
-        else:
-            break
-    return values[k]
-
-
-# The robust kernel of the bundle adjustment: wrong decodings lose their influence, slow frames keep theirs.
-#
-# Its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately for every
-# frame: when
-# most frames already fit, a frame that does not yet fit keeps a kernel wide enough to be pulled in.
+# The robust kernel: its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately
+# for every frame. When most frames already fit, a frame that does not yet fit keeps a kernel wide enough to pull it in.
 
 
 @dataclass(frozen=True)
@@ -396,39 +353,39 @@ class Kernel:
 
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
-    """Median of the cross residuals that involve each frame; infinite if there are none."""
-    groups = [Groups.of(array(one), frames) for one in pair]
-    out = np.empty(frames)
-    parts = [part for group in groups for part in (group.first, group.entries)]
-    medians_by_frame(frames, *parts, array(r.cross.norm(dim=-1)), array(r.cross_valid), out)
+    """Lower median of the cross residuals that involve each frame; infinite if there are none."""
+    groups = Groups.of(array(pair[:, r.cross_valid]).ravel(), frames)
+    size, out = np.tile(array(r.cross[r.cross_valid].norm(dim=-1)), 2)[groups.entries], np.full(frames, np.inf)
+    for k, (first, last) in enumerate(pairwise(groups.first.tolist())):
+        if last > first:
+            middle = (last - first - 1) // 2
+            out[k] = np.partition(size[first:last], middle)[middle]
     return torch.from_numpy(out)
 
 
-def narrowed(
-    width: Float[Tensor, "frames"], target: Float[Tensor, "frames"], settings: KernelSettings
-) -> Float[Tensor, "frames"]:
+def narrowed(width: Float[Tensor, "frames"], target: Float[Tensor, "frames"]) -> Float[Tensor, "frames"]:
     """Kernel widths one gradual step closer to a narrower target: a part of a frame may fit before all of it does."""
-    gently = torch.where(width.isfinite(), width / settings.fastest, torch.zeros_like(width))
+    gently = torch.where(width.isfinite(), width / _FASTEST, torch.zeros_like(width))
     return torch.minimum(width, torch.maximum(target, gently))
 
 
-def noise_of(r: Residuals, width: float, settings: KernelSettings) -> float:
+def noise_of(r: Residuals, width: float) -> float:
     """Robust 1 sigma of one residual component, from the residuals that the kernel keeps; pattern pixels."""
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 2 * width)
     values = r.cross[inliers].reshape(-1).abs()
-    return max(float(values.median()) * MAD_TO_SIGMA, settings.noise_floor_px)
+    return max(float(values.median()) * MAD_TO_SIGMA, NOISE_FLOOR_PX)
 
 
-def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], settings: KernelSettings) -> float:
+def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"]) -> float:
     """Distance from the border of what was decoded from which on residuals are no larger than usual.
 
     Classes by distance hold equally many. Only those that are nearer than most are asked, so at most half fall away.
     """
     if not len(distance):
         return 0.0
-    shares = np.linspace(0, 1, settings.border_classes + 1)[: settings.border_classes // 2 + 1]
+    shares = np.linspace(0, 1, _BORDER_CLASSES + 1)[: _BORDER_CLASSES // 2 + 1]
     edges = np.quantile(array(distance), shares)
-    most = settings.most_border_noise * float(size.median().clamp_min(settings.noise_floor_px))
+    most = _MOST_BORDER_NOISE * float(size.median().clamp_min(NOISE_FLOOR_PX))
     for low, high in reversed(list(pairwise(edges.tolist()))):
         mine = (distance >= low) & (distance < high)
         if mine.any() and float(size[mine].median()) > most:
@@ -436,7 +393,7 @@ def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"], sett
     return 0.0
 
 
-def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSettings) -> Float[Tensor, "rows"]:
+def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"]) -> Float[Tensor, "rows"]:
     """Noise of each look-up over that of all, from the residuals of those that see their surface as obliquely.
 
     `cosine`: between the surface's normal and the line of sight. Classes hold equally many look-ups.
@@ -444,11 +401,11 @@ def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"], settings: KernelSe
     size, known = r.cross.norm(dim=-1), r.cross_valid
     if not known.any():
         return torch.ones_like(size)
-    shares = np.linspace(0, 1, settings.obliqueness_classes + 1)[1:-1]
+    shares = np.linspace(0, 1, _OBLIQUENESS_CLASSES + 1)[1:-1]
     group = torch.bucketize(cosine, torch.from_numpy(np.quantile(array(cosine[known]), shares)))
     usual, ratio = size[known].median(), torch.ones_like(size)
-    for k in range(settings.obliqueness_classes):
+    for k in range(_OBLIQUENESS_CLASSES):
         mine = group == k
         if (mine & known).any():
-            ratio[mine] = size[mine & known].median() / usual.clamp_min(settings.noise_floor_px)
-    return ratio.clamp_min(settings.least_noise_ratio)
+            ratio[mine] = size[mine & known].median() / usual.clamp_min(NOISE_FLOOR_PX)
+    return ratio.clamp_min(_LEAST_NOISE_RATIO)

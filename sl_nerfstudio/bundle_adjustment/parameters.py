@@ -1,11 +1,7 @@
-"""How well the stated intrinsics agree with the captures.
+"""Unknowns of the bundle adjustment: their order, the prior, the gauge, which are free, and the intrinsics.
 
-Focal length and principal point of both devices become six more unknowns of the bundle adjustment, common to all
-frames. One Gauss-Newton step shows how much better other values would agree (self-calibration: Triggs et al., Bundle
-Adjustment - A Modern Synthesis, 2000, section 3). The step is reported, not taken. Poses that were adjusted with wrong
-intrinsics have absorbed part of the error, and their stated uncertainty includes that part.
-
-Changes are shares of the focal length, in the order of `IntrinsicsChange.values`.
+Unknowns of the poses are the increments delta and rho of `residuals`; those of the intrinsics, common to all frames,
+are changes as shares of the focal length, in the order of `IntrinsicsChange.values`.
 """
 
 import math
@@ -18,9 +14,8 @@ from jaxtyping import Float, Float64, Int, Shaped
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import WIDE_HALF_WINDOW, CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
-from sl_nerfstudio.bundle_adjustment.settings import SelfCalibrationSettings
 from sl_nerfstudio.geometry.devices import UNCHANGED, Intrinsics, IntrinsicsChange, project, project_jacobian
 from sl_nerfstudio.geometry.lie import (
     Similarity,
@@ -38,7 +33,7 @@ from sl_nerfstudio.geometry.lie import (
 
 
 def by_frame(values: Shaped[Tensor, "unknowns *k"]) -> Shaped[Tensor, "frames 12 *k"]:
-    """From delta of all frames, then rho of all."""
+    """Reorder delta of all frames, then rho of all, to delta and rho of each frame."""
     n = len(values) // 12
     return values.reshape(2, n, 6, *values.shape[1:]).transpose(0, 1).reshape(n, 12, *values.shape[1:])
 
@@ -51,7 +46,7 @@ def by_kind(values: Shaped[Tensor, "frames 12 *k"]) -> Shaped[Tensor, "unknowns 
 
 # What is known about poses and intrinsics before any residual is computed.
 
-INTRINSICS_SIGMA = 0.005  # share of the focal length, if the uncertainty of the intrinsics is not stated
+INTRINSICS_SIGMA = 0.005  # share of the focal length; unstated intrinsics are assumed accurate to this
 USUAL_FRAME_ROTATION_DEG = 2.0  # 1 sigma about each axis of a starting pose, if it is not stated
 
 
@@ -121,7 +116,7 @@ def prior_equations(
 
 
 def _departure(start: Rig, rig: Rig) -> Float[Tensor, "frames 12"]:
-    """From the starting poses to the current ones.
+    """Difference of the current poses from the starting ones.
 
     Increment of each frame as a whole, change of its projector's position in camera axes, and its rotation vector.
     """
@@ -139,12 +134,10 @@ def rough_weight(noise: float, residuals_per_frame: float, independent: float) -
     return noise**2 * max(residuals_per_frame / independent, 1.0)
 
 
-# The seven degrees of freedom that no measurement fixes: position and orientation of the world, and its scale.
-#
-# After an adjustment the whole scene is moved by one similarity, which changes no residual. The scale is set to its
-# known
-# value (from a baseline, or from all lengths of the starting poses), else to the geometric mean of the baselines.
-# Position and orientation are set to the best agreement with the starting poses, in least squares.
+# The gauge: position, orientation and scale of the world, which no measurement fixes. After an adjustment the whole
+# scene is moved by one similarity, which changes no residual. The scale is set to its known value (from a baseline, or
+# from all lengths of the starting poses), else to the geometric mean of the baselines; position and orientation to the
+# best agreement with the starting poses, in least squares.
 
 _MOST_STEPS, _CONVERGED = 50, 1e-12  # of the logarithm of the scale
 
@@ -284,7 +277,7 @@ class FreeParameters:
         return torch.cat([mine.flatten(0, 1), shared]).reshape(self.count, *g.shape[2:])
 
     def matrix(self, H: Float[Tensor, "unknowns unknowns"]) -> Float[Tensor, "parameters parameters"]:
-        """The same for both sides of a normal matrix; unknowns after those of the frames stay. It may be `H` itself."""
+        """A normal matrix by the parameters; unknowns after those of the frames stay. It may be `H` itself."""
         if self.own.shape[2] == 12 and not self.shared.shape[2]:
             return H
         return self._rows(self._rows(H).T)
@@ -295,7 +288,7 @@ class FreeParameters:
 
 
 def free_parameters(refine: RefinePoses, rig: Rig) -> FreeParameters:
-    """What a choice leaves free at a rig."""
+    """Parameters that a choice leaves free at a rig."""
     n = rig.frames
     eye = torch.eye(12, dtype=torch.float64).expand(n, 12, 12)
     own, shared = eye[..., :6], eye[..., :0]
@@ -336,7 +329,14 @@ def mean_pose(T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "4 4"]:
     return pose((U * sign) @ Vt, T[:, :3, 3].mean(0))
 
 
+# Self-calibration (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 3): one Gauss-Newton step of
+# the intrinsics shows how much better other values would agree. It is reported, not taken. Poses that were adjusted
+# with wrong intrinsics have absorbed part of the error, and their stated uncertainty includes that part.
+
 UNKNOWNS = 6  # focal length, centre x, centre y: of all cameras together, then of the projector
+_CONTRADICTION = 50.0  # chi square of six above which the captures contradict the intrinsics: by chance once in 10^8,
+# but the errors of blocks of pixels are not independent
+_LEAST_CHANGE = 1e-3  # share of the focal length below which no change is reported: no calibration is that good
 
 
 @dataclass(frozen=True)
@@ -348,7 +348,7 @@ class SelfCalibration:
 
     @staticmethod
     def of(change: IntrinsicsChange, covariance: Float[Tensor, "6 6"]) -> "SelfCalibration":
-        """From a change in plain numbers."""
+        """The record of a change in plain numbers."""
         return SelfCalibration(torch.tensor(change.values, dtype=torch.float64), covariance)
 
     @property
@@ -358,21 +358,22 @@ class SelfCalibration:
 
     def of_projector(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
         """Change of the projector alone, and its covariance, if the cameras' intrinsics are right."""
-        C, gain = self.covariance, self._projector_by_camera()
+        C, gain = self.covariance, self._projector_by_camera
         return self.change[3:] - gain @ self.change[:3], C[3:, 3:] - gain @ C[:3, 3:]
 
     def projector_by_camera(self, camera_sigma: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
         """Covariance that `of_projector` has besides if the cameras' intrinsics are right within 1 sigma only."""
-        moved = self._projector_by_camera() * torch.tensor(camera_sigma, dtype=self.covariance.dtype)
+        moved = self._projector_by_camera * torch.tensor(camera_sigma, dtype=self.covariance.dtype)
         return moved @ moved.T
 
+    @property
     def _projector_by_camera(self) -> Float[Tensor, "3 3"]:
         """How the projector follows the cameras."""
         C = self.covariance
         return torch.linalg.solve(C[:3, :3], C[:3, 3:]).T
 
     def allowing(self, sigma: Float64[ndarray, "6"]) -> "SelfCalibration":
-        """With stated values that are themselves uncertain, by 1 sigma each: no contradiction within it."""
+        """Allow for stated values that are themselves uncertain, by 1 sigma each: no contradiction within it."""
         return SelfCalibration(self.change, self.covariance + torch.from_numpy(sigma).square().diag())
 
     @property
@@ -385,18 +386,16 @@ class SelfCalibration:
         """Squared length of the change in units of its uncertainty: about six if the intrinsics are correct."""
         return float(self.change @ torch.linalg.solve(self.covariance, self.change))
 
-    def contradicts(self, settings: SelfCalibrationSettings | None = None) -> bool:
+    def contradicts(self) -> bool:
         """Whether the captures show that the stated intrinsics are wrong."""
-        s = settings or SelfCalibrationSettings()
-        if not self.known:
-            return False
-        return self.chi_square > s.contradiction and bool((self.change.abs() > s.least_change).any())
+        large = self.known and bool((self.change.abs() > _LEAST_CHANGE).any())
+        return large and self.chi_square > _CONTRADICTION
 
 
 def linearise_with_intrinsics(
     linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
 ) -> Linearisation:
-    """The same residuals with added derivatives by the six intrinsics, which come after the poses."""
+    """Add derivatives by the six intrinsics, which come after the poses."""
     i, j, a = anchors.frame, observations.frame, observations.anchor
     ray = rig.camera[i]
     K = project_jacobian(ray, anchors.d_camera)
@@ -435,8 +434,8 @@ def by_intrinsics(devices: Intrinsics, uv: Float[Tensor, "n 2"]) -> Float[Tensor
 def with_smooth_derivatives(
     linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
 ) -> Linearisation:
-    """The same residuals; derivatives by poses and intrinsics from wide windows where a paraboloid fits them."""
-    wide = maps.with_windows(maps.settings.wide_half_window)
+    """Replace derivatives by those of wide windows, where a paraboloid fits them."""
+    wide = maps.with_windows(WIDE_HALF_WINDOW)
     rows = Observations(observations.anchor, observations.frame)  # with a memory of its own
     found = linearise_with_intrinsics(linearise(rig, anchors, rows, wide), rig, anchors, rows, wide)
     fits = found.residuals.cross_valid

@@ -1,6 +1,6 @@
 """From a registration to a scan's poses: bundle adjustment of all registered frames, in the registration's gauge."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, Minimum, find_minimum
+from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, find_minimum, with_other_minima
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
 from sl_nerfstudio.bundle_adjustment.parameters import (
@@ -20,7 +20,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     restore,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on
@@ -28,10 +28,22 @@ from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.registration.surfaces import FrameCloud, motion_by_pose_errors
 from sl_nerfstudio.scan.types import PoseSigma
 
+# Errors after a registration, 1 sigma.
+_FRAME_ROTATION_DEG = 1.0  # about each axis
+_TONED_ROTATION_DEG = 0.5  # of a frame that tones hold where its surface would let it slip: the adjustment lets it, too
+_FRAME_TRANSLATION = 0.03  # share of the object's radius
+_BASELINE_LENGTH = 0.02  # of the logarithm
+_LEAST_RELATIVE_ROTATION_DEG = 0.02  # a frame's own covariance does not include wrong intrinsics
+
+# Factor on the stated sigma: look-ups share pixels, cells and edges, and errors on synthetic scans are about twice as
+# large as independent residuals suggest.
+DEPENDENCE = 2.0
+_LEAST_SIGMA = 1e-9  # smallest sigma that is stated, scene units or radian
+
 
 @dataclass(frozen=True)
 class ProjectorKnowledge:
-    """What is known of the projector's focal length and principal point: shares of the focal length."""
+    """Prior knowledge of the projector's focal length and principal point: shares of the focal length."""
 
     sigma: tuple[float, float, float]
     change: DeviceChange = field(default_factory=DeviceChange)  # of the current projector against the known one
@@ -41,29 +53,11 @@ class ProjectorKnowledge:
 class RegisteredFramesSettings:
     """Bundle adjustment after a registration by surfaces."""
 
-    frame_rotation_deg: float = 1.0
-    """Error of each frame's rotation after registration, 1 sigma per axis, in degrees."""
-    toned_rotation_deg: float = 0.5
-    """The same for a frame that tones hold where its surface would let it slip: the adjustment lets it slip, too."""
-    frame_translation: float = 0.03
-    """The same for its position, as a share of the object's radius."""
-    baseline_length: float = 0.02
-    """Error of a baseline's length after registration, 1 sigma of the logarithm."""
-    least_relative_rotation_deg: float = 0.02
-    """Smallest sigma of the relative rotation, in degrees: a frame's own covariance does not include wrong
-    intrinsics."""
-    dependence: float = 2.0
-    """Factor on the stated sigma: look-ups share pixels, cells and edges, and errors on synthetic scans are about twice
-    as large as independent residuals suggest."""
-    least_sigma: float = 1e-9
-    """Smallest sigma that is stated, in scene units or radian."""
     refine: RefinePoses = "free"
     """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
     projector: ProjectorKnowledge | None = None
     """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
-    adjustment: AdjustmentSettings = field(
-        default_factory=lambda: AdjustmentSettings(hops=HopSettings(lost_by_surface=False))
-    )
+    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(lost_by_surface=False))
     """The bundle adjustment itself; surfaces were registered before."""
 
 
@@ -82,36 +76,33 @@ class AdjustedFrames:
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
 
     def mapped(self, S_target_world: Similarity) -> "AdjustedFrames":
-        """In other axes and another unit."""
-        factor = S_target_world.scale
-        sigma = tuple(
-            None
-            if s is None
-            else replace(
-                s,
-                camera_translation=s.camera_translation * factor,
-                relative_translation=s.relative_translation * factor,
-            )
+        """The same frames in other axes and another unit."""
+        f = S_target_world.scale
+        sigma = [
+            s and PoseSigma(s.camera_translation * f, s.camera_rotation_deg, s.relative_translation * f,
+                            s.relative_rotation_deg)
             for s in self.sigma
-        )
-        return replace(self, poses=self.poses.mapped(S_target_world), sigma=sigma)
+        ]  # fmt: skip
+        return replace(self, poses=self.poses.mapped(S_target_world), sigma=tuple(sigma))
 
     def scaled(self, factor: float) -> "AdjustedFrames":
-        """With all lengths multiplied, which makes a scan metric."""
+        """The same frames with all lengths multiplied."""
         return self.mapped(Similarity.scaling(factor))
 
 
 @dataclass(frozen=True)
 class RegisteredMinimum:
-    """Where the adjustment of all registered frames has ended."""
+    """Adjustment of all registered frames, of which it is not known yet whether it is one of several minima."""
 
     frames: AdjustedFrames  # with the sigma of this minimum alone
-    _minimum: Minimum
-    _stated: Callable[[Adjustment], tuple[PoseSigma | None, ...]]
+    adjustment: Adjustment
+    unit: float  # of the scene, in that of the frames
 
     def with_other_minima(self) -> AdjustedFrames:
-        """The same poses; their sigma also covers how far other minima are, which takes several more searches."""
-        return replace(self.frames, sigma=self._stated(self._minimum.with_other_minima()))
+        """Let sigma cover how far other minima are, which takes several more searches; the poses stay."""
+        index = np.flatnonzero([s is not None for s in self.frames.sigma]).tolist()
+        sigma = _stated_sigma(with_other_minima(self.adjustment), self.unit)
+        return replace(self.frames, sigma=_sigmas_among_all(sigma, index, len(self.frames.sigma)))
 
 
 def adjust_registered(
@@ -127,62 +118,41 @@ def adjust_registered(
 def find_registered_minimum(
     clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
 ) -> RegisteredMinimum:
-    """The same without asking for other minima, for frames of which some may be taken out.
+    """Adjust without asking for other minima, where frames may be taken out again.
 
     Raises UserError if fewer than two frames are registered.
     """
     s = settings or RegisteredFramesSettings()
-    index = _registered(clouds, registration)
+    index, total = _registered(clouds, registration), len(clouds)
     S_scene_world = _scene(clouds, registration, index)
-    start = Rig.of(
-        [clouds[k].camera for k in index],
-        clouds[0].projector,
-        _poses_of(clouds, registration, index),
-        S_scene_world,
-    )
-    maps = CoordinateMaps.of((torch.from_numpy(clouds[k].coords) for k in index), s.adjustment.look_up)
-    prior = _prior(clouds, registration, index, S_scene_world.scale, s)
-    minimum = find_minimum(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
-    found, S_world_scene = minimum.adjustment, S_scene_world.inverse()
+    poses = _poses_of(clouds, registration, index)
+    start = Rig.of([clouds[k].camera for k in index], clouds[0].projector, poses, S_scene_world)
+    maps = CoordinateMaps.of(torch.from_numpy(clouds[k].coords) for k in index)
+    prior = _prior(clouds, registration, index, S_scene_world.scale, s.projector)
+    found = find_minimum(constrained(s.refine, start), maps, prior, s.refine, s.adjustment)
+    S_world_scene = S_scene_world.inverse()
     rig = restore(start, found.rig, baseline_scale(start, found.rig, None))
-
-    def stated(found: Adjustment) -> tuple[PoseSigma | None, ...]:
-        sigma = s.dependence * frame_sigmas(found.sigma.clamp_min(s.least_sigma), S_world_scene.scale)
-        return _sigmas_among_all(sigma, index, len(clouds))
-
     frames = AdjustedFrames(
-        _among_all(rig.poses(S_world_scene), index, len(clouds)),
-        stated(found),
+        _among_all(rig.poses(S_world_scene), index, total),
+        _sigmas_among_all(_stated_sigma(found, S_world_scene.scale), index, total),
         found.noise_px,
         found.median_before_px,
         found.median_after_px,
         found.intrinsics,
     )
-    return RegisteredMinimum(frames, minimum, stated)
+    return RegisteredMinimum(frames, found, S_world_scene.scale)
 
 
-def keep_registered(
-    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
-) -> AdjustedFrames:
+def keep_registered(clouds: Sequence[FrameCloud], registration: Registration) -> AdjustedFrames:
     """The poses of all registered frames as registration left them, with what the adjustment takes as their prior.
 
     Raises UserError if fewer than two frames are registered.
     """
-    s = settings or RegisteredFramesSettings()
-    index = _registered(clouds, registration)
+    index, total, nan = _registered(clouds, registration), len(clouds), float("nan")
     scale = _scene(clouds, registration, index).scale
-    prior = _prior(clouds, registration, index, scale, s)
-    shift, turn = prior.frame_translation / scale, torch.rad2deg(prior.frame_rotation)
-    own_shift, own_turn = prior.relative_translation / scale, torch.rad2deg(prior.relative_rotation)
-    stated = torch.stack([shift, turn, own_shift, own_turn], 1).numpy()
-    return AdjustedFrames(
-        _among_all(_poses_of(clouds, registration, index), index, len(clouds)),
-        _sigmas_among_all(stated, index, len(clouds)),
-        noise_px=float("nan"),
-        median_before_px=float("nan"),
-        median_after_px=float("nan"),
-        intrinsics=None,
-    )
+    stated = frame_sigmas(_prior(clouds, registration, index, scale, None).sigma, 1 / scale)
+    poses = _among_all(_poses_of(clouds, registration, index), index, total)
+    return AdjustedFrames(poses, _sigmas_among_all(stated, index, total), nan, nan, nan, None)
 
 
 def _registered(clouds: Sequence[FrameCloud], registration: Registration) -> list[int]:
@@ -199,8 +169,14 @@ def _registered(clouds: Sequence[FrameCloud], registration: Registration) -> lis
 
 def _poses_of(clouds: Sequence[FrameCloud], registration: Registration, index: Sequence[int]) -> DevicePoses:
     """Poses of some frames after registration."""
-    projector = np.stack([_projector_pose(clouds[k], registration, k) for k in index])
-    return DevicePoses(registration.T_world_camera[list(index)], projector)
+    camera, relative = registration.T_world_camera[list(index)], [clouds[k].pose.T_camera_projector for k in index]
+    projector = np.stack(relative)
+    projector[:, :3, 3] *= registration.baseline[list(index), None]
+    return DevicePoses(camera, camera @ projector)
+
+
+def _stated_sigma(found: Adjustment, unit: float) -> Float64[ndarray, "m 4"]:
+    return DEPENDENCE * frame_sigmas(found.sigma.clamp_min(_LEAST_SIGMA), unit)
 
 
 def _sigmas_among_all(
@@ -220,12 +196,6 @@ def _among_all(poses: DevicePoses, index: Sequence[int], frames: int) -> DeviceP
     return DevicePoses(camera, projector)
 
 
-def _projector_pose(cloud: FrameCloud, registration: Registration, k: int) -> Float64[ndarray, "4 4"]:
-    T = cloud.pose.T_camera_projector.copy()
-    T[:3, 3] *= registration.baseline[k]
-    return registration.T_world_camera[k] @ T
-
-
 def _scene(clouds: Sequence[FrameCloud], registration: Registration, index: Sequence[int]) -> Similarity:
     """World to scene: the object's centre becomes the origin, its radius one."""
     parts = []
@@ -236,12 +206,9 @@ def _scene(clouds: Sequence[FrameCloud], registration: Registration, index: Sequ
 
 
 def _prior(
-    clouds: Sequence[FrameCloud],
-    registration: Registration,
-    index: Sequence[int],
-    scale: float,
-    settings: RegisteredFramesSettings,
-) -> PosePrior:
+    clouds: Sequence[FrameCloud], registration: Registration, index: Sequence[int], scale: float,
+    projector: ProjectorKnowledge | None,
+) -> PosePrior:  # fmt: skip
     """Uncertainty of each frame after registration and relative pose estimation; scene units.
 
     Registration moves the surface into its place; where the pose's error has moved, turned and scaled the surface as a
@@ -256,18 +223,17 @@ def _prior(
         motion = motion_by_pose_errors(clouds[k])
         camera_shift = motion[:3] - np.outer(clouds[k].centroid, motion[6])
         growth = float(np.linalg.norm(motion[6]))
-        turn_deg = settings.toned_rotation_deg if registration.names[k] in toned else settings.frame_rotation_deg
+        turn_deg = _TONED_ROTATION_DEG if registration.names[k] in toned else _FRAME_ROTATION_DEG
         rows.append(
             (
-                float(np.hypot(settings.frame_translation, length * np.linalg.norm(camera_shift) / 3**0.5)),
+                float(np.hypot(_FRAME_TRANSLATION, length * np.linalg.norm(camera_shift) / 3**0.5)),
                 float(np.hypot(np.radians(turn_deg), np.linalg.norm(motion[3:6]) / 3**0.5)),
-                length * float(np.linalg.norm([settings.baseline_length, growth, direction])),
-                max(turn, np.radians(settings.least_relative_rotation_deg)),
+                length * float(np.linalg.norm([_BASELINE_LENGTH, growth, direction])),
+                max(turn, np.radians(_LEAST_RELATIVE_ROTATION_DEG)),
             )
         )
     a, b, c, d = torch.tensor(rows, dtype=torch.float64).unbind(1)
-    if settings.projector is None:
+    if projector is None:
         return PosePrior(a, b, c, d)
-    known = settings.projector
-    change = IntrinsicsChange(projector=known.change)
-    return PosePrior(a, b, c, d, intrinsics_change=change, projector_intrinsics=known.sigma)
+    change = IntrinsicsChange(projector=projector.change)
+    return PosePrior(a, b, c, d, intrinsics_change=change, projector_intrinsics=projector.sigma)

@@ -40,8 +40,6 @@ from sl_nerfstudio.geometry.lie import (
 )
 from sl_nerfstudio.parallel import compiled, compiled_range
 
-# All devices of a scan as tensors in the scene frame, for solvers.
-
 
 @dataclass(frozen=True)
 class Rig:
@@ -54,7 +52,7 @@ class Rig:
 
     @staticmethod
     def of(cameras: Sequence[Device], projector: Device, poses: DevicePoses, S_scene_world: Similarity) -> "Rig":
-        """Devices with the given poses in a world; the rig's "world" is the scene."""
+        """Put devices with the given poses in a world into the scene, which is the rig's "world"."""
         scene = poses.mapped(S_scene_world)
         camera = torch.from_numpy(scene.T_world_camera)
         return Rig(
@@ -75,7 +73,7 @@ class Rig:
 
     @cached_property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray, int, ndarray, int]:
-        """For compiled loops: poses first, then parameters and model codes of cameras and projector.
+        """Arrays for compiled loops: poses first, then parameters and model codes of cameras and projector.
 
         The poses are those of the cameras, their inverses, and those of the cameras in the axes of their projectors.
         """
@@ -109,7 +107,7 @@ class Rig:
         )
 
     def scaled(self, scale: float) -> "Rig":
-        """With all lengths multiplied."""
+        """The rig with all lengths multiplied."""
         camera, relative = self.T_world_camera.clone(), self.T_camera_projector.clone()
         camera[:, :3, 3] *= scale
         relative[:, :3, 3] *= scale
@@ -123,12 +121,8 @@ def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tens
     return torch.from_numpy(out)
 
 
-# Residuals and their derivatives; `bundle_adjustment/residuals.py` says what they are.
-#
-# `devices` are a rig's arrays (`Rig.arrays`): poses of the cameras in the world, their inverses, those of the
-# cameras in their projectors, and parameters and model codes of cameras and projector. Arrays for derivatives may
-# be
-# empty: then none are computed.
+# Compiled residuals and derivatives. `devices` are `Rig.arrays`. Arrays for derivatives may be empty: then none are
+# computed.
 
 
 @compiled
@@ -148,7 +142,7 @@ def _world_point(devices, frame, depth, ray):
 
 @compiled_range
 def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, by_pose, by_depth):
-    """The anchors' own: decoded coordinates from their projector's view of them."""
+    """Own residuals of the anchors: their projector's view of them less the decoded coordinates."""
     _, _, T_projector_camera, _, _, projector, code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
@@ -165,7 +159,7 @@ def own_residuals(first, last, devices, frame, rays, depths, decoded, residual, 
 
 @compiled_range
 def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_front):
-    """Where other cameras see the anchors."""
+    """Pixels at which other cameras see the anchors."""
     _, T_camera_world, _, cameras, code, _, _ = devices
     for k in range(first, last):
         a, j = anchor[k], viewer[k]
@@ -178,7 +172,7 @@ def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_
 def cross_residuals(
     first, last, devices, frame, rays, depths, anchor, viewer, seen, seen_by_pixel, residual, by_pose, by_depth
 ):
-    """What other frames decoded (`seen`, with its derivatives by the pixel), from their projectors' views."""
+    """Cross residuals: the views of their projectors less what other frames decoded (`seen`, `seen_by_pixel`)."""
     T_world_camera, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
@@ -221,7 +215,7 @@ class Anchors:
         return replace(self, depth=depth)
 
     def chosen(self, index: Tensor) -> "Anchors":
-        """Some of the anchors, by mask or by index."""
+        """Choose anchors by mask or by index."""
         return Anchors(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
@@ -238,7 +232,7 @@ class Observations:
 
     @cached_property
     def memory(self) -> WindowMemory:
-        """Of the look-ups of these rows: anchors move little from one step to the next."""
+        """Last fits of the look-ups of these rows: anchors move little from one step to the next."""
         return WindowMemory.empty(array(self.frame))
 
 
@@ -297,7 +291,7 @@ def residuals_of(rig: Rig, anchors: Anchors, observations: Observations, maps: C
 def pixels_of_rows(
     rig: Rig, anchors: Anchors, observations: Observations
 ) -> tuple[Float[Tensor, "rows 2"], Bool[Tensor, "rows"]]:
-    """Where the seeing cameras have the anchors, and whether in front of them."""
+    """Pixels of the anchors in the cameras that see them, and whether they are in front."""
     n = len(observations.anchor)
     uv, in_front = np.empty((n, 2)), np.empty(n, dtype=np.bool_)
     rows = (array(observations.anchor), array(observations.frame))

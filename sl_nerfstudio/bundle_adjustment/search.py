@@ -1,4 +1,9 @@
-"""One search: all stages, with frames that were lost on the way."""
+"""One search for the poses: steps in stages with a narrowing kernel; frames that were lost on the way placed again.
+
+A frame that ended in a wrong minimum while the others agreed is placed on its own: with all others fixed it has six
+unknowns and thousands of residuals. Starting with a wide kernel, and from a few poses around its current one, it finds
+the surface that the others agree on.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -7,8 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, lm_step
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import DAMPING, LMState, lm_step
 from sl_nerfstudio.bundle_adjustment.observations import (
+    NOISE_FLOOR_PX,
     Kernel,
     away_from_borders,
     frame_medians,
@@ -39,21 +45,64 @@ from sl_nerfstudio.bundle_adjustment.residuals import (
     residuals_of,
     viewing_cosines,
 )
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import project
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 
-# What a search is given, and how far it has come.
-
 FRAMES_MOVE = ("free", "rigid-rig", "known-rig")
 """What may be refined if single frames are to move by themselves."""
-_NO_GATE = float("inf")  # pixels: no residual is too large to be used
+
+LEAST_COSINE = 0.1  # between surface normal and ray; below it a device counts as not seeing a point
+PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: many frames take time by their number
+_LEAST_ANCHORS = 60  # of each frame, however many frames there are
+_RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
+_OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
+INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
+_KERNEL_MEDIANS = 2.0  # width that a frame's kernel narrows to, in its median residuals
+_KERNEL_NOISES = 3.0  # smallest width, in estimated noises
+_CONVERGED = 1e-4  # largest component of a step, scene units or radian, below which the poses have converged
+_SETTLED = 0.98  # share of its last width above which a kernel counts as no longer narrowing
+
+# Frames that are lost.
+_ROUNDS = 3  # of searching; frames that were found help to find the others
+_LOST_ANCHORS = 200  # decoded pixels of each frame that are used
+EVERY_FRAME_PER_ANCHOR = 16  # in which an anchor is looked up where every frame that may see it is asked
+_MOST_RESIDUALS = 6000  # between one frame and all others
+_STARTS = 12  # starting poses for a lost frame, drawn from the prior
+_FRAME_STEPS = 10  # from each, in which the frame moves as a whole
+_PROJECTOR_STEPS = 10  # after those, in which its projector moves, too
+_LOST_OBSERVE_EVERY = 3
+_INLIER_NOISES = 5.0  # largest residual that supports a pose
+LEAST_GAIN = 0.01  # share of supporting residuals that a new pose must add to replace the old one
+_LOST_SIGMAS = 4.0  # robust standard deviations below the median frame's support at which a frame is lost,
+_LEAST_SHARE, _MOST_SHARE = 0.75, 0.95  # always below the first share of that, and never above the second
+
+
+@dataclass(frozen=True)
+class AdjustmentSettings:
+    """Size of the bundle adjustment; the defaults suit object-sized scans."""
+
+    anchors_per_frame: int = 600
+    """Decoded pixels of each frame that are looked up in other frames."""
+    max_anchors: int = 12000
+    """Decoded pixels of all frames, at most: time grows with this number, accuracy with its square root."""
+    frames_per_anchor: int = 8
+    """Most other frames in which each of them is looked up."""
+    max_iterations: int = 40
+    """Most Levenberg-Marquardt steps."""
+    seed: int = 0
+    """Seed of the choice of pixels."""
+    other_minima: int = 3
+    """Searches from other starting poses if a result turns out to be one of several minima; 0: none."""
+    hops: int = 12
+    """Most further searches after rough starts, each begun beside the best end so far; 0: none."""
+    lost_by_surface: bool = True
+    """Whether frames that agree with no others after all searches are looked for by their surfaces."""
 
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """What does not change during an adjustment."""
+    """A search: the measurements, the prior, and where it begins."""
 
     start: Rig  # to which the prior belongs
     begin: Rig  # where the search begins
@@ -66,15 +115,14 @@ class SearchProblem:
     expected: Float[Tensor, "frames"]  # support of each frame with which it is not lost; -inf: it is never searched for
 
     def observe(self, state: LMState) -> Observations:
-        """A new choice of which frame looks up which anchor."""
-        s = self.settings
+        """A new choice of which frame looks up which anchor; no residual is too large to be used."""
         return observe(
-            state.rig, state.anchors, self.maps, s.frames_per_anchor, _NO_GATE, s.least_cosine, self.generator,
-            self.partners,
+            state.rig, state.anchors, self.maps, self.settings.frames_per_anchor, float("inf"), LEAST_COSINE,
+            self.generator, self.partners,
         )  # fmt: skip
 
     def again(self, start: Rig, begin: Rig, expected: Float[Tensor, "frames"]) -> "SearchProblem":
-        """The same problem for another search, which expects that support of each frame."""
+        """Another search with the same measurements, which expects that support of each frame."""
         return replace(problem_of(start, self.maps, self.prior, self.settings, begin), expected=expected)
 
 
@@ -94,18 +142,15 @@ class SearchProgress:
         return self.rows.pairs(self.state.anchors)
 
     def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "SearchProgress":
-        """The same with some frames at other poses; the kernels of those frames are wide again."""
+        """Continue with some frames at other poses; the kernels of those frames are wide again."""
         widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
         return replace(self, state=replace(self.state, rig=rig), widths=widths)
 
 
-def kernel_of(
-    state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals, problem: SearchProblem
-) -> Kernel:
+def kernel_of(state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals) -> Kernel:
     """The kernel with the noise that look-ups have by how obliquely a camera sees the surface."""
     cosine = viewing_cosines(state.rig, state.anchors, rows)
-    ratio = noise_ratios(r, cosine, problem.settings.kernel)
-    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), ratio)
+    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), noise_ratios(r, cosine))
 
 
 def problem_of(
@@ -115,14 +160,11 @@ def problem_of(
     begin = start if begin is None else begin
     generator = torch.Generator().manual_seed(settings.seed)
     per_frame = min(settings.anchors_per_frame, settings.max_anchors // start.frames)
-    per_frame = max(per_frame, min(settings.least_anchors_per_frame, settings.anchors_per_frame))
+    per_frame = max(per_frame, min(_LEAST_ANCHORS, settings.anchors_per_frame))
     anchors = place_anchors(begin, maps, per_frame, generator)
-    together = partners(begin, anchors, maps, settings.partners, settings.least_cosine, generator)
+    together = partners(begin, anchors, maps, PARTNERS, LEAST_COSINE, generator)
     whatever = torch.full((start.frames,), float("inf"), dtype=torch.float64)
     return SearchProblem(start, begin, maps, prior, settings, generator, together, anchors, whatever)
-
-
-# Steps that follow each other until nothing moves any more.
 
 
 @dataclass(frozen=True)
@@ -141,92 +183,57 @@ def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStag
     counted as thousands, they would overrule the prior along directions that they hardly determine, and the scene would
     drift.
     """
-    rough = max(settings.max_iterations // 2 - settings.rigid_iterations, 1)
+    rough = max(settings.max_iterations // 2 - _RIGID_ITERATIONS, 1)
     found = [SearchStage(refine, True, rough), SearchStage(refine, False, settings.max_iterations)]
     if refine in ("free", "rigid-rig"):  # a static projector is already in place
-        found.insert(0, SearchStage("known-rig", True, settings.rigid_iterations))
+        found.insert(0, SearchStage("known-rig", True, _RIGID_ITERATIONS))
     return found
 
 
 def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress) -> SearchProgress:
     """Take the steps of one stage, until nothing moves any more."""
-    start, maps, s = problem.start, problem.maps, problem.settings
-    found = replace(found, state=replace(found.state, damping=s.steps.damping))
+    start, maps = problem.start, problem.maps
+    found = replace(found, state=replace(found.state, damping=DAMPING))
     for iteration in track(range(stage.iterations), "Adjusting poses"):
-        if stage.rough and iteration % s.observe_every == 0:
+        if stage.rough and iteration % _OBSERVE_EVERY == 0:
             found = replace(found, rows=problem.observe(found.state))
         linear = linearise(found.state.rig, found.state.anchors, found.rows, maps)
         r = linear.residuals
-        target = s.kernel.medians * frame_medians(r, found.pairs, start.frames)
-        noise = noise_of(r, float(torch.minimum(found.widths, target).min()), s.kernel)
-        widths = narrowed(found.widths, target, s.kernel).clamp_min(s.kernel.noises * noise)
-        kernel = kernel_of(found.state, found.rows, widths, r, problem)
+        target = _KERNEL_MEDIANS * frame_medians(r, found.pairs, start.frames)
+        noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
+        widths = narrowed(found.widths, target).clamp_min(_KERNEL_NOISES * noise)
+        kernel = kernel_of(found.state, found.rows, widths, r)
         per_frame = float(r.cross_valid.sum()) / start.frames
-        weight = rough_weight(noise, per_frame, s.independent_residuals) if stage.rough else noise**2
+        weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
         free = free_parameters(stage.refine, found.state.rig)
-        state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free, s.steps)
+        state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free)
         # a step may also be small because it was damped
-        small = state.size < s.steps.converged and (state.damping < 1 or state.size == 0)
-        settled = bool((widths >= s.steps.settled * found.widths).all()) and small
+        small = state.size < _CONVERGED and (state.damping < 1 or state.size == 0)
+        settled = bool((widths >= _SETTLED * found.widths).all()) and small
         found = SearchProgress(state, found.rows, widths, noise, found.iterations + 1)
         if settled:
             break
     return found
 
 
-# Frames that ended in a wrong minimum while the others agreed: each is placed again on its own.
-#
-# With all other frames fixed, a frame has six unknowns and thousands of residuals. Starting with a wide kernel, and
-# from
-# a few poses around its current one, it finds the surface that the others agree on.
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """What does not change during a search."""
-
-    anchors: Anchors
-    maps: CoordinateMaps
-    start: Rig
-    prior: PosePrior
-    noise: float
-    generator: torch.Generator
-    settings: AdjustmentSettings
-    projector_steps: int  # after those of the frame as a whole
-
-    def support(self, rig: Rig, rows: Observations, anchors: Anchors) -> Float[Tensor, "frames"]:
-        """See support_of."""
-        return support_of(rig, anchors, rows, self.maps, self.settings.relocalisation.inlier_noises * self.noise)
-
-    def rows(self, rig: Rig, around: int | None = None) -> Observations:
-        """Anchors in other frames that may see them; with `around`, only of or in one frame."""
-        return rows_of_all(rig, self.anchors, self.maps, self.settings, self.generator, around)
-
-
 def rows_of_all(
-    rig: Rig,
-    anchors: Anchors,
-    maps: CoordinateMaps,
-    settings: AdjustmentSettings,
-    generator: torch.Generator,
-    around: int | None = None,
+    rig: Rig, anchors: Anchors, maps: CoordinateMaps, generator: torch.Generator, around: int | None = None
 ) -> Observations:
-    """Every anchor in other frames that may see it."""
-    most, cosine = settings.relocalisation.frames_per_anchor, settings.least_cosine
+    """Every anchor in other frames that may see it; with `around`, only anchors of or in one frame."""
     if around is None:
-        allowed = partners(rig, anchors, maps, settings.partners, cosine, generator)
+        allowed = partners(rig, anchors, maps, PARTNERS, LEAST_COSINE, generator)
     else:
         allowed = involving(around, rig.frames)
-    return observe(rig, anchors, maps, most, float("inf"), cosine, generator, allowed)
+    return observe(rig, anchors, maps, EVERY_FRAME_PER_ANCHOR, float("inf"), LEAST_COSINE, generator, allowed)
 
 
 def support_of(
-    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, within_px: float
+    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, noise: float
 ) -> Float[Tensor, "frames"]:
     """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
     r = residuals_of(rig, anchors, rows, maps)
-    inlier = r.cross_valid & (r.cross.norm(dim=-1) < within_px)
+    inlier = r.cross_valid & (r.cross.norm(dim=-1) < _INLIER_NOISES * noise)
     counts = torch.zeros(2, rig.frames, dtype=torch.float64)
     for frame in rows.pairs(anchors):
         for k, counted in enumerate((inlier, r.cross_valid)):
@@ -238,38 +245,37 @@ def frame_support(
     rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings
 ) -> Float[Tensor, "frames"]:
     """Share of residuals within the noise of each frame, the same ones of the same poses; NaN where there are none."""
-    s, generator = settings.relocalisation, torch.Generator().manual_seed(settings.seed)
-    anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    rows = rows_of_all(rig, anchors, maps, settings, generator)
-    return support_of(rig, anchors, rows, maps, s.inlier_noises * noise)
+    generator = torch.Generator().manual_seed(settings.seed)
+    anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
+    return support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
 
 
 def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
     """Frames that see too little of the surface on which the others agree, in order."""
     support = frame_support(rig, maps, noise, settings)
-    wrong = support.isnan() | (support < settings.relocalisation.least_share * support.nanmedian())
+    wrong = support.isnan() | (support < _LEAST_SHARE * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
 
 
-def least_support(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> float:
+def least_support(support: Float[Tensor, "frames"]) -> float:
     """The smallest support with which a frame counts as placed.
 
     It is some robust standard deviations below the median frame's, but always between two shares of that.
     """
     middle = support.nanmedian()
     sigma = MAD_TO_SIGMA * (support - middle).abs().nanmedian()
-    return float((middle - settings.sigmas * sigma).clamp(settings.least_share * middle, settings.most_share * middle))
+    return float((middle - _LOST_SIGMAS * sigma).clamp(_LEAST_SHARE * middle, _MOST_SHARE * middle))
 
 
-def find_lost_frames(support: Float[Tensor, "frames"], settings: RelocalisationSettings) -> Int[Tensor, "lost"]:
+def find_lost_frames(support: Float[Tensor, "frames"]) -> Int[Tensor, "lost"]:
     """Frames with far less support than most others, those with the most support first."""
-    lost = (support < least_support(support, settings)).nonzero().squeeze(-1)
+    lost = (support < least_support(support)).nonzero().squeeze(-1)
     return lost[support[lost].argsort(descending=True)]
 
 
 @dataclass(frozen=True)
 class Relocalised:
-    """What a search for lost frames has found."""
+    """Result of a search for lost frames."""
 
     rig: Rig
     found: tuple[int, ...]  # frames that the others support now
@@ -277,15 +283,7 @@ class Relocalised:
 
 
 def relocalise(
-    rig: Rig,
-    start: Rig,
-    maps: CoordinateMaps,
-    prior: PosePrior,
-    refine: RefinePoses,
-    noise: float,
-    generator: torch.Generator,
-    settings: AdjustmentSettings,
-    expected: Float[Tensor, "frames"],
+    problem: SearchProblem, refine: RefinePoses, rig: Rig, noise: float, expected: Float[Tensor, "frames"]
 ) -> Relocalised:
     """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
 
@@ -293,29 +291,25 @@ def relocalise(
     starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
     A frame with the support that is `expected` of it, or with enough of it, is not searched for.
     """
-    s = settings.relocalisation
-    relative_free = refine == "free"
-    anchors = place_anchors(rig, maps, s.anchors_per_frame, generator)
-    problem = _Problem(
-        anchors, maps, start, prior, noise, generator, settings, s.projector_steps if relative_free else 0
-    )
-    support = problem.support(rig, problem.rows(rig), anchors)
-    lost = find_lost_frames(support, s)
+    maps, prior, generator = problem.maps, problem.prior, problem.generator
+    anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
+    support = support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
+    lost = find_lost_frames(support)
     placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
     searched = [k for k in lost.tolist() if support[k] < expected[k]]
-    usual = least_support(support, s)
+    usual = least_support(support)
     for k in searched:
         enough = min(usual, float(expected[k]))
-        best, best_support = rig, float(support[k]) + s.least_gain
-        for attempt in range(s.starts):
+        best, best_support = rig, float(support[k]) + LEAST_GAIN
+        for attempt in range(_STARTS):
             delta = torch.zeros(rig.frames, 6, dtype=torch.float64)
             if attempt:
                 delta[k] = prior.sigma[k, :6] * torch.randn(6, generator=generator, dtype=torch.float64)
             relative = rig.T_camera_projector.clone()
-            if relative_free:
-                relative[k] = start.T_camera_projector[k]
+            if refine == "free":
+                relative[k] = problem.start.T_camera_projector[k]
             there = replace(rig, T_camera_projector=relative).moved(delta, torch.zeros_like(delta))
-            found, found_support = _place_one(there, k, placed, problem)
+            found, found_support = _place_one(problem, refine, there, anchors, k, placed, noise)
             if found_support > best_support:
                 best, best_support = found, found_support
             if best_support > enough:
@@ -325,69 +319,60 @@ def relocalise(
     return Relocalised(rig, tuple(k for k in searched if placed[k]), tuple(k for k in searched if not placed[k]))
 
 
-def _place_one(rig: Rig, k: int, placed: Bool[Tensor, "frames"], problem: _Problem) -> tuple[Rig, float]:
+def _place_one(
+    problem: SearchProblem, refine: RefinePoses, rig: Rig, all_anchors: Anchors, k: int, placed: Bool[Tensor, "frames"],
+    noise: float,
+) -> tuple[Rig, float]:  # fmt: skip
     """Move frame k alone, first as a whole, then its projector too; returns the rig and the frame's support in it."""
-    settings, n = problem.settings, rig.frames
-    s = settings.relocalisation
+    n, maps = rig.frames, problem.maps
     allowed = placed.clone()
     allowed[k] = True
+
+    def rows_near(rig: Rig) -> tuple[Int[Tensor, "n"], Observations]:
+        """Numbers of anchors that take part, and their rows; a random subset of these if there are too many."""
+        rows, frame = rows_of_all(rig, all_anchors, maps, problem.generator, k), all_anchors.frame
+        chosen = (allowed[frame[rows.anchor]] & allowed[rows.frame]).nonzero().squeeze(-1)
+        chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:_MOST_RESIDUALS]]
+        taking_part = frame == k
+        taking_part[rows.anchor[chosen]] = True
+        number = torch.cumsum(taking_part, 0) - 1
+        return taking_part.nonzero().squeeze(-1), Observations(number[rows.anchor[chosen]], rows.frame[chosen])
+
     width = torch.full((n,), float("inf"), dtype=torch.float64)
-    anchors, near = problem.anchors, _near(rig, k, allowed, problem)
-    state = LMState(rig, anchors.chosen(near.number), settings.steps.damping)
-    for step in range(s.frame_steps + problem.projector_steps):
-        if step and step % s.observe_every == 0:
-            anchors = anchors.at(anchors.depth.index_copy(0, near.number, state.anchors.depth))
-            near = _near(state.rig, k, allowed, problem)
-            state = replace(state, anchors=anchors.chosen(near.number))
-        linear = linearise(state.rig, state.anchors, near.rows, problem.maps)
+    anchors, (number, rows) = all_anchors, rows_near(rig)
+    state = LMState(rig, anchors.chosen(number), DAMPING)
+    for step in range(_FRAME_STEPS + (_PROJECTOR_STEPS if refine == "free" else 0)):
+        if step and step % _LOST_OBSERVE_EVERY == 0:
+            anchors = anchors.at(anchors.depth.index_copy(0, number, state.anchors.depth))
+            number, rows = rows_near(state.rig)
+            state = replace(state, anchors=anchors.chosen(number))
+        linear = linearise(state.rig, state.anchors, rows, maps)
         if not linear.residuals.cross_valid.any():
             return rig, 0.0
-        pair = near.rows.pairs(state.anchors)
-        target = settings.kernel.medians * float(frame_medians(linear.residuals, pair, n)[k])
-        width = narrowed(width, torch.full_like(width, target), settings.kernel)
-        width = width.clamp_min(settings.kernel.noises * problem.noise)
-        residuals = float(linear.residuals.cross_valid.sum())
-        weight = rough_weight(problem.noise, residuals, settings.independent_residuals)
+        pair = rows.pairs(state.anchors)
+        target = _KERNEL_MEDIANS * float(frame_medians(linear.residuals, pair, n)[k])
+        width = narrowed(width, torch.full_like(width, target)).clamp_min(_KERNEL_NOISES * noise)
+        weight = rough_weight(noise, float(linear.residuals.cross_valid.sum()), INDEPENDENT)
         term = PriorTerm(problem.prior, problem.start, weight)
         kernel = Kernel(width, state.anchors.frame, pair)
-        free = of_one_frame(k, n, with_projector=step >= s.frame_steps)
-        state = lm_step(state, linear, near.rows, problem.maps, kernel, term, free, settings.steps)
-    near = _near(state.rig, k, allowed, problem)
-    support = problem.support(state.rig, near.rows, problem.anchors.chosen(near.number))[k]
+        free = of_one_frame(k, n, with_projector=step >= _FRAME_STEPS)
+        state = lm_step(state, linear, rows, maps, kernel, term, free)
+    number, rows = rows_near(state.rig)
+    support = support_of(state.rig, all_anchors.chosen(number), rows, maps, noise)[k]
     return state.rig, float(support.nan_to_num())
-
-
-@dataclass(frozen=True)
-class _Near:
-    """The part of the problem that changes while one frame moves alone."""
-
-    number: Int[Tensor, "n"]  # of its anchors among all, in order: those of the frame and those that are looked up
-    rows: Observations  # anchors of the frame in others, and of others in the frame
-
-
-def _near(rig: Rig, k: int, allowed: Bool[Tensor, "frames"], problem: _Problem) -> _Near:
-    """Residuals of frame k with the frames that are allowed; a random subset if there are too many."""
-    rows, frame = problem.rows(rig, k), problem.anchors.frame
-    chosen = (allowed[frame[rows.anchor]] & allowed[rows.frame]).nonzero().squeeze(-1)
-    most = problem.settings.relocalisation.most_residuals
-    chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:most]]
-    taking_part = frame == k
-    taking_part[rows.anchor[chosen]] = True
-    number = torch.cumsum(taking_part, 0) - 1
-    return _Near(taking_part.nonzero().squeeze(-1), Observations(number[rows.anchor[chosen]], rows.frame[chosen]))
 
 
 def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress, float] | None:
     """All stages, and the median residual at the beginning; None if there is nothing to search."""
     begin, settings = problem.begin, problem.settings
-    state = LMState(begin, problem.anchors, settings.steps.damping)
+    state = LMState(begin, problem.anchors, DAMPING)
     rows = problem.observe(state)
     r = residuals_of(begin, state.anchors, rows, problem.maps)
     if settings.max_iterations < 1 or not r.cross_valid.any():
         return None
     before = float(r.cross[r.cross_valid].norm(dim=-1).median())
     widths = torch.full((begin.frames,), float("inf"), dtype=torch.float64)
-    found = SearchProgress(state, rows, widths, max(before, settings.kernel.noise_floor_px), 0)
+    found = SearchProgress(state, rows, widths, max(before, NOISE_FLOOR_PX), 0)
     *rough, last = stages(refine, settings)
     for stage in rough:
         found = run_stage(problem, stage, found)
@@ -398,23 +383,23 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
 
 
 def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchProgress:
-    """Without look-ups so near to the border of what was decoded that their residuals are larger than usual.
+    """Leave out look-ups so near to the border of what was decoded that their residuals are larger than usual.
 
     As wide a strip beside those falls away, too, if windows reach that far: their look-ups average over both.
     """
-    state, maps, s = found.state, problem.maps, problem.settings.kernel
+    state, maps = found.state, problem.maps
     anchors, rows = state.anchors, found.rows
     r = residuals_of(state.rig, anchors, rows, maps)
     frame = torch.cat([anchors.frame, rows.frame])
     uv_own = project(state.rig.camera[anchors.frame], anchors.d_camera)[0]
     uv = torch.cat([uv_own, pixels_of_rows(state.rig, anchors, rows)[0]])
     own, seen = maps.border_distance(frame, uv).tensor_split([len(uv_own)])
-    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows), s)
+    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows))
     nearer = torch.minimum(own[rows.anchor], seen)
-    least = useful_distance(nearer[r.cross_valid], size[r.cross_valid], s)
+    least = useful_distance(nearer[r.cross_valid], size[r.cross_valid])
     if least <= 0:
         return found
-    least += min(least, maps.settings.half_window)
+    least += min(least, maps.half_window)
     anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
 
@@ -429,11 +414,8 @@ def _relocalised(
     if refine not in FRAMES_MOVE:
         return found
     expected = problem.expected.clone()
-    for _ in range(problem.settings.relocalisation.rounds):
-        again = relocalise(
-            found.state.rig, problem.start, problem.maps, problem.prior, refine, found.noise, problem.generator,
-            problem.settings, expected,
-        )  # fmt: skip
+    for _ in range(_ROUNDS):
+        again = relocalise(problem, refine, found.state.rig, found.noise, expected)
         moved = (again.rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
         if not moved.any():
             break

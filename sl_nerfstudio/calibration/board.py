@@ -311,7 +311,7 @@ def _added(adjusted: AdjustedBoard, T: ndarray, p_board: Float64[ndarray, "m 3"]
             return None
         seen.append(Corners(inside, uv.numpy()[inside]))
     view = BoardView("", seen[0], seen[1] if len(seen) > 1 else None)
-    return normal_equations(rig, adjusted.free, sightings([view], p_board), adjusted.sigma_px).reduced(0.0)[0]
+    return normal_equations(rig, adjusted.free, sightings([view], p_board), adjusted.sigma_px).reduced().H
 
 
 def _relative_sigma(adjusted: AdjustedBoard, information: Float64[ndarray, "s s"]) -> tuple[float, float]:

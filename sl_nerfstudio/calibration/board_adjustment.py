@@ -1,7 +1,9 @@
-"""A first solution: focal lengths and poses from homographies and from points whose place is known.
+"""Bundle adjustment of a camera, a projector and the boards that they see: a first solution, and the best one.
 
-Zhang, "A flexible new technique for camera calibration" (PAMI 2000). Several focal lengths are tried besides the one in
-closed form, which noise can make imaginary.
+The start is Zhang's, "A flexible new technique for camera calibration" (PAMI 2000); several focal lengths are tried
+besides the one in closed form, which noise can make imaginary. Corners in the camera and in the projector have noise of
+different size, which is estimated from the residuals. Boards are eliminated from the normal equations, so many of them
+cost little.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,22 +12,27 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 from numpy import ndarray
-from scipy.spatial import KDTree
 
 from sl_nerfstudio.geometry.devices import MODELS, PARAMETERS, Device, DeviceKind, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.lie import exp_se3, hat
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
-from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 
-# The corners of a board in a photograph, to a fraction of a pixel; the detectors are OpenCV's.
-
-LEAST_CORNERS = 8  # of a ChArUco board of which only a part is in view
-_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-_SEARCHED = 1600  # longest side of the image in which a chessboard is searched; it is measured in the full one
-_SMALLEST_WINDOW, _LARGEST_WINDOW = 2, 11  # half the side, pixels
-_OTHER_COUNTS = ((0, -1), (-1, 0), (0, 1), (1, 0), (-1, -1), (1, 1))
+_BEHIND_PX = 1e4  # the residual of a corner behind a device: a step that turns a board over must not look good
+_KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
+_LEAST_SIGMA = 1e-6  # pixels: noise-free corners
+_ROUNDS, _SETTLED = 4, 0.02  # of estimating the noise, and its relative change in the last one
+_TOLERANCE, _FIRST_DAMPING = 1e-6, 1e-5  # share of the cost that may be left to gain
+_PLACING_STEPS = 4
+_SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
+_FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
+_CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
+_TRIED = 3  # of the starts that fit best, how many are adjusted
+_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
+_LEAST_CORNERS = 6
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -34,83 +41,6 @@ class Corners:
 
     ids: Int64[ndarray, "n"]  # places in `board.corners()`, ascending
     uv: Float64[ndarray, "n 2"]  # pixels; the centre of the first pixel is (0.5, 0.5)
-
-
-def find_corners(image: Float32[ndarray, "h w"], board: Board) -> Corners | None:
-    """The corners of a board in an image with values in [0, 1]; None where it is not seen.
-
-    A chessboard must be seen whole, a ChArUco board with eight corners or more.
-    """
-    grey = _stretched(image)
-    return _find_charuco(grey, board) if isinstance(board, CharucoBoard) else _find_chessboard(grey, board)
-
-
-def other_board_seen(image: Float32[ndarray, "h w"], board: Chessboard) -> Chessboard | None:
-    """A chessboard with other numbers of corners that is seen instead: the user may have counted squares."""
-    grey = _stretched(image)
-    sizes = [(board.rows, board.columns), *((board.columns + x, board.rows + y) for x, y in _OTHER_COUNTS)]
-    for columns, rows in sizes:
-        if min(columns, rows) < 3 or (columns, rows) == (board.columns, board.rows):
-            continue
-        other = replace(board, columns=columns, rows=rows)
-        if _find_chessboard(grey, other) is not None:
-            return other
-    return None
-
-
-def _stretched(image: Float32[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
-    """8 bits, with the brightest hundredth saturated: boards under a projector are often dark."""
-    brightest = max(float(np.quantile(image[::4, ::4], 0.99)), 1e-3)
-    return np.rint(np.clip(image / brightest, 0, 1) * 255).astype(np.uint8)
-
-
-def _find_chessboard(grey: UInt8[ndarray, "h w"], board: Chessboard) -> Corners | None:
-    size = (board.columns, board.rows)
-    factor = min(1.0, _SEARCHED / max(grey.shape))
-    small = grey if factor == 1 else cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    found, uv = cv2.findChessboardCornersSB(small, size, flags=_FLAGS)
-    if not found:
-        found, uv = cv2.findChessboardCorners(small, size)
-        if not found:
-            return None
-    # either detector is off by a tenth of a pixel or more: on synthetic boards 0.10 px (RMS), 0.04 px when refined
-    uv = np.asarray(uv, np.float64).reshape(-1, 2)
-    return Corners(np.arange(len(uv)), _refined(grey, (uv + 0.5) / factor - 0.5) + 0.5)
-
-
-def _refined(grey: UInt8[ndarray, "h w"], uv: Float64[ndarray, "n 2"], share: float = 0.25) -> Float64[ndarray, "n 2"]:
-    """Corners moved to the saddle points of the brightness, in OpenCV's convention (first pixel centre at 0).
-
-    `share` is half the window, in distances to the next corner.
-    """
-    pitch = float(np.quantile(KDTree(uv).query(uv, k=2)[0][:, 1], 0.1))
-    half = int(np.clip(round(share * pitch), _SMALLEST_WINDOW, _LARGEST_WINDOW))
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-    found = cv2.cornerSubPix(grey, uv.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), stop)
-    return found.reshape(-1, 2).astype(np.float64)
-
-
-def _find_charuco(grey: UInt8[ndarray, "h w"], board: CharucoBoard) -> Corners | None:
-    """With the layout of either version of OpenCV: only one of them has the markers where they are."""
-    found = [_charuco_corners(grey, board, legacy) for legacy in (False, True)]
-    return max((corners for corners in found if corners is not None), key=lambda c: len(c.ids), default=None)
-
-
-def _charuco_corners(grey: UInt8[ndarray, "h w"], board: CharucoBoard, legacy: bool) -> Corners | None:
-    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
-    drawn = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, markers)
-    drawn.setLegacyPattern(legacy)
-    uv, ids, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(grey)
-    if ids is None or uv is None or len(ids) < LEAST_CORNERS:
-        return None
-    order = np.argsort(ids.ravel())
-    # OpenCV counts these pixels from one or the other corner of a pixel, as its version goes: a saddle has one place.
-    share = min(0.25, 0.8 * (board.square - board.marker) / 2 / board.square)  # markers stay outside the window
-    refined = _refined(grey, uv.reshape(-1, 2)[order].astype(np.float64), share)
-    return Corners(ids.ravel()[order].astype(np.int64), refined + 0.5)
-
-
-# What a calibration solves for: the intrinsics of both devices, their relative pose, and the pose of every board.
 
 
 @dataclass(frozen=True)
@@ -156,12 +86,12 @@ class BoardRig:
         return (self.camera,) if self.projector is None else (self.camera, self.projector)
 
     def with_devices(self, devices: Sequence[Device]) -> "BoardRig":
-        """With other intrinsics."""
+        """The rig with other intrinsics."""
         camera, *others = devices
         return replace(self, camera=camera, projector=others[0] if others else None)
 
     def only(self, views: Sequence[int]) -> "BoardRig":
-        """With the boards of some views."""
+        """The rig with the boards of some views."""
         return replace(self, T_camera_board=self.T_camera_board[list(views)])
 
 
@@ -173,11 +103,6 @@ def with_numbers(device: Device, values: Float64[ndarray, "8"]) -> Device:
 def board_points(corners: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """`board.corners()`, which have y down, as points of the board's frame."""
     return np.c_[corners[:, 0], -corners[:, 1], np.zeros(len(corners))]
-
-
-# Reprojection residuals of the corners that a device sees, in all views at once, with their derivatives.
-
-_BEHIND_PX = 1e4  # the residual of a corner behind a device: a step that turns a board over must not look good
 
 
 @dataclass(frozen=True)
@@ -200,7 +125,7 @@ class Linearised:
 
 
 def sightings(views: Sequence[BoardView], p_board: Float64[ndarray, "m 3"]) -> tuple[CornerSightings, ...]:
-    """Of the camera, and of the projector if it sees any corner."""
+    """The corners that the camera sees, and those of the projector if it sees any."""
     seen = [[(k, view.camera) for k, view in enumerate(views)],
             [(k, view.projector) for k, view in enumerate(views) if view.projector is not None]]  # fmt: skip
     return tuple(
@@ -222,7 +147,7 @@ def residuals(rig: BoardRig, device: int, seen: CornerSightings) -> Float64[ndar
 
 
 def linearised(rig: BoardRig, device: int, free: FreeIntrinsics, seen: CornerSightings) -> Linearised:
-    """Residuals with their derivatives."""
+    """Residuals with the derivatives of the predictions."""
     p_camera, p_device = _in_device(rig, device, seen)
     p = torch.from_numpy(p_device)
     intrinsics = Intrinsics.of(rig.devices[device], torch.float64)
@@ -270,22 +195,6 @@ def _by_parameters(device: Device, p: torch.Tensor) -> Float64[ndarray, "n 2 8"]
     return np.stack([u, v], 1)
 
 
-# Bundle adjustment of both devices and all boards: Levenberg-Marquardt with a robust kernel.
-#
-# Corners in the camera and in the projector have noise of different size, which is estimated from the residuals.
-# Boards
-# are eliminated from the normal equations (Schur complement), so many of them cost little.
-
-_KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
-_LEAST_SIGMA = 1e-6  # pixels: noise-free corners
-_ROUNDS = 4  # of estimating the noise
-_SETTLED = 0.02  # relative change of the noise
-_MOST_STEPS = 50
-_CONVERGED = 1e-6  # relative decrease of the cost
-_LEAST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-5, 1e10
-_PLACING_STEPS = 4
-_SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
-
 Free = tuple[FreeIntrinsics, ...]
 """Of the camera, and of the projector if there is one."""
 Seen = tuple[CornerSightings, ...]
@@ -302,53 +211,28 @@ class AdjustedBoard:
     information: Float64[ndarray, "s s"]  # of the fitted intrinsics of each device, then of the rig's twist
 
 
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations: shared numbers, and those of each board with what couples them to the shared ones."""
-
-    cost: float
-    H: Float64[ndarray, "s s"]
-    g: Float64[ndarray, "s"]
-    H_board: Float64[ndarray, "b 6 6"]
-    coupling: Float64[ndarray, "b s 6"]
-    g_board: Float64[ndarray, "b 6"]
-
-    def reduced(self, damping: float) -> tuple[Float64[ndarray, "s s"], Float64[ndarray, "s"]]:
-        """Without the boards."""
-        solved = np.linalg.solve(
-            self._damped(damping), np.concatenate([self.coupling.transpose(0, 2, 1), self.g_board[..., None]], -1)
-        )
-        H = self.H + damping * np.diag(np.diag(self.H)) - np.einsum("bsk,bkt->st", self.coupling, solved[..., :-1])
-        return H, self.g - np.einsum("bsk,bk->s", self.coupling, solved[..., -1])
-
-    def step(self, damping: float) -> tuple[Float64[ndarray, "s"], Float64[ndarray, "b 6"]]:
-        """Of the shared numbers, and of the boards."""
-        H, g = self.reduced(damping)
-        scale = 1 / np.sqrt(np.diag(self.H).clip(1e-300))
-        shared = scale * np.linalg.lstsq(H * scale[:, None] * scale, g * scale, rcond=_SINGULAR)[0]
-        rest = self.g_board - np.einsum("bsk,s->bk", self.coupling, shared)
-        return shared, np.linalg.solve(self._damped(damping), rest[..., None])[..., 0]
-
-    def _damped(self, damping: float) -> Float64[ndarray, "b 6 6"]:
-        diagonal = np.diagonal(self.H_board, axis1=1, axis2=2)
-        least = _SINGULAR * diagonal.max(1, keepdims=True).clip(1e-300)
-        return self.H_board + (damping * diagonal + least)[..., None] * np.eye(6)
-
-
 def adjust(start: BoardRig, free: Free, seen: Seen, sigma_px: Sigma | None = None) -> AdjustedBoard:
     """The rig that explains the corners best. `sigma_px` holds the noise fixed; default: it is estimated."""
     rig = start
     sigma = sigma_px or noise(rig, free, seen)
     for _ in range(1 if sigma_px else _ROUNDS):
-        rig, normal = _minimised(rig, free, seen, sigma)
-        before, sigma = sigma, sigma_px or noise(rig, free, seen)
+        found = minimise(
+            rig,
+            lambda rig, sigma=sigma: normal_equations(rig, free, seen, sigma),
+            lambda rig, step: moved(rig, free, *step),
+            lambda rig, sigma=sigma: _cost(rig, seen, sigma),
+            tolerance=_TOLERANCE,
+            damping=_FIRST_DAMPING,
+        )
+        rig, before = found.state, sigma
+        sigma = sigma_px or noise(rig, free, seen)
         if np.allclose(before, sigma, rtol=_SETTLED):
             break
-    return AdjustedBoard(rig, free, sigma, normal.reduced(0.0)[0])
+    return AdjustedBoard(rig, free, sigma, found.equations.reduced().H)
 
 
 def covariance(information: Float64[ndarray, "s s"]) -> Float64[ndarray, "s s"]:
-    """Of the fitted numbers, by the noise of the corners alone; huge where they do not determine them."""
+    """Covariance of the fitted numbers by the noise of the corners alone; huge where these do not determine them."""
     scale = 1 / np.sqrt(np.diag(information).clip(1e-300))
     values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
     inverse = (vectors / values.clip(_SINGULAR * values.max())) @ vectors.T
@@ -357,14 +241,10 @@ def covariance(information: Float64[ndarray, "s s"]) -> Float64[ndarray, "s s"]:
 
 def place_boards(rig: BoardRig, seen: CornerSightings, sigma_px: float) -> BoardRig:
     """Every board where its corners in the camera put it; the rest of the rig stays."""
+    free = FreeIntrinsics()
     for _ in range(_PLACING_STEPS):
-        one = linearised(rig, 0, FreeIntrinsics(), seen)
-        root = np.sqrt(kernel(one.residual / sigma_px)[1])[:, None]
-        steps = np.zeros((len(rig.T_camera_board), 6))
-        for b in range(len(steps)):
-            own = seen.view == b
-            B, e = (one.by_board * root[..., None])[own].reshape(-1, 6), (one.residual * root)[own].ravel()
-            steps[b] = np.linalg.lstsq(B, e, rcond=_SINGULAR)[0]
+        equations = normal_equations(replace(rig, projector=None), (free,), (seen,), (sigma_px,))
+        steps = equations.blocks_after(np.zeros(free.columns().shape[1]))
         rig = replace(rig, T_camera_board=_exp(steps) @ rig.T_camera_board)
     return rig
 
@@ -378,28 +258,9 @@ def noise(rig: BoardRig, free: Free, seen: Seen) -> Sigma:
     return tuple(max(MAD_TO_SIGMA * median / freedom, _LEAST_SIGMA) for median in medians)
 
 
-def _minimised(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> tuple[BoardRig, Normal]:
-    normal, damping = normal_equations(rig, free, seen, sigma), _FIRST_DAMPING
-    for _ in range(_MOST_STEPS):
-        moved = _moved(rig, free, *normal.step(damping))
-        cost = _cost(moved, seen, sigma)
-        if cost < normal.cost:
-            decrease = (normal.cost - cost) / normal.cost
-            rig, damping = moved, max(damping / 10, _LEAST_DAMPING)
-            normal = normal_equations(rig, free, seen, sigma)
-            if decrease < _CONVERGED:
-                break
-        else:
-            damping *= 10
-            if damping > _LARGEST_DAMPING:
-                break
-    return rig, normal
-
-
 def _cost(rig: BoardRig, seen: Seen, sigma: Sigma) -> float:
-    return sum(
-        float(kernel(residuals(rig, k, one) / s)[0].sum()) for k, (one, s) in enumerate(zip(seen, sigma, strict=True))
-    )
+    costs = (kernel(residuals(rig, k, one) / s)[0] for k, (one, s) in enumerate(zip(seen, sigma, strict=True)))
+    return sum(float(cost.sum()) for cost in costs) / 2
 
 
 def kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
@@ -408,15 +269,14 @@ def kernel(whitened: Float64[ndarray, "n 2"]) -> tuple[Float64[ndarray, "n"], Fl
     return _KERNEL**2 * geman_mcclure_cost(x), geman_mcclure_weight(x)
 
 
-def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Normal:
-    """Of all corners at a rig."""
+def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> BlockEquations:
+    """Normal equations of all corners at a rig: shared numbers, and a block for each board."""
     begin = np.cumsum([0, *(one.columns().shape[1] for one in free)])
     size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
-    products, cost = np.zeros((boards, size + 7, size + 7)), 0.0  # of all columns: shared, of the board, residual
+    products = np.zeros((boards, size + 7, size + 7))  # of all columns: shared, of the board, residual
     for k, of_device in enumerate(seen):
         one = linearised(rig, k, free[k], of_device)
-        costs, weights = kernel(one.residual / sigma[k])
-        cost += float(costs.sum())
+        weights = kernel(one.residual / sigma[k])[1]
         rows = np.zeros((len(weights), 2, size + 7))
         rows[..., begin[k] : begin[k + 1]] = one.by_intrinsics
         if k:
@@ -429,17 +289,17 @@ def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Nor
             own = rows[ends[b] : ends[b + 1]].reshape(-1, size + 7)
             products[b] += own.T @ own
     of_boards = slice(size, size + 6)
-    return Normal(
-        cost,
+    return BlockEquations(
         products[:, :size, :size].sum(0),
-        products[:, :size, -1].sum(0),
+        -products[:, :size, -1].sum(0),
         products[:, of_boards, of_boards],
+        -products[:, of_boards, -1],
         products[:, :size, of_boards],
-        products[:, of_boards, -1],
     )
 
 
-def _moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:
+def moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Float64[ndarray, "b 6"]) -> BoardRig:
+    """The rig after a step of the shared numbers and of all boards."""
     devices, place = [], 0
     for device, one in zip(rig.devices, free, strict=True):
         columns = one.columns()
@@ -456,12 +316,7 @@ def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:
     return exp_se3(torch.from_numpy(twists)).numpy()
 
 
-_FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
-_CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
-_TRIED = 3  # of the starts that fit best, how many are adjusted
-_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
-_LEAST_CORNERS = 6
-Size = tuple[int, int]
+# First solutions.
 
 
 def camera_start(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> AdjustedBoard:

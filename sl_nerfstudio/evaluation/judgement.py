@@ -10,7 +10,6 @@ from sl_nerfstudio.evaluation.agreement import FrameAgreement
 from sl_nerfstudio.evaluation.completeness import Completeness, NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Length, SurfaceScore
 from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, PoseErrors
-from sl_nerfstudio.review.agreement import VerdictSettings
 from sl_nerfstudio.review.verdict import (
     Band,
     DepartedFrame,
@@ -149,7 +148,7 @@ def _stands_out(frame: FrameAgreement, frames: tuple[FrameAgreement, ...]) -> bo
 
 def _contradicts(evaluation: Evaluation, number: int) -> bool:
     cross = evaluation.cross
-    return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number], VerdictSettings()) != "good"
+    return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number]) != "good"
 
 
 def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
@@ -249,7 +248,7 @@ def judge(
     reasons += [Reason("acceptable", f"{f.name}: cannot be judged") for f in figures if f.band == "unknown"]
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:
-        reasons += cross_reasons(names, evaluation.cross, VerdictSettings())
+        reasons += cross_reasons(names, evaluation.cross)
     reasons += [
         Reason("poor", f"{name}: could not be placed; leave it out or register it again, and train again")
         for name in unplaced

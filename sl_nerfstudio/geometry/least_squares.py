@@ -21,7 +21,7 @@ State = TypeVar("State")
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e8
 _DAMPING_FACTOR = 10.0
 _RCOND = 1e-14  # directions of the scaled normal equations below this share of the largest are not moved along
-_LEAST_DIAGONAL = 1e-12  # of its mean, added to each block so that an undetermined one can be inverted
+_LEAST_DAMPING_OF_BLOCKS = 1e-14  # so that an undetermined block can be inverted, and hardly anything else changes
 
 
 class Equations(Protocol):
@@ -93,8 +93,16 @@ class BlockEquations:
     def step(self, damping: float) -> tuple[Float64[ndarray, "s"], Float64[ndarray, "b k"]]:
         """Increments of the shared unknowns and of the blocks."""
         shared = self.reduced(damping).step(0.0)
+        return shared, self.blocks_after(shared, damping)
+
+    def slopes(self) -> Float64[ndarray, "b k s"]:
+        """How far each block moves back where the shared unknowns move: H_block^-1 coupling^T."""
+        return np.linalg.solve(self._damped(0.0), self.coupling.transpose(0, 2, 1))
+
+    def blocks_after(self, shared: Float64[ndarray, "s"], damping: float = 0.0) -> Float64[ndarray, "b k"]:
+        """Increments of the blocks that suit one of the shared unknowns."""
         rest = -(self.g_block + np.einsum("bsk,s->bk", self.coupling, shared))
-        return shared, np.linalg.solve(self._damped(damping), rest[..., None])[..., 0]
+        return np.linalg.solve(self._damped(damping), rest[..., None])[..., 0]
 
     def decrement(self) -> float:
         """The whitened squared gradient."""
@@ -107,8 +115,8 @@ class BlockEquations:
 
     def _damped(self, damping: float) -> Float64[ndarray, "b k k"]:
         diagonal = np.einsum("bkk->bk", self.H_block)
-        least = _LEAST_DIAGONAL * diagonal.mean(1, keepdims=True) + np.finfo(float).tiny
-        return self.H_block + (damping * diagonal + least)[..., None] * np.eye(self.H_block.shape[-1])
+        added = (damping + _LEAST_DAMPING_OF_BLOCKS) * diagonal + np.finfo(float).tiny
+        return self.H_block + added[..., None] * np.eye(self.H_block.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -131,6 +139,7 @@ def minimise(
     iterations: int = 50,
     tolerance: float = 1e-10,
     damping: float = _FIRST_DAMPING,
+    narrow: Callable[[State], None] | None = None,
 ) -> Minimum[State]:
     """Levenberg-Marquardt from a state.
 
@@ -143,7 +152,10 @@ def minimise(
         iterations: most accepted steps.
         tolerance: the search ends where the cost can fall by no more than this share of itself.
         damping: of the first step, relative to the diagonal.
+        narrow: called before a state is linearised; may narrow the kernel of the objective to the noise at the state.
     """
+    if narrow is not None:
+        narrow(state)
     now, accepted = cost(state), 0
     linear = equations(state)
     while accepted < iterations:
@@ -159,6 +171,9 @@ def minimise(
                 return Minimum(state, now, linear, accepted, True)
         state, now, accepted = candidate, then, accepted + 1
         damping = max(damping / _DAMPING_FACTOR, _LEAST_DAMPING)
+        if narrow is not None:
+            narrow(state)
+            now = cost(state)
         linear = equations(state)
     return Minimum(state, now, linear, accepted, False)
 

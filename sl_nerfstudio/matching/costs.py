@@ -1,7 +1,14 @@
-"""How badly image and pattern match at every pixel for every inverse distance that is tried."""
+"""How badly image and pattern match at every pixel for every inverse distance, and the distances that cost least.
+
+Costs are correlations in Gaussian windows. Semi-global matching (Hirschmueller, "Stereo processing by semiglobal
+matching and mutual information", PAMI 2008) adds them up along eight ways to each pixel; changes of distance cost a
+little to the next one and more to any other. Changes are counted from the slope of the surface that was decoded, where
+one was: otherwise steep surfaces would cost more than those that face the camera (Scharstein, Taniai and Sinha,
+"Semi-global stereo matching with surface orientation priors", 3DV 2017).
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -9,14 +16,98 @@ from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid
-from sl_nerfstudio.matching.lines import CostSettings, EpipolarLines, HypothesisSettings, SmoothnessSettings
+from sl_nerfstudio.matching.lines import EpipolarLines
 from sl_nerfstudio.parallel import compiled
-from sl_nerfstudio.pattern.grid import gaussian_window
 
-# Loops of matching costs, each over so few arrays that the compiler makes it work on several numbers at a time.
+LEAST_PATTERN_VARIANCE = 1e-3  # added to that of the drawn pattern: where it is flat, nothing can be compared
+LEAST_IMAGE_VARIANCE = 0.03  # added to that of the image, as a share of its median at decoded pixels
+SMALL, LARGE = 30, 250  # costs of a change to the next inverse distance, and to any other
+STEEPEST = 4  # steps from one pixel to the next up to which a decoded surface is steep; beyond, it has a jump there
+APART = 3  # steps from the best inverse distance within which another one is no rival
 
-_HALF = 127  # the cost where image and pattern have nothing to do with each other
+HALF = 127  # the cost where image and pattern have nothing to do with each other
 OUTSIDE = 255  # the cost beside the pattern
+_TOGETHER = 16  # inverse distances whose costs are written at once
+_BAND = 48  # rows whose costs are computed at once: all that is needed on the way stays in the processor's memory
+_NEVER = np.int16(16000)  # more than any way costs
+
+Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
+"""Mean of the image in the window of each pixel, and its variance, with what is added to it."""
+
+
+def image_statistics(image: Float32[ndarray, "h w"], decoded: Bool[ndarray, "h w"], sigma: float) -> Statistics:
+    """Mean and variance in windows of `sigma` pixels."""
+    mean = _window(image, sigma)
+    variance = np.maximum(_window(image * image, sigma) - mean * mean, 0)
+    usual = float(np.median(variance[decoded])) if decoded.any() else float(np.median(variance))
+    return mean, variance + np.float32(LEAST_IMAGE_VARIANCE * usual + 1e-9)
+
+
+def matching_costs(
+    image: Float32[ndarray, "h w"],
+    statistics: Statistics,
+    lines: EpipolarLines,
+    inverse_distances: Float64[ndarray, "k"],
+    grid: DrawnGrid,
+    sigma: float,
+) -> UInt8[ndarray, "h w k"]:
+    """From 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
+    mean, variance = statistics
+    scale = 1 / np.sqrt(variance)
+    picture, weights = np.ascontiguousarray(grid.layers[..., 0]), _half_window(sigma)
+    least, h = np.float32(LEAST_PATTERN_VARIANCE), len(image)
+    out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
+    for first in range(0, h, _BAND):
+        inner, around = _with_window(first, h, len(weights) - 1)
+        band, there = lines.part((around, slice(None))), (image[around], mean[around], scale[around])
+        x, y, drawn = (np.empty(image[around].shape, dtype=np.float32) for _ in range(3))
+        block = np.empty((_TOGETHER, *x.shape), dtype=np.uint8)
+        for start in range(0, len(inverse_distances), _TOGETHER):
+            some = inverse_distances[start : start + _TOGETHER]
+            for w, costs in zip(some, block, strict=False):
+                band.pixels_at(w, x, y)
+                sample(picture, x, y, drawn)
+                fill_costs(drawn, *there, weights, least, costs)
+                mark_outside(x, y, picture.shape, costs)
+            interleave(block[: len(some), inner], start, out[first : first + _BAND])
+    return out
+
+
+def _with_window(first: int, h: int, reach: int) -> tuple[slice, slice]:
+    """Rows of a band within those that its windows need, and the latter."""
+    begin, end = max(first - reach, 0), min(first + _BAND + reach, h)
+    return slice(first - begin, min(first + _BAND, h) - begin), slice(begin, end)
+
+
+def correlations(
+    image: Float32[ndarray, "h w"],
+    statistics: Statistics,
+    coords: Float32[ndarray, "h w 2"],
+    grid: DrawnGrid,
+    sigma: float,
+) -> Float32[ndarray, "h w"]:
+    """Correlation of image and pattern at given coordinates."""
+    mean, variance = statistics
+    drawn = grid.at(coords)[..., 0]
+    p, pp, ip = cv2.split(_window(np.dstack([drawn, drawn * drawn, drawn * image]), sigma))
+    spread = np.maximum(pp - p * p, 0) + np.float32(LEAST_PATTERN_VARIANCE)
+    return (ip - p * mean) / np.sqrt(spread * variance)
+
+
+def _window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray, "h w *k"]:
+    size = 2 * _reach(sigma) + 1
+    return cv2.GaussianBlur(values, (size, size), sigma, borderType=cv2.BORDER_REFLECT)
+
+
+def _half_window(sigma: float) -> Float32[ndarray, "r"]:
+    """Weights from the middle of a Gaussian window to its end."""
+    reach = _reach(sigma)
+    return cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)[reach:, 0].copy()
+
+
+def _reach(sigma: float) -> int:
+    """Pixels from the middle of a Gaussian window to its end, at three standard deviations."""
+    return int(np.ceil(3 * sigma))
 
 
 @compiled
@@ -90,7 +181,7 @@ def _sum_along(row: ndarray, weights: ndarray, longer: ndarray) -> None:
 def _write_costs(
     p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, least: float, out: ndarray
 ) -> None:
-    half, one = np.float32(_HALF), np.float32(1)
+    half, one = np.float32(HALF), np.float32(1)
     for column in range(len(out)):
         m = p[column]
         spread = max(pp[column] - m * m, np.float32(0)) + least
@@ -118,105 +209,7 @@ def interleave(block: ndarray, first: int, out: ndarray) -> None:
                 out[row, column, first + k] = block[k, row, column]
 
 
-_TOGETHER = 16  # inverse distances whose costs are written at once
-_BAND = 48  # rows whose costs are computed at once: all that is needed on the way stays in the processor's memory
-
-Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
-"""Mean of the image in the window of each pixel, and its variance, with what is added to it."""
-
-
-def image_statistics(
-    image: Float32[ndarray, "h w"], decoded: Bool[ndarray, "h w"], sigma: float, settings: CostSettings
-) -> Statistics:
-    """For windows of `sigma` pixels."""
-    mean = _window(image, sigma)
-    variance = np.maximum(_window(image * image, sigma) - mean * mean, 0)
-    usual = float(np.median(variance[decoded])) if decoded.any() else float(np.median(variance))
-    return mean, variance + np.float32(settings.least_image_variance * usual + 1e-9)
-
-
-def matching_costs(
-    image: Float32[ndarray, "h w"],
-    statistics: Statistics,
-    lines: EpipolarLines,
-    inverse_distances: Float64[ndarray, "k"],
-    grid: DrawnGrid,
-    sigma: float,
-    settings: CostSettings,
-) -> UInt8[ndarray, "h w k"]:
-    """From 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
-    mean, variance = statistics
-    scale = 1 / np.sqrt(variance)
-    picture, weights = np.ascontiguousarray(grid.layers[..., 0]), _half_window(sigma)
-    least, h = np.float32(settings.least_pattern_variance), len(image)
-    out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
-    for first in range(0, h, _BAND):
-        inner, around = _with_window(first, h, len(weights) - 1)
-        band, there = lines.part((around, slice(None))), (image[around], mean[around], scale[around])
-        x, y, drawn = (np.empty(image[around].shape, dtype=np.float32) for _ in range(3))
-        block = np.empty((_TOGETHER, *x.shape), dtype=np.uint8)
-        for start in range(0, len(inverse_distances), _TOGETHER):
-            some = inverse_distances[start : start + _TOGETHER]
-            for w, costs in zip(some, block, strict=False):
-                band.pixels_at(w, x, y)
-                sample(picture, x, y, drawn)
-                fill_costs(drawn, *there, weights, least, costs)
-                mark_outside(x, y, picture.shape, costs)
-            interleave(block[: len(some), inner], start, out[first : first + _BAND])
-    return out
-
-
-def _with_window(first: int, h: int, reach: int) -> tuple[slice, slice]:
-    """Rows of a band within those that its windows need, and the latter."""
-    begin, end = max(first - reach, 0), min(first + _BAND + reach, h)
-    return slice(first - begin, min(first + _BAND, h) - begin), slice(begin, end)
-
-
-def correlations(
-    image: Float32[ndarray, "h w"],
-    statistics: Statistics,
-    coords: Float32[ndarray, "h w 2"],
-    grid: DrawnGrid,
-    sigma: float,
-    settings: CostSettings,
-) -> Float32[ndarray, "h w"]:
-    """Correlation of image and pattern at given coordinates."""
-    mean, variance = statistics
-    drawn = grid.at(coords)[..., 0]
-    p, pp, ip = cv2.split(_window(np.dstack([drawn, drawn * drawn, drawn * image]), sigma))
-    spread = np.maximum(pp - p * p, 0) + np.float32(settings.least_pattern_variance)
-    return (ip - p * mean) / np.sqrt(spread * variance)
-
-
-def _window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32[ndarray, "h w *k"]:
-    size = 2 * _reach(sigma) + 1
-    return cv2.GaussianBlur(values, (size, size), sigma, borderType=cv2.BORDER_REFLECT)
-
-
-def _half_window(sigma: float) -> Float32[ndarray, "r"]:
-    """Weights from the middle of a Gaussian window to its end."""
-    reach = _reach(sigma)
-    return cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F)[reach:, 0].copy()
-
-
-def _reach(sigma: float) -> int:
-    """Pixels from the middle of a Gaussian window to its end, at three standard deviations."""
-    return int(np.ceil(3 * sigma))
-
-
-# The inverse distance of every pixel that costs least together with changes to its neighbours.
-#
-# Semi-global matching: Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008.
-# Costs
-# are added up along eight ways to each pixel; changes of distance cost a little to the next one and more to any
-# other.
-# Changes are counted from the slope of the surface that was decoded, where one was: otherwise steep surfaces would
-# cost
-# more than those that face the camera (Scharstein, Taniai and Sinha, "Semi-global stereo matching with surface
-# orientation priors", 3DV 2017).
-
-UNKNOWN = -(2**20)  # far from the number of any inverse distance
-_NEVER = np.int16(16000)  # more than any way costs
+# Semi-global matching.
 
 
 @dataclass(frozen=True)
@@ -228,31 +221,29 @@ class StereoMatches:
     margin: Float32[ndarray, "h w"]  # by how much the sums of the best rival are larger
 
     def part(self, rows: slice) -> "StereoMatches":
-        """Some rows."""
+        """The matches of some rows."""
         return StereoMatches(self.index[rows], self.cost[rows], self.margin[rows])
 
     @staticmethod
     def joined(parts: Sequence["StereoMatches"]) -> "StereoMatches":
-        """One below the other."""
+        """The matches of parts, one below the other."""
         return StereoMatches(
             *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(StereoMatches))
         )
 
 
-def match_semi_globally(
-    costs: UInt8[ndarray, "h w k"], decoded: Int32[ndarray, "h w"], settings: SmoothnessSettings
-) -> StereoMatches:
+def match_semi_globally(costs: UInt8[ndarray, "h w k"], decoded: Int32[ndarray, "h w"]) -> StereoMatches:
     """The best match of every pixel. There must be at least three inverse distances.
 
     `decoded` are the numbers of those that were decoded, `UNKNOWN` where nothing was.
     """
     sums = np.zeros(costs.shape, dtype=np.uint16)
     for step in (1, -1):
-        _add_ways(costs, decoded, step, settings.small, settings.large, settings.steepest, sums)
+        _add_ways(costs, decoded, step, SMALL, LARGE, STEEPEST, sums)
     h, w = costs.shape[:2]
     index, cost = np.empty((h, w), dtype=np.float32), np.empty((h, w), dtype=np.uint8)
     margin = np.empty((h, w), dtype=np.float32)
-    _choose(costs, sums, settings.apart, index, cost, margin)
+    _choose(costs, sums, APART, index, cost, margin)
     return StereoMatches(index, cost, margin)
 
 
@@ -363,65 +354,3 @@ def _choose(costs: ndarray, sums: ndarray, apart: int, index: ndarray, cost: nda
             a, b, c = np.int64(total[middle - 1]), np.int64(total[middle]), np.int64(total[middle + 1])
             bend = a - 2 * b + c
             index[row, column] = middle + (min(max((a - c) / (2 * bend), -1), 1) if bend > 0 else best - middle)
-
-
-# The inverse distances that are tried for every pixel of an image, and where its epipolar lines really run.
-
-
-def with_offset(
-    lines: EpipolarLines,
-    coords: Float32[ndarray, "h w 2"],
-    period: float,
-    pixels_a_period: float,
-    settings: HypothesisSettings,
-) -> EpipolarLines:
-    """Lines that run through decoded coordinates, on average over a window: poses and lenses are not known exactly."""
-    apart = coords - lines.at(lines.nearest(coords))
-    good = np.hypot(apart[..., 0], apart[..., 1]) < settings.agreement * period  # False for NaN
-    values = np.dstack([np.where(good[..., None], apart, np.float32(0)), good.astype(np.float32)])
-    means = gaussian_window(values, settings.offset_window * pixels_a_period)
-    offset = means[..., :2] / (means[..., 2:] + np.float32(settings.offset_prior))
-    return replace(lines, offset=lines.offset + offset)
-
-
-def hypotheses(
-    lines: EpipolarLines,
-    coords: Float32[ndarray, "h w 2"],
-    w: Float64[ndarray, "h w"],
-    mask: Bool[ndarray, "h w"],
-    period: float,
-    settings: HypothesisSettings,
-) -> Float64[ndarray, "k"] | None:
-    """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line.
-
-    `w` are the inverse distances nearest to the decoded coordinates. What the mask shows may be as deep as it is wide:
-    parts of which nothing was decoded may lie before or behind.
-    """
-    apart = np.linalg.norm(coords - lines.at(w), axis=-1)
-    good = apart < settings.agreement * period
-    if good.sum() < settings.fewest:
-        return None
-    low, middle, high = np.quantile(w[good], [settings.quantile, 0.5, 1 - settings.quantile])
-    depth = _half_width(lines.ray[mask | good], settings.quantile)
-    low, high = min(low, middle / (1 + depth)), max(high, middle / (1 - depth))
-    margin = settings.margin * (high - low)
-    low, high = max(low - margin, low / 2), high + margin
-    slope = np.linalg.norm(lines.slopes(np.full(w.shape, (low + high) / 2)), axis=-1)[good]
-    length = float(np.median(slope)) * (high - low)
-    count = int(np.clip(np.ceil(length / (settings.step * period)), settings.fewest, settings.most))
-    return np.linspace(low, high, count)
-
-
-def numbers_of(w: Float64[ndarray, "h w"], tried: Float64[ndarray, "k"]) -> Int32[ndarray, "h w"]:
-    """The nearest of the inverse distances that are tried; `UNKNOWN` for NaN and beyond their range."""
-    number = np.rint((w - tried[0]) / (tried[1] - tried[0]))
-    inside = (number >= 0) & (number < len(tried))  # False for NaN
-    return np.where(inside, number, UNKNOWN).astype(np.int32)
-
-
-def _half_width(rays: Float64[ndarray, "n 3"], quantile: float) -> float:
-    """Of what the rays see, as a share of its distance; at most a half."""
-    rays = rays[np.isfinite(rays[:, 0])]
-    centre = rays.mean(0)
-    cosine = np.quantile(rays @ (centre / np.linalg.norm(centre)), quantile)
-    return min(float(np.sqrt(1 - min(cosine, 1.0) ** 2)), 0.5)

@@ -1,180 +1,35 @@
-"""Where in the projector's image the ray of each camera pixel runs, by the inverse distance along it."""
+"""Where in the projector's image the ray of each camera pixel runs, by the inverse distance along it.
 
-from dataclasses import dataclass, field, replace
+Lengths in an image are in periods of the pattern as it appears there.
+"""
+
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid_edges import slopes
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of, ray_of, view_of
 from sl_nerfstudio.parallel import compiled
+from sl_nerfstudio.pattern.grid import gaussian_window
 
-# Settings of matching along epipolar lines. Lengths in the image are in periods of the pattern as it appears there.
+TEAR = 0.35  # difference between neighbouring pixels that separates surfaces, periods
+FEWEST_FOR_SIZE = 100  # pixels from which the size of a period is told
+OUTSIDE_PX = -1e6  # in place of coordinates where nothing is seen
+NEAREST_STEPS = 4  # of Gauss-Newton, to the nearest place on a line
+UNKNOWN = -(2**20)  # far from the number of any inverse distance
 
-
-@dataclass(frozen=True)
-class HypothesisSettings:
-    """The inverse distances that are tried."""
-
-    step: float = 0.1
-    """between two of them on the pattern, periods (median over the image)"""
-    fewest: int = 16
-    """so many are tried at least"""
-    most: int = 512
-    """so many are tried at most; the step grows where more would be needed"""
-    quantile: float = 0.002
-    """share of the decoded pixels that may be nearer than the range, and share that may be farther"""
-    margin: float = 0.04
-    """by which the range is longer on each side, as a share of it"""
-    agreement: float = 0.15
-    """distance of decoded coordinates from their epipolar line up to which they count, periods"""
-    offset_window: float = 1.0
-    """standard deviation of the window in which these distances are averaged, periods"""
-    offset_prior: float = 0.05
-    """share of decoded pixels in the window at which the average is halved"""
-
-
-@dataclass(frozen=True)
-class CostSettings:
-    """Correlation of image and pattern in a Gaussian window."""
-
-    window: float = 0.14
-    """standard deviation of the window, periods"""
-    least_pattern_variance: float = 1e-3
-    """added to the variance of the drawn pattern: where it is flat, nothing can be compared"""
-    least_image_variance: float = 0.03
-    """added to the variance of the image, as a share of its median at decoded pixels"""
-
-
-@dataclass(frozen=True)
-class SmoothnessSettings:
-    """What a change of distance from one pixel to the next costs; a correlation of 0 costs 127, of -1 costs 254."""
-
-    small: int = 30
-    """to the next inverse distance"""
-    large: int = 250
-    """to any other"""
-    steepest: int = 4
-    """steps from one pixel to the next up to which a decoded surface is steep; beyond, it has a jump there"""
-    apart: int = 3
-    """steps from the best inverse distance within which another one is no rival"""
-
-
-@dataclass(frozen=True)
-class LineFitSettings:
-    """The fit of coordinates to the image, from matched ones."""
-
-    smoothing: tuple[tuple[float, float], ...] = ((0.25, 0.05), (0.12, 0.1))
-    """windows in which the surface is taken to be flat, largest first, and how far from them a pixel may be; periods"""
-    window: float = 0.38
-    """standard deviation of the window of a shift, periods"""
-    rounds: int = 6
-    """each recovers a part of the detail that the window of the fit averages over"""
-    detail: float = 0.06
-    """how far coordinates along the line are expected to be from that flat surface (1 sigma), periods"""
-    across: float = 0.02
-    """the same across the line: more than there is, because distances from it tell how large noise is"""
-    dependent: float = 16.0
-    """area, in pixels, over which the errors of an image depend on each other"""
-    largest: float = 0.12
-    """limit of all shifts together, periods"""
-    least_area: float = 1.0
-    """smaller regions are left out, periods squared"""
-    tear: float = 0.35
-    """difference between neighbouring pixels that separates regions, periods"""
-
-
-@dataclass(frozen=True)
-class KeepingSettings:
-    """Which pixels are kept."""
-
-    least_probability: float = 0.5
-    """that a pixel is right"""
-    near: float = 0.1
-    """distance within which coordinates count as right, and matched ones as those that were decoded; periods"""
-    jump: float = 0.3
-    """difference between neighbouring pixels that counts as a jump in depth, periods"""
-    smallest_region: float = 2.0
-    """smaller regions are left out, periods squared"""
-    tear: float = 0.5
-    """difference between neighbouring pixels that separates such regions, periods"""
-    least_agreement: float = 0.8
-    """share of the decoded pixels that must be matched where they were decoded; otherwise nothing is replaced"""
-
-
-@dataclass(frozen=True)
-class MatchingSettings:
-    """Everything that matching depends on besides its inputs."""
-
-    hypotheses: HypothesisSettings = field(default_factory=HypothesisSettings)
-    """the inverse distances that are tried"""
-    costs: CostSettings = field(default_factory=CostSettings)
-    """correlation of image and pattern"""
-    smoothness: SmoothnessSettings = field(default_factory=SmoothnessSettings)
-    """what changes of distance cost"""
-    fit: LineFitSettings = field(default_factory=LineFitSettings)
-    """the fit to the image"""
-    keeping: KeepingSettings = field(default_factory=KeepingSettings)
-    """which pixels are kept"""
-    finest: float = 12.0
-    """pixels per period: finer captures are averaged first"""
-    most_bytes: int = 2**28
-    """memory for costs; larger images are matched in strips"""
-    strip_margin: float = 6.0
-    """by which strips overlap on each side, periods"""
-
-
-MATCHING_DEFAULTS = MatchingSettings()
-
-# How large a period of the pattern is in an image, and coordinates at another resolution.
-
-_TEAR = 0.35  # periods between neighbouring pixels
-_FEWEST = 100  # pixels from which a size is told
-
-
-def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float | None:
-    """Pixels of the image in a period of the pattern, median; None where hardly anything is decoded."""
-    by_x, by_y = np.diff(coords[:-1], axis=1), np.diff(coords[:, :-1], axis=0)
-    smooth = np.ones(by_x.shape[:2], dtype=bool)
-    for step in (by_x, by_y):
-        for part in (step[..., 0], step[..., 1]):  # numpy takes the larger of two far more slowly
-            smooth &= np.abs(part) < _TEAR * period
-    area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])[smooth]
-    area = area[area > 0]
-    return period / float(np.sqrt(np.median(area))) if len(area) >= _FEWEST else None
-
-
-def enlarged(
-    coords: Float32[ndarray, "a b 2"], factor: int, shape: tuple[int, int], period: float
-) -> Float32[ndarray, "h w 2"]:
-    """Coordinates at the pixels of an image of the given shape; those given are at squares of `factor` of its pixels.
-
-    Bilinear within a surface; at its border, the square's plane is continued. NaN where a pixel's square has none.
-    """
-    if factor == 1:
-        return coords
-    h, w = shape
-    size = coords.shape[1] * factor, coords.shape[0] * factor
-    near = np.repeat(np.repeat(coords, factor, axis=0), factor, axis=1)
-    slope = np.repeat(np.repeat(slopes(coords, period), factor, axis=0), factor, axis=1)
-    place = ((np.arange(factor) + 0.5) / factor - 0.5).astype(np.float32)
-    x, y = np.tile(place, coords.shape[1])[None, :, None], np.tile(place, coords.shape[0])[:, None, None]
-    plane = near + slope[..., 0] * x + slope[..., 1] * y
-    linear = cv2.resize(coords, size, interpolation=cv2.INTER_LINEAR)  # NaN beside what is unknown
-    smooth = np.abs(linear - near).max(-1, keepdims=True) < _TEAR * period
-    half = factor // 2  # beside the image's border, where interpolation has one side only
-    smooth[:half], smooth[-half:], smooth[:, :half], smooth[:, -half:] = False, False, False, False
-    whole = np.where(smooth, linear, np.where(np.isfinite(plane), plane, near))
-    out = np.full((h, w, 2), np.nan, dtype=np.float32)
-    out[: size[1], : size[0]] = np.where(np.isfinite(near), whole, np.float32(np.nan))
-    return out
-
-
-_OUTSIDE = -1e6  # where nothing is seen
-_STEPS = 4  # of Gauss-Newton, to the nearest place on a line
+# The inverse distances that are tried.
+STEP = 0.1  # between two of them on the pattern, periods (median over the image)
+FEWEST, MOST = 16, 512  # numbers of them; the step grows where more would be needed
+QUANTILE = 0.002  # share of the decoded pixels that may be nearer than the range, and that may be farther
+MARGIN = 0.04  # by which the range is longer on each side, as a share of it
+AGREEMENT = 0.15  # distance of decoded coordinates from their line up to which they count, periods
+OFFSET_WINDOW = 1.0  # standard deviation of the window in which these distances are averaged, periods
+OFFSET_PRIOR = 0.05  # share of decoded pixels in the window at which the average is halved
 
 
 @dataclass(frozen=True)
@@ -192,14 +47,14 @@ class EpipolarLines:
 
     @staticmethod
     def of(camera: Device, projector: Device, T_camera_projector: Float64[ndarray, "4 4"]) -> "EpipolarLines":
-        """Those of two devices; NaN where a pixel has no ray."""
+        """The lines of two devices; NaN where a pixel has no ray."""
         shape, R = (camera.h, camera.w), np.ascontiguousarray(T_camera_projector[:3, :3])
         rays = np.empty((*shape, 3))
         _turned_rays(*for_loops(camera), R, rays)
         return EpipolarLines(rays, -R.T @ T_camera_projector[:3, 3], projector, np.zeros((*shape, 2), dtype=np.float32))
 
     def part(self, box: tuple[slice, slice]) -> "EpipolarLines":
-        """Those of the pixels in a box."""
+        """The lines of the pixels in a box."""
         return replace(self, ray=np.ascontiguousarray(self.ray[box]), offset=np.ascontiguousarray(self.offset[box]))
 
     def at(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
@@ -239,8 +94,103 @@ class EpipolarLines:
 
     @cached_property
     def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
-        """For compiled loops: model code and parameters of the projector, rays, centre, offsets."""
+        """Arguments of compiled loops: model code and parameters of the projector, rays, centre, offsets."""
         return *for_loops(self.projector), self.ray, self.centre, self.offset
+
+
+def with_offset(
+    lines: EpipolarLines,
+    coords: Float32[ndarray, "h w 2"],
+    period: float,
+    pixels_a_period: float,
+) -> EpipolarLines:
+    """Lines that run through decoded coordinates, on average over a window: poses and lenses are not known exactly."""
+    apart = coords - lines.at(lines.nearest(coords))
+    good = np.hypot(apart[..., 0], apart[..., 1]) < AGREEMENT * period  # False for NaN
+    values = np.dstack([np.where(good[..., None], apart, np.float32(0)), good.astype(np.float32)])
+    means = gaussian_window(values, OFFSET_WINDOW * pixels_a_period)
+    offset = means[..., :2] / (means[..., 2:] + np.float32(OFFSET_PRIOR))
+    return replace(lines, offset=lines.offset + offset)
+
+
+def hypotheses(
+    lines: EpipolarLines,
+    coords: Float32[ndarray, "h w 2"],
+    w: Float64[ndarray, "h w"],
+    mask: Bool[ndarray, "h w"],
+    period: float,
+) -> Float64[ndarray, "k"] | None:
+    """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line.
+
+    `w` are the inverse distances nearest to the decoded coordinates. What the mask shows may be as deep as it is wide:
+    parts of which nothing was decoded may lie before or behind.
+    """
+    apart = np.linalg.norm(coords - lines.at(w), axis=-1)
+    good = apart < AGREEMENT * period
+    if good.sum() < FEWEST:
+        return None
+    low, middle, high = np.quantile(w[good], [QUANTILE, 0.5, 1 - QUANTILE])
+    depth = _half_width(lines.ray[mask | good])
+    low, high = min(low, middle / (1 + depth)), max(high, middle / (1 - depth))
+    margin = MARGIN * (high - low)
+    low, high = max(low - margin, low / 2), high + margin
+    slope = np.linalg.norm(lines.slopes(np.full(w.shape, (low + high) / 2)), axis=-1)[good]
+    length = float(np.median(slope)) * (high - low)
+    count = int(np.clip(np.ceil(length / (STEP * period)), FEWEST, MOST))
+    return np.linspace(low, high, count)
+
+
+def numbers_of(w: Float64[ndarray, "h w"], tried: Float64[ndarray, "k"]) -> Int32[ndarray, "h w"]:
+    """The nearest of the inverse distances that are tried; `UNKNOWN` for NaN and beyond their range."""
+    number = np.rint((w - tried[0]) / (tried[1] - tried[0]))
+    inside = (number >= 0) & (number < len(tried))  # False for NaN
+    return np.where(inside, number, UNKNOWN).astype(np.int32)
+
+
+def _half_width(rays: Float64[ndarray, "n 3"]) -> float:
+    """Half the width of what the rays see, as a share of its distance; at most a half."""
+    rays = rays[np.isfinite(rays[:, 0])]
+    centre = rays.mean(0)
+    cosine = np.quantile(rays @ (centre / np.linalg.norm(centre)), QUANTILE)
+    return min(float(np.sqrt(1 - min(cosine, 1.0) ** 2)), 0.5)
+
+
+def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float | None:
+    """Pixels of the image in a period of the pattern, median; None where hardly anything is decoded."""
+    by_x, by_y = np.diff(coords[:-1], axis=1), np.diff(coords[:, :-1], axis=0)
+    smooth = np.ones(by_x.shape[:2], dtype=bool)
+    for step in (by_x, by_y):
+        for part in (step[..., 0], step[..., 1]):  # numpy takes the larger of two far more slowly
+            smooth &= np.abs(part) < TEAR * period
+    area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])[smooth]
+    area = area[area > 0]
+    return period / float(np.sqrt(np.median(area))) if len(area) >= FEWEST_FOR_SIZE else None
+
+
+def enlarged(
+    coords: Float32[ndarray, "a b 2"], factor: int, shape: tuple[int, int], period: float
+) -> Float32[ndarray, "h w 2"]:
+    """Coordinates at the pixels of an image of the given shape; those given are at squares of `factor` of its pixels.
+
+    Bilinear within a surface; at its border, the square's plane is continued. NaN where a pixel's square has none.
+    """
+    if factor == 1:
+        return coords
+    h, w = shape
+    size = coords.shape[1] * factor, coords.shape[0] * factor
+    near = np.repeat(np.repeat(coords, factor, axis=0), factor, axis=1)
+    slope = np.repeat(np.repeat(slopes(coords, period), factor, axis=0), factor, axis=1)
+    place = ((np.arange(factor) + 0.5) / factor - 0.5).astype(np.float32)
+    x, y = np.tile(place, coords.shape[1])[None, :, None], np.tile(place, coords.shape[0])[:, None, None]
+    plane = near + slope[..., 0] * x + slope[..., 1] * y
+    linear = cv2.resize(coords, size, interpolation=cv2.INTER_LINEAR)  # NaN beside what is unknown
+    smooth = np.abs(linear - near).max(-1, keepdims=True) < TEAR * period
+    half = factor // 2  # beside the image's border, where interpolation has one side only
+    smooth[:half], smooth[-half:], smooth[:, :half], smooth[:, -half:] = False, False, False, False
+    whole = np.where(smooth, linear, np.where(np.isfinite(plane), plane, near))
+    out = np.full((h, w, 2), np.nan, dtype=np.float32)
+    out[: size[1], : size[0]] = np.where(np.isfinite(near), whole, np.float32(np.nan))
+    return out
 
 
 @compiled
@@ -254,7 +204,7 @@ def _turned_rays(code: int, parameters: ndarray, R: ndarray, out: ndarray) -> No
 
 @compiled
 def _point(ray: ndarray, centre: ndarray, w: float) -> tuple[float, float, float]:
-    """In the projector's axes, but for its length."""
+    """A point at an inverse distance in the projector's axes, but for its length."""
     return ray[0] + w * centre[0], ray[1] + w * centre[1], ray[2] + w * centre[2]
 
 
@@ -278,17 +228,17 @@ def _pixels(
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
             u, v, front = pixel_of(code, *_point(ray[row, column], centre, w), parameters)
-            x[row, column] = u + offset[row, column, 0] - 0.5 if front else _OUTSIDE
-            y[row, column] = v + offset[row, column, 1] - 0.5 if front else _OUTSIDE
+            x[row, column] = u + offset[row, column, 0] - 0.5 if front else OUTSIDE_PX
+            y[row, column] = v + offset[row, column, 1] - 0.5 if front else OUTSIDE_PX
 
 
 @compiled
 def _pinhole_pixels(parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray) -> None:
-    """The same for a pinhole without distortion, ten times as fast."""
+    """Fill columns and rows for a pinhole without distortion, ten times as fast."""
     f = np.float32
     fx, fy, cx, cy = f(parameters[0]), f(-parameters[1]), f(parameters[2] - 0.5), f(parameters[3] - 0.5)
     a, b, c = f(w * centre[0]), f(w * centre[1]), f(w * centre[2])
-    outside, nearest = f(_OUTSIDE), f(-1e-12)
+    outside, nearest = f(OUTSIDE_PX), f(-1e-12)
     ray_x, ray_y, ray_z, du, dv = planes[0], planes[1], planes[2], planes[3], planes[4]
     for row in range(x.shape[0]):
         for column in range(x.shape[1]):
@@ -332,7 +282,7 @@ def _nearest(
             if not square > 0:
                 continue
             s, front = -(ax * bx + ay * by + az * bz) / square, False
-            for _ in range(_STEPS):
+            for _ in range(NEAREST_STEPS):
                 view = view_of(code, *_point(a, centre, s), parameters)
                 front = view[2]
                 if not front:

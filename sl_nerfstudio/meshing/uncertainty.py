@@ -17,10 +17,9 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import HALF_WINDOW, CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, is_exact
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, by_intrinsics
-from sl_nerfstudio.bundle_adjustment.settings import LookUpSettings
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import MODELS, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.lie import DevicePoses, hat, inverse, transform
@@ -275,7 +274,7 @@ def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int6
     return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
 
 
-def window_pixels(half: int = LookUpSettings().half_window) -> float:
+def window_pixels(half: int = HALF_WINDOW) -> float:
     """How many independent pixels have the variance of one look-up in a window that is decoded throughout."""
     y, x = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1).astype(float)
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)

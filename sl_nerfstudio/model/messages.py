@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation, cross_validate
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
@@ -20,6 +20,9 @@ from sl_nerfstudio.model.pose_refinement import (
 from sl_nerfstudio.review.verdict import DepartedFrame, describe_departed
 
 # Intrinsics that agree better with the captures: found before training, kept only if held-out pixels confirm them.
+
+_ROUNDS = 3  # Gauss-Newton steps of the intrinsics, at most; all poses are adjusted again after each
+_AGREEMENT = 6.0  # chi square of correct intrinsics: below it, no further steps are taken
 
 
 @dataclass(frozen=True)
@@ -46,9 +49,8 @@ def refine_intrinsics(
     the captures do not contradict remain unchanged. Gauss-Newton steps are taken while the chi square of the
     contradiction falls; held-out pixels then decide once between the first result and the last.
     """
-    maps, held_out = maps_and_held_out(loaded.scan, loaded.samples, settings)
-    s = settings.self_calibration
-    once = replace(settings, other_minima=replace(settings.other_minima, searches=0))  # poses are adjusted again later
+    maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
+    once = replace(settings, other_minima=0)  # poses are adjusted again later
 
     def adjusted_with(change: IntrinsicsChange) -> ScanAdjustment:
         scan = loaded.scan.with_intrinsics_change(change)
@@ -57,11 +59,11 @@ def refine_intrinsics(
         return adjusted(scan, loaded.S_scene_world, start, maps, refine, known, once)
 
     before = adjusted_with(stated)
-    if before.intrinsics is None or not before.intrinsics.contradicts(s):
+    if before.intrinsics is None or not before.intrinsics.contradicts():
         return RefinedIntrinsics(stated, before, before)
     change, after = stated, before
-    for _ in range(s.rounds):
-        if after.intrinsics is None or after.intrinsics.chi_square < s.agreement:
+    for _ in range(_ROUNDS):
+        if after.intrinsics is None or after.intrinsics.chi_square < _AGREEMENT:
             break
         proposed = change + IntrinsicsChange.of(after.intrinsics.change.tolist())
         found = adjusted_with(proposed)
@@ -69,8 +71,7 @@ def refine_intrinsics(
             break
         change, after = proposed, found
     # That the captures contradict the stated intrinsics is known already: any gain beyond chance confirms it.
-    any_gain = replace(settings, cross_validation=replace(settings.cross_validation, least_gain=0.0))
-    decision = cross_validate(before.rig, after.rig, held_out, maps, before.noise_px, any_gain)
+    decision = cross_validate(before.rig, after.rig, held_out, maps, before.noise_px, least_gain=0.0)
     return RefinedIntrinsics(change if decision.better else stated, before, after, decision)
 
 

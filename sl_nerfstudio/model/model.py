@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration, constrained
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, rotate

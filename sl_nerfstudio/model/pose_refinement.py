@@ -8,7 +8,14 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, CrossValidation, HeldOutPixels, adjust, cross_validate
+from sl_nerfstudio.bundle_adjustment.adjust import (
+    HELD_OUT_PER_FRAME,
+    Adjustment,
+    CrossValidation,
+    HeldOutPixels,
+    adjust,
+    cross_validate,
+)
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import (
     JointCovariance,
@@ -31,7 +38,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     restore,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import BLOCK, PixelBatch, PixelSamples
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, log_se3
@@ -106,10 +113,10 @@ def adjust_scan(
 ) -> ScanAdjustment:
     """Adjust all poses together, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
-    maps, held_out = maps_and_held_out(scan, samples, settings)
+    maps, held_out = maps_and_held_out(scan, samples)
     stated = pose_prior(scan, S_scene_world, prior)
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
-    decision = cross_validate(start, found.rig, held_out, maps, found.noise_px, settings)
+    decision = cross_validate(start, found.rig, held_out, maps, found.noise_px)
     if decision.better:
         return replace(found, cross_validation=decision)
     nothing_learnt = decision.worse or refine == "off"
@@ -199,14 +206,12 @@ def known_length(
 
 
 @one_library_thread()
-def maps_and_held_out(
-    scan: Scan, samples: PixelSamples, settings: AdjustmentSettings
-) -> tuple[CoordinateMaps, HeldOutPixels]:
+def maps_and_held_out(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps, HeldOutPixels]:
     """Coordinate images without the held-out pixels, and a selection of the held-out pixels."""
     frames, uv_camera, uv_projector, blocks = [], [], [], []
     for number, frame in enumerate(scan.frames):
         index = samples.held_out_of(number)
-        count = min(len(index), settings.cross_validation.pixels_per_frame)
+        count = min(len(index), HELD_OUT_PER_FRAME)
         test = samples.at(index[torch.from_numpy(evenly_spaced(len(index), count))])
         decoded = test.decoded
         frames.append(test.frame[decoded])
@@ -220,7 +225,7 @@ def maps_and_held_out(
         frame_of, torch.cat(uv_camera), torch.cat(uv_projector), frame_of * most + torch.cat(blocks)
     )
     images = (_training_coords(frame.camera, own) for frame, own in zip(scan.frames, samples.in_order(), strict=True))
-    return CoordinateMaps.of(images, settings.look_up), held_out
+    return CoordinateMaps.of(images), held_out
 
 
 def _training_coords(camera: Device, pixels: PixelBatch) -> Float[Tensor, "h w 2"]:

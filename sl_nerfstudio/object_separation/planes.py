@@ -1,4 +1,4 @@
-"""The planes of the surroundings as each frame sees them, and which of a frame's points are part of them.
+"""Planes in the points of all frames: found, judged (surroundings or part of the object), and told from what rises.
 
 The pose of a frame may be wrong by more than its points are noisy. A plane fitted again in each frame, with the common
 plane as prior, takes that error out of the heights above it.
@@ -19,82 +19,12 @@ from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
 from sl_nerfstudio.parallel import compiled, compiled_range
 
-# All settings of the separation of object and surroundings.
+# Limits are in standard deviations of the measured noise, or shares; none is a length.
 
-
-@dataclass(frozen=True)
-class SeparationSettings:
-    """Limits are in standard deviations of the measured noise, or shares; none is a length."""
-
-    pixels_per_frame: int = 40_000
-    """Decoded pixels of each frame that the search looks at, at most."""
-    points: int = 30_000
-    """Points of all frames together from which planes are found, at most."""
-    neighbours: int = 12
-    """Points of the same frame from which the normal of a point is found."""
-    hypotheses: int = 300
-    """Planes that are tried in each round of the search."""
-    planes: int = 8
-    """Planes that are looked for, at most."""
-    least_support: float = 0.03
-    """Smallest share of the points that a plane must hold."""
-    normal_cosine: float = 0.9
-    """Smallest cosine between the normal of a point and that of its plane."""
-    search_sigmas: float = 4.0
-    """Distance from a plane within which a point counts as part of it, while planes are searched for."""
-    clear_sigmas: float = 8.0
-    """Distance from a plane above which a point certainly does not belong to it."""
-    plane_sigmas: float = 3.0
-    """Height up to which a pixel is part of the plane wherever the object may be near, at least. Decoders err more
-    beside edges than elsewhere, so the height is measured: nothing is below the plane, what seems to be is error."""
-    error_share: float = 0.98
-    """Share of the errors below the plane that the measured height covers."""
-    most_sigmas: float = 30.0
-    """What is farther below the plane is no error of this kind; the measured height is at most this."""
-    bare_sigmas: float = 8.0
-    """Height up to which a pixel is part of the plane where the plane is bare, at least."""
-    bare_factor: float = 3.0
-    """The same in measured heights."""
-    bare_share: float = 0.7
-    """Share of the points near the plane that must lie on it for a place to count as bare."""
-    cameras_in_front: float = 0.95
-    """Share of the cameras that must be in front of a plane that is left out."""
-    most_behind: float = 0.05
-    """Largest share of the points in the viewed region that may lie behind such a plane."""
-    least_above: float = 0.005
-    """Smallest share of the points in the viewed region that must lie in front of it: there must be an object."""
-    directions: int = 36
-    """Directions in which the edge of a plane is looked for."""
-    view_margin: float = 0.1
-    """Strip along the borders of image and pattern in which an edge is not told from the end of the view: a share."""
-    edge_frames: float = 0.15
-    """Share of the frames that must look past the edge of a plane, for the edge to count as seen."""
-    continues: float = 0.5
-    """Share of the directions in which a plane must leave the views, for it to be more than the object."""
-    support_area: float = 3.0
-    """A plane whose edges are seen counts as support only if its bare area is at least so many times the area of what
-    stands on it."""
-    support_height: float = 0.25
-    """and if what stands on it rises at least so high, as a share of the root of its area."""
-    voxels: int = 40
-    """Voxels along the radius of the viewed region; parts of the object farther apart than two voxels are separate."""
-    least_frames: int = 2
-    """Frames that must have seen a voxel, or"""
-    least_points: int = 4
-    """points in it, for it to count."""
-    least_voxels: int = 5
-    """Voxels of the smallest part that is kept beside the main part."""
-    gap: float = 0.15
-    """Distance from the main part within which other parts are kept, as a share of its size."""
-    silhouette_points: int = 200_000
-    """Points of the object that are looked for in every frame, to tell which pixels that were not decoded show it."""
-    least_object: float = 0.01
-    """Smallest share of the points that the object must hold; with less, nothing is left out."""
-
-
-SEPARATION_DEFAULTS = SeparationSettings()
-
-# Planes in the world, and their least-squares fit.
+NEIGHBOURS = 12  # points of the same frame from which the normal of a point is found
+NORMAL_COSINE = 0.9  # smallest cosine between the normals of a point and of its plane, or of two points of one place
+SEARCH_SIGMAS = 4.0  # distance from a plane within which a point counts as part of it, while planes are searched for
+CLEAR_SIGMAS = 8.0  # distance from a plane above which a point certainly does not belong to it
 
 
 @dataclass(frozen=True)
@@ -134,7 +64,6 @@ def fit_plane(p_world: Float[ndarray, "n 3"], weight: Float[ndarray, "n"]) -> Pl
 LEAST_COSINE = 0.05  # between a ray and a plane's normal: a ray in the plane would have no noise across it
 _LEAST_NOISE_PX = 0.01  # rounding of stored coordinates and poses
 _SAME_PLACE = 3.0  # spacings: how far apart points of two frames on the same surface may be
-_SAME_NORMAL = 0.9  # cosine
 
 
 @dataclass(frozen=True)
@@ -150,7 +79,7 @@ class DecodedFrame:
     stride: int = 1
 
     def thinned(self, most: int) -> "DecodedFrame":
-        """Every n-th pixel, so that at most about `most` are decoded."""
+        """Keep every n-th pixel, so that at most about `most` are decoded."""
         count = int(np.isfinite(self.coords).all(-1).sum())
         step = max(1, int(np.ceil(np.sqrt(count / most))))
         coords, seen = self.coords[::step, ::step].copy(), self.seen[::step, ::step].copy()
@@ -172,12 +101,8 @@ class FramePoints:
         return len(self.p_world)
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "FramePoints":
-        """Some of the points."""
+        """Choose points by mask or by index."""
         return FramePoints(*(values[index] for values in vars(self).values()))
-
-    def scaled_noise(self, factor: float) -> "FramePoints":
-        """With all sigmas multiplied."""
-        return replace(self, sigma=self.sigma * factor)
 
     def sigma_along(self, normal: Float[ndarray, "3"] | Float[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
         """1 sigma of each point's place along a direction."""
@@ -208,11 +133,11 @@ def points_of(frame: DecodedFrame) -> FramePoints:
     return FramePoints(row[good].astype(np.int64), column[good].astype(np.int64), p[good], ray, sigma)
 
 
-def normals_of(points: FramePoints, neighbours: int) -> Float64[ndarray, "n 3"]:
+def normals_of(points: FramePoints) -> Float64[ndarray, "n 3"]:
     """Unit normals towards the camera, from the nearest points of the same frame; NaN with too few points."""
-    if len(points) < neighbours:
+    if len(points) < NEIGHBOURS:
         return np.full((len(points), 3), np.nan)
-    _, near = KDTree(points.p_world).query(points.p_world, neighbours)
+    _, near = KDTree(points.p_world).query(points.p_world, NEIGHBOURS)
     offset = points.p_world[near] - points.p_world[near].mean(1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))
     normal = vectors[:, :, 0]
@@ -246,36 +171,35 @@ def _distances_in_sigmas(
     distance, near = (np.asarray(v) for v in tree.query(a.p_world, distance_upper_bound=_SAME_PLACE * spacing))
     mine = np.flatnonzero(np.isfinite(distance))
     there = near[mine]
-    same = (normal_a[mine] * normal_b[there]).sum(-1) > _SAME_NORMAL
+    same = (normal_a[mine] * normal_b[there]).sum(-1) > NORMAL_COSINE
     mine, there = mine[same], there[same]
     off = ((a.p_world[mine] - b.p_world[there]) * normal_b[there]).sum(-1)
     sigma = np.hypot(a.sigma_along(normal_a)[mine], b.sigma_along(normal_b)[there])
     return np.abs(off) / sigma
 
 
-# Planes grown from single points: a compiled loop over hypotheses.
+# Dominant planes, by random sampling: planes grown from single points, in a compiled loop over hypotheses.
 
+_SCORED = 6000  # points on which hypotheses are compared
+_HYPOTHESES = 300  # planes that are tried in each round
+_PLANES = 8  # that are looked for, at most
+_LEAST_SUPPORT = 0.03  # share of the points that a plane must hold
 GROWTH = (0.2, 0.5, np.inf)  # of the radius: a plane is fitted near its seed first, and then to more and more points
 FEWEST = 6  # points that a plane is fitted to
 
 
 def grown_planes(
-    points: FramePoints,
-    normal: Float64[ndarray, "n 3"],
-    seeds: Int64[ndarray, "s"],
-    radius: float,
-    sigmas: float,
-    cosine: float,
+    points: FramePoints, normal: Float64[ndarray, "n 3"], seeds: Int64[ndarray, "s"], radius: float
 ) -> tuple[Float64[ndarray, "s 4"], Int64[ndarray, "s"]]:
     """Planes (unit normal, offset) through points along their normals, fitted to more and more points around them.
 
-    Points within `sigmas` of a plane, whose normals' cosine is greater than `cosine`, are part of it. Returns the
-    planes, and the number of points that are part of each.
+    Points within `SEARCH_SIGMAS` of a plane, and with a normal like its own, are part of it. Returns the planes, and
+    the number of points that are part of each.
     """
     planes, counts = np.zeros((len(seeds), 4)), np.zeros(len(seeds), dtype=np.int64)
     arrays = [np.ascontiguousarray(x) for x in (points.p_world, points.ray, points.sigma, normal)]
     reaches = np.array([reach * radius for reach in GROWTH])
-    _grow(len(seeds), seeds, *arrays, reaches, sigmas, cosine, planes, counts)
+    _grow(len(seeds), seeds, *arrays, reaches, SEARCH_SIGMAS, NORMAL_COSINE, planes, counts)
     return planes, counts
 
 
@@ -331,11 +255,6 @@ def _fit(moments, about, plane):
     plane[3] = axis @ (centre + about)
 
 
-# The dominant planes in the points of all frames, by random sampling and refinement.
-
-_SCORED = 6000  # points on which hypotheses are compared
-
-
 @dataclass(frozen=True)
 class PointPool:
     """Points of all frames together, thinned, with normals."""
@@ -346,77 +265,63 @@ class PointPool:
 
     @staticmethod
     def of(frames: Sequence[FramePoints], normals: Sequence[Float[ndarray, "_n 3"]]) -> "PointPool":
-        """The points of several frames that have a normal."""
+        """Join the points of several frames that have a normal."""
         joined = FramePoints(*(np.concatenate([vars(f)[key] for f in frames]) for key in vars(frames[0])))
         frame = np.repeat(np.arange(len(frames)), [len(f) for f in frames])
         pool = PointPool(joined, np.concatenate(list(normals)), frame)
         return pool.chosen(np.isfinite(pool.normal).all(-1))
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "PointPool":
-        """Some of the points."""
+        """Choose points by mask or by index."""
         return PointPool(self.points.chosen(index), self.normal[index], self.frame[index])
 
     def __len__(self) -> int:
         """Number of points."""
         return len(self.frame)
 
-    def on(self, plane: Plane, settings: SeparationSettings) -> Bool[ndarray, "n"]:
+    def on(self, plane: Plane) -> Bool[ndarray, "n"]:
         """The points that are part of a plane: by their place and by their normal."""
-        near = np.abs(plane.heights(self.points.p_world)) < settings.search_sigmas * self.points.sigma_along(
-            plane.normal
-        )
-        return near & (np.abs(self.normal @ plane.normal) > settings.normal_cosine)
+        height, sigma = plane.heights(self.points.p_world), self.points.sigma_along(plane.normal)
+        return (np.abs(height) < SEARCH_SIGMAS * sigma) & (np.abs(self.normal @ plane.normal) > NORMAL_COSINE)
 
 
-def find_planes(
-    pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings
-) -> list[tuple[Plane, float]]:
+def find_planes(pool: PointPool, radius: float, rng: np.random.Generator) -> list[tuple[Plane, float]]:
     """Planes with the share of all points that they hold, the largest first; none that holds too few or one frame's.
 
     `radius` is that of the viewed region.
     """
     found: list[tuple[Plane, float]] = []
     rest = pool
-    for _ in range(settings.planes):
-        plane = _largest(rest, radius, rng, settings)
+    for _ in range(_PLANES):
+        plane = _largest(rest, radius, rng)
         if plane is None:
             break
-        on = rest.on(plane, settings)
-        if on.sum() < settings.least_support * len(pool) or len(np.unique(rest.frame[on])) < 2:
+        on = rest.on(plane)
+        if on.sum() < _LEAST_SUPPORT * len(pool) or len(np.unique(rest.frame[on])) < 2:
             break
         found.append((plane, float(on.sum() / len(pool))))
-        clear = np.abs(plane.heights(rest.points.p_world)) > settings.clear_sigmas * rest.points.sigma_along(
-            plane.normal
-        )
-        rest = rest.chosen(clear)
+        height, sigma = plane.heights(rest.points.p_world), rest.points.sigma_along(plane.normal)
+        rest = rest.chosen(np.abs(height) > CLEAR_SIGMAS * sigma)
     return found
 
 
-def _largest(pool: PointPool, radius: float, rng: np.random.Generator, settings: SeparationSettings) -> Plane | None:
+def _largest(pool: PointPool, radius: float, rng: np.random.Generator) -> Plane | None:
     """The plane that holds the most points, of planes grown from random points; None if there are too few points."""
-    if len(pool) < settings.neighbours:
+    if len(pool) < NEIGHBOURS:
         return None
     some = pool.chosen(rng.choice(len(pool), min(_SCORED, len(pool)), replace=False))
-    seeds = rng.integers(0, len(some), settings.hypotheses)
-    planes, counts = grown_planes(
-        some.points, some.normal, seeds, radius, settings.search_sigmas, settings.normal_cosine
-    )
+    seeds = rng.integers(0, len(some), _HYPOTHESES)
+    planes, counts = grown_planes(some.points, some.normal, seeds, radius)
     most = int(counts.argmax())
     if counts[most] == 0:
         return None
     best = Plane(planes[most, :3], float(planes[most, 3]))
     for _ in range(3):
-        best = _refitted(pool, pool.on(best, settings), best)
+        on = pool.points.chosen(pool.on(best))
+        if len(on) >= FEWEST:
+            found = fit_plane(on.p_world, 1 / on.sigma_along(best.normal) ** 2)
+            best = found if found.normal @ best.normal > 0 else found.flipped()
     return best
-
-
-def _refitted(pool: PointPool, on: Bool[ndarray, "n"], plane: Plane) -> Plane:
-    """The plane fitted to some points; unchanged if they are too few."""
-    if on.sum() < FEWEST:
-        return plane
-    points = pool.points.chosen(on)
-    found = fit_plane(points.p_world, 1 / points.sigma_along(plane.normal) ** 2)
-    return found if found.normal @ plane.normal > 0 else found.flipped()
 
 
 # Where all cameras look at: the point that their axes pass nearest, and how far around it they see.
@@ -437,7 +342,7 @@ class ViewedRegion:
 
 
 def viewed_region(frames: Sequence[DecodedFrame], p_world: Float[ndarray, "n 3"]) -> ViewedRegion:
-    """From the poses and fields of view of all devices; `p_world` are points of all frames."""
+    """Find the region from the poses and fields of view of all devices; `p_world` are points of all frames."""
     middle = np.median(p_world, axis=0)
     A, b = _TOWARDS_POINTS * np.eye(3), _TOWARDS_POINTS * middle
     for frame in frames:
@@ -466,15 +371,19 @@ Verdict = Literal[
 ]  # fmt: skip
 """Why a plane is surroundings (the first two), or why it may be a part of the object and is kept."""
 
+_CAMERAS_IN_FRONT = 0.95  # share of the cameras that must be in front of a plane that is left out
+_MOST_BEHIND = 0.05  # share of the points in the viewed region that may lie behind such a plane
+_LEAST_ABOVE = 0.005  # share of them that must lie in front of it: there must be an object
+_DIRECTIONS = 36  # in which the edge of a plane is looked for
+_VIEW_MARGIN = 0.1  # strip along the borders of image and pattern, a share, where an edge may be the end of the view
+_EDGE_FRAMES = 0.15  # share of the frames that must look past the edge of a plane, for the edge to count as seen
+_CONTINUES = 0.5  # share of the directions in which a plane must leave the views, for it to be more than the object
+# A plane whose edges are seen is a support if its bare area is so many times that of what stands on it, if that rises
+# so high, in roots of its area, and if the plane extends beyond it in so many of the directions.
+_SUPPORT_AREA, _SUPPORT_HEIGHT, _AROUND = 3.0, 0.25, 0.75
 _CELLS = 20  # of the grid in the plane, along the radius of the viewed region
 _POINTS_IN_CELL = 3
-_BEYOND_EDGE = (
-    1.04,
-    1.1,
-    1.2,
-    1.35,
-)  # where past the edge to look, as distances from the middle in distances of the edge
-_AROUND = 0.75  # share of the directions in which a support extends beyond what stands on it
+_BEYOND_EDGE = (1.04, 1.1, 1.2, 1.35)  # distances from the middle at which to look past the edge, in that of the edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,7 +414,6 @@ def judge_plane(
     frames: Sequence[DecodedFrame],
     points: Sequence[FramePoints],
     region: ViewedRegion,
-    settings: SeparationSettings,
 ) -> PlaneFinding:
     """Judge one plane. `pool` has points of all frames, `points` are those of each frame.
 
@@ -517,46 +425,37 @@ def judge_plane(
         plane = plane.flipped()
     in_front = float((plane.heights(centres) > 0).mean())
     p = pool.points.p_world
-    height, clear = plane.heights(p), settings.clear_sigmas * pool.points.sigma_along(plane.normal)
+    height, clear = plane.heights(p), CLEAR_SIGMAS * pool.points.sigma_along(plane.normal)
     inside = region.contains(p)
     behind, above = (float((side & inside).sum() / max(inside.sum(), 1)) for side in (height < -clear, height > clear))
-    on = pool.on(plane, settings)
-    continues = _continues(plane, p[on], frames, points, settings)
+    on = pool.on(plane)
+    continues = _continues(plane, p[on], frames, points)
     area, tall, around = _what_stands_on_it(plane, p[on], p[inside & (height > clear)], region)
     return PlaneFinding(
         plane, share, in_front, behind, above, continues, area, tall, around,
-        _verdict(in_front, behind, above, continues, (area, tall, around), settings),
+        _verdict(in_front, behind, above, continues, (area, tall, around)),
     )  # fmt: skip
 
 
 def _verdict(
-    in_front: float,
-    behind: float,
-    above: float,
-    continues: float,
-    support: tuple[float, float, float],
-    settings: SeparationSettings,
+    in_front: float, behind: float, above: float, continues: float, support: tuple[float, float, float]
 ) -> Verdict:
     area, tall, around = support
-    if in_front < settings.cameras_in_front:
+    if in_front < _CAMERAS_IN_FRONT:
         return "cameras on both sides"
-    if behind > settings.most_behind:
+    if behind > _MOST_BEHIND:
         return "surface behind it"
-    if above < settings.least_above:
+    if above < _LEAST_ABOVE:
         return "nothing on it"
-    if continues >= settings.continues:
+    if continues >= _CONTINUES:
         return "leaves the views"
-    if area >= settings.support_area and tall >= settings.support_height and around >= _AROUND:
+    if area >= _SUPPORT_AREA and tall >= _SUPPORT_HEIGHT and around >= _AROUND:
         return "object stands on it"
     return "edges seen"
 
 
 def _continues(
-    plane: Plane,
-    on: Float[ndarray, "n 3"],
-    frames: Sequence[DecodedFrame],
-    points: Sequence[FramePoints],
-    settings: SeparationSettings,
+    plane: Plane, on: Float[ndarray, "n 3"], frames: Sequence[DecodedFrame], points: Sequence[FramePoints]
 ) -> float:
     """Share of the directions in the plane in which no more than a few frames look past its edge."""
     if not len(on):
@@ -564,39 +463,33 @@ def _continues(
     centre = np.median(on, axis=0)
     flat = (on - centre) @ plane.axes().T
     distance = np.linalg.norm(flat, axis=1)
-    sector = _sectors(flat, settings.directions)
+    sector = _sectors(flat, _DIRECTIONS)
     probes = []
-    for k in range(settings.directions):
+    for k in range(_DIRECTIONS):
         if (sector == k).sum() < _POINTS_IN_CELL:
             continue
         reach = np.percentile(distance[sector == k], 98) * np.array(_BEYOND_EDGE)
-        angle = 2 * np.pi * (k + 0.5) / settings.directions - np.pi
+        angle = 2 * np.pi * (k + 0.5) / _DIRECTIONS - np.pi
         outward = np.array([np.cos(angle), np.sin(angle)]) @ plane.axes()
         probes.append(centre + reach[:, None] * outward)
     if not probes:
         return 0.0
     places = np.concatenate(probes)
-    past = sum(
-        _looks_past(plane, places, frame, own, settings).astype(int) for frame, own in zip(frames, points, strict=True)
-    )
+    past = sum(_looks_past(plane, places, frame, own).astype(int) for frame, own in zip(frames, points, strict=True))
     # A rim may stand on the edge, so that only places farther out show that nothing follows.
     most = np.reshape(past, (len(probes), -1)).max(1)
-    return float((most <= settings.edge_frames * len(frames)).mean())
+    return float((most <= _EDGE_FRAMES * len(frames)).mean())
 
 
 def _looks_past(
-    plane: Plane,
-    probes: Float[ndarray, "m 3"],
-    frame: DecodedFrame,
-    points: FramePoints,
-    settings: SeparationSettings,
+    plane: Plane, probes: Float[ndarray, "m 3"], frame: DecodedFrame, points: FramePoints
 ) -> Bool[ndarray, "m"]:
     """Places where a frame looks past the plane: well inside its view, it saw something behind it or nothing at all."""
-    uv, inside = _well_inside(frame.camera, frame.T_world_camera, probes, settings.view_margin)
-    _, lit = _well_inside(frame.projector, frame.T_world_projector, probes, settings.view_margin)
+    uv, inside = _well_inside(frame.camera, frame.T_world_camera, probes)
+    _, lit = _well_inside(frame.projector, frame.T_world_projector, probes)
     looked = inside & lit
     nothing, beyond = ~frame.seen, np.zeros_like(frame.seen)
-    below = plane.heights(points.p_world) < -settings.clear_sigmas * points.sigma_along(plane.normal)
+    below = plane.heights(points.p_world) < -CLEAR_SIGMAS * points.sigma_along(plane.normal)
     beyond[points.row[below], points.column[below]] = True
     past = np.zeros(len(probes), dtype=bool)
     for k in np.flatnonzero(looked):
@@ -607,14 +500,14 @@ def _looks_past(
 
 
 def _well_inside(
-    device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "m 3"], margin: float
+    device: Device, T_world_device: Float[ndarray, "4 4"], p_world: Float[ndarray, "m 3"]
 ) -> tuple[Float[ndarray, "m 2"], Bool[ndarray, "m"]]:
     """Pixels of points, and whether they are in the image without a strip along its borders."""
     p_device = (p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]
     found, in_front = project(Intrinsics.of(device, torch.float64), torch.from_numpy(np.ascontiguousarray(p_device)))
     uv = found.numpy()
     share = uv / (device.w, device.h)
-    return uv, in_front.numpy() & (share > margin).all(1) & (share < 1 - margin).all(1)
+    return uv, in_front.numpy() & (share > _VIEW_MARGIN).all(1) & (share < 1 - _VIEW_MARGIN).all(1)
 
 
 def _what_stands_on_it(
@@ -654,6 +547,15 @@ def _sectors(flat: Float[ndarray, "n 2"], count: int) -> Int64[ndarray, "n"]:
     return np.minimum((count * turn).astype(np.int64), count - 1)
 
 
+# Planes as each frame sees them, and where nothing rises from them.
+
+_PLANE_SIGMAS = 3.0  # height up to which a pixel is part of the plane where the object may be near, at least. Decoders
+# err more beside edges than elsewhere, so the height is measured: nothing is below the plane, what seems to be is error
+_ERROR_SHARE = 0.98  # share of the errors below the plane that the measured height covers
+_MOST_SIGMAS = 30.0  # what is farther below the plane is no error of this kind
+_BARE_SIGMAS, _BARE_FACTOR = 8.0, 3.0  # height up to which a pixel is part of a bare plane: the larger of these, the
+# second in measured heights
+_BARE_SHARE = 0.7  # of the points near the plane, those that must lie on it for a place to count as bare
 _FEWEST = 100  # points on a plane from which a frame's own plane is found
 _STEPS = 6
 _PRESENT = 0.1  # share of the points of a cell with which something is there
@@ -671,15 +573,13 @@ class FramePlane:
         return self.plane.heights(points.p_world) / (self.noise * points.sigma_along(self.plane.normal))
 
 
-def plane_in_frame(
-    plane: Plane, points: FramePoints, pose_noise: float, region_radius: float, settings: SeparationSettings
-) -> FramePlane:
+def plane_in_frame(plane: Plane, points: FramePoints, pose_noise: float, region_radius: float) -> FramePlane:
     """The plane fitted to the points of one frame that are near it.
 
     `points` have the noise of their coordinates; that of poses makes heights `pose_noise` times as uncertain.
     """
     found, noise = plane, 1.0
-    width = settings.clear_sigmas * pose_noise
+    width = CLEAR_SIGMAS * pose_noise
     for _ in range(_STEPS):
         sigma = points.sigma_along(found.normal)
         z = found.heights(points.p_world) / sigma
@@ -689,17 +589,12 @@ def plane_in_frame(
         found = _corrected(found, plane, points.chosen(near), z[near], pose_noise, region_radius)
         z = found.heights(points.p_world) / sigma
         noise = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(z[np.abs(z) < width]))))
-        width = max(settings.search_sigmas * noise, width / 2)
+        width = max(SEARCH_SIGMAS * noise, width / 2)
     return FramePlane(found, noise)
 
 
 def _corrected(
-    found: Plane,
-    prior: Plane,
-    points: FramePoints,
-    z: Float[ndarray, "n"],
-    pose_noise: float,
-    radius: float,
+    found: Plane, prior: Plane, points: FramePoints, z: Float[ndarray, "n"], pose_noise: float, radius: float
 ) -> Plane:
     """One step of robust least squares for height and slopes, with the common plane as prior."""
     axes = prior.axes()
@@ -735,9 +630,7 @@ class BarePlaces:
         return bare[place.reshape(-1)]
 
 
-def find_bare_places(
-    plane: Plane, frames: Sequence[tuple[FramePoints, FramePlane]], size: float, settings: SeparationSettings
-) -> BarePlaces:
+def find_bare_places(plane: Plane, frames: Sequence[tuple[FramePoints, FramePlane]], size: float) -> BarePlaces:
     """Cells where nearly all points near the plane are part of it, in all frames together.
 
     First with the points' own noise. Where something rises from the plane, what seems to be below it is error, and says
@@ -745,15 +638,15 @@ def find_bare_places(
     """
     p = np.concatenate([points.p_world for points, _ in frames])
     z = np.concatenate([own.in_sigmas(points) for points, own in frames])
-    first = _bare(plane, p, z, size, settings.plane_sigmas, settings)
-    near = np.abs(z) < settings.most_sigmas
-    errors = -z[near][_beside_what_rises(plane, p[near], z[near], size, settings) & (z[near] < 0) & ~first.at(p[near])]
-    measured = float(np.quantile(errors, settings.error_share)) if len(errors) >= _FEWEST else 0.0
-    return _bare(plane, p, z, size, max(settings.plane_sigmas, measured), settings)
+    first = _bare(plane, p, z, size, _PLANE_SIGMAS)
+    near = np.abs(z) < _MOST_SIGMAS
+    errors = -z[near][_beside_what_rises(plane, p[near], z[near], size) & (z[near] < 0) & ~first.at(p[near])]
+    measured = float(np.quantile(errors, _ERROR_SHARE)) if len(errors) >= _FEWEST else 0.0
+    return _bare(plane, p, z, size, max(_PLANE_SIGMAS, measured))
 
 
 def _beside_what_rises(
-    plane: Plane, p_world: Float[ndarray, "n 3"], z: Float[ndarray, "n"], size: float, settings: SeparationSettings
+    plane: Plane, p_world: Float[ndarray, "n 3"], z: Float[ndarray, "n"], size: float
 ) -> Bool[ndarray, "n"]:
     """Points in cells that hold parts of the plane, and of what rises from it.
 
@@ -762,27 +655,22 @@ def _beside_what_rises(
     _, place = np.unique(_cells(plane, p_world, size), axis=0, return_inverse=True)
     place = place.reshape(-1)
     count = np.bincount(place)
-    rising = np.bincount(place, (z > settings.plane_sigmas).astype(float)) > _PRESENT * count
-    flat = np.bincount(place, (np.abs(z) < settings.plane_sigmas).astype(float)) > _PRESENT * count
+    rising = np.bincount(place, (z > _PLANE_SIGMAS).astype(float)) > _PRESENT * count
+    flat = np.bincount(place, (np.abs(z) < _PLANE_SIGMAS).astype(float)) > _PRESENT * count
     return (rising & flat)[place]
 
 
 def _bare(
-    plane: Plane,
-    p_world: Float[ndarray, "n 3"],
-    z: Float[ndarray, "n"],
-    size: float,
-    height: float,
-    settings: SeparationSettings,
+    plane: Plane, p_world: Float[ndarray, "n 3"], z: Float[ndarray, "n"], size: float, height: float
 ) -> BarePlaces:
     """The cells in which nearly all points near the plane seem to be no higher than `height` (in sigmas)."""
-    bare = max(settings.bare_sigmas, settings.bare_factor * height)
+    bare = max(_BARE_SIGMAS, _BARE_FACTOR * height)
     near = np.abs(z) < 2 * bare
     cell, place = np.unique(_cells(plane, p_world[near], size), axis=0, return_inverse=True)
     place = place.reshape(-1)
     flat = (np.abs(z[near]) < height).astype(float)
     share = np.bincount(place, flat, len(cell)) / np.maximum(np.bincount(place, minlength=len(cell)), 1)
-    chosen = cell[share >= settings.bare_share]
+    chosen = cell[share >= _BARE_SHARE]
     return BarePlaces(plane, size, frozenset((a, b) for a, b in chosen.tolist()), height, bare)
 
 

@@ -1,11 +1,11 @@
 """The object of a scan apart from its surroundings.
 
-Planes are found in the points of all frames, and each is judged (`plane_judgement`). What is part of a plane of the
+Planes are found in the points of all frames, and each is judged (`planes`). What is part of a plane of the
 surroundings, or behind one, is left out; of the rest, the connected part on which the cameras look is the object.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import product
 
@@ -19,7 +19,6 @@ from scipy.spatial import Delaunay, KDTree
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.numerics import component_labels, geman_mcclure_weight
 from sl_nerfstudio.object_separation.planes import (
-    SEPARATION_DEFAULTS,
     BarePlaces,
     DecodedFrame,
     FramePlane,
@@ -27,7 +26,6 @@ from sl_nerfstudio.object_separation.planes import (
     Plane,
     PlaneFinding,
     PointPool,
-    SeparationSettings,
     ViewedRegion,
     cross_frame_noise,
     find_bare_places,
@@ -40,7 +38,10 @@ from sl_nerfstudio.object_separation.planes import (
     viewed_region,
 )
 
-# The outline of the object in a frame, from the points of all frames.
+PIXELS_PER_FRAME = 40_000  # decoded pixels of each frame that the search looks at, at most
+_POINTS = 30_000  # of all frames together from which planes are found, at most
+_SILHOUETTE_POINTS = 200_000  # points of the object that show which pixels that were not decoded belong to it, at most
+_LEAST_OBJECT = 0.01  # share of the points that the object must hold; with less, nothing is left out
 
 
 def silhouette(frame: DecodedFrame, p_object: Float[ndarray, "n 3"], gap: float) -> Bool[ndarray, "h w"]:
@@ -62,6 +63,10 @@ def silhouette(frame: DecodedFrame, p_object: Float[ndarray, "n 3"], gap: float)
 
 # Connected parts of a point cloud in voxels, and which of them are the object.
 
+_VOXELS = 40  # along the radius of the viewed region
+_LEAST_FRAMES, _LEAST_POINTS = 2, 4  # frames that must have seen a voxel, or points in it, for it to count
+_LEAST_VOXELS = 5  # of the smallest part that is kept beside the main part
+_GAP = 0.15  # distance from the main part within which other parts are kept, as a share of its size
 _REACH = 2  # voxels: how far apart connected ones may be
 _TOUCHES = 3.0  # voxels: what comes so near to a plane stands on it
 _WITHIN = 0.5  # share of a part that must lie in the main part's outline in the plane
@@ -83,11 +88,7 @@ class ObjectVoxels:
 
 
 def find_object(
-    frames: Sequence[Float[ndarray, "_n 3"]],
-    planes: Sequence[Plane],
-    region: ViewedRegion,
-    size: float,
-    settings: SeparationSettings,
+    frames: Sequence[Float[ndarray, "_n 3"]], planes: Sequence[Plane], region: ViewedRegion, size: float
 ) -> ObjectVoxels:
     """The part on which most cameras look, and what belongs to it.
 
@@ -95,20 +96,18 @@ def find_object(
     main one, because what is between them was not decoded, belongs to it if the gap is short, and if it floats or is
     below or above the main one; what stands on a plane beside it does not.
     """
-    voxels = _occupied(frames, size, settings)
+    voxels = _occupied(frames, size)
     centres = (voxels + 0.5) * size
     if not len(voxels):
         return ObjectVoxels(size, centres)
     count, label = _connected(voxels)
     distance = np.linalg.norm(centres - region.focus, axis=1) / region.radius
     main = int(np.argmax(np.bincount(label, geman_mcclure_weight(distance**2), count)))
-    kept = _near_main(centres, label, main, _candidates(centres, label, main, planes, size, settings), settings)
+    kept = _near_main(centres, label, main, _candidates(centres, label, main, planes, size))
     return ObjectVoxels(size, centres[kept[label]])
 
 
-def _occupied(
-    frames: Sequence[Float[ndarray, "_n 3"]], size: float, settings: SeparationSettings
-) -> Int64[ndarray, "v 3"]:
+def _occupied(frames: Sequence[Float[ndarray, "_n 3"]], size: float) -> Int64[ndarray, "v 3"]:
     """Voxels that several frames saw, or one saw clearly."""
     each = [np.unique(np.floor(p / size).astype(np.int64), axis=0, return_counts=True) for p in frames if len(p)]
     if not each:
@@ -117,7 +116,7 @@ def _occupied(
     place = place.reshape(-1)
     seen_by = np.bincount(place, minlength=len(voxel))
     points = np.bincount(place, np.concatenate([n for _, n in each]), len(voxel))
-    return voxel[(seen_by >= settings.least_frames) | (points >= settings.least_points)]
+    return voxel[(seen_by >= _LEAST_FRAMES) | (points >= _LEAST_POINTS)]
 
 
 def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]:
@@ -144,17 +143,12 @@ def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]
 
 
 def _candidates(
-    centres: Float[ndarray, "v 3"],
-    label: Int64[ndarray, "v"],
-    main: int,
-    planes: Sequence[Plane],
-    size: float,
-    settings: SeparationSettings,
+    centres: Float[ndarray, "v 3"], label: Int64[ndarray, "v"], main: int, planes: Sequence[Plane], size: float
 ) -> Bool[ndarray, "parts"]:
     """Parts that are large enough, and do not stand on a plane beside the main part."""
     count = int(label.max(initial=-1)) + 1
     members = np.bincount(label, minlength=count)
-    fits = members >= settings.least_voxels
+    fits = members >= _LEAST_VOXELS
     for plane in planes:
         touching = np.bincount(label, plane.heights(centres) < _TOUCHES * size, count) > 0
         flat = (centres - centres[label == main].mean(0)) @ plane.axes().T
@@ -170,15 +164,11 @@ def _has_area(flat: Float[ndarray, "v 2"], size: float) -> bool:
 
 
 def _near_main(
-    centres: Float[ndarray, "v 3"],
-    label: Int64[ndarray, "v"],
-    main: int,
-    candidates: Bool[ndarray, "parts"],
-    settings: SeparationSettings,
+    centres: Float[ndarray, "v 3"], label: Int64[ndarray, "v"], main: int, candidates: Bool[ndarray, "parts"]
 ) -> Bool[ndarray, "parts"]:
     """The main part, and candidates that a short gap separates from it or from such a part."""
     body = centres[label == main]
-    limit = settings.gap * float(np.linalg.norm(np.percentile(body, 98, axis=0) - np.percentile(body, 2, axis=0)))
+    limit = _GAP * float(np.linalg.norm(np.percentile(body, 98, axis=0) - np.percentile(body, 2, axis=0)))
     kept = np.zeros(len(candidates), dtype=bool)
     kept[main] = True
     while True:
@@ -255,35 +245,32 @@ class Separation:
         return label
 
 
-def separate(
-    frames: Sequence[DecodedFrame], seed: int = 0, settings: SeparationSettings = SEPARATION_DEFAULTS
-) -> Separation:
+def separate(frames: Sequence[DecodedFrame], seed: int = 0) -> Separation:
     """Find the object. The same frames and seed give the same result.
 
     If hardly anything would be left, no plane counts as surroundings.
     """
     rng = np.random.default_rng(seed)
-    thin = [frame.thinned(settings.pixels_per_frame) for frame in frames]
+    thin = [frame.thinned(PIXELS_PER_FRAME) for frame in frames]
     points = [points_of(frame) for frame in thin]
-    few = [p.chosen(_spread(len(p), settings.points // len(points), rng)) for p in points]
-    normals = [normals_of(p, settings.neighbours) for p in few]
+    few = [p.chosen(_spread(len(p), _POINTS // len(points), rng)) for p in points]
+    normals = [normals_of(p) for p in few]
     pose_noise = cross_frame_noise(few, normals)
-    pool = PointPool.of([p.scaled_noise(pose_noise) for p in few], normals)
+    pool = PointPool.of([replace(p, sigma=p.sigma * pose_noise) for p in few], normals)
     region = viewed_region(thin, pool.points.p_world)
-    size = _voxel_size(points, region, settings)
+    size = _voxel_size(points, region)
     findings = tuple(
-        judge_plane(plane, share, pool, thin, points, region, settings)
-        for plane, share in find_planes(pool, region.radius, rng, settings)
+        judge_plane(plane, share, pool, thin, points, region) for plane, share in find_planes(pool, region.radius, rng)
     )
-    outside = [_surroundings(f, points, pose_noise, region, size, settings) for f in findings if f.is_surroundings]
+    outside = [_surroundings(f, points, pose_noise, region, size) for f in findings if f.is_surroundings]
     rest = [_without(outside, k, p) for k, p in enumerate(points)]
-    voxels = find_object(rest, [s.finding.plane for s in outside], region, size, settings)
+    voxels = find_object(rest, [s.finding.plane for s in outside], region, size)
     held = sum(int(voxels.contain(p).sum()) for p in rest)
-    if held < settings.least_object * sum(map(len, points)):
+    if held < _LEAST_OBJECT * sum(map(len, points)):
         outside, rest = [], [p.p_world for p in points]
-        voxels = find_object(rest, [], region, size, settings)
+        voxels = find_object(rest, [], region, size)
     p_object = np.concatenate([p[voxels.contain(p)] for p in rest])
-    p_object = p_object[_spread(len(p_object), settings.silhouette_points, rng)]
+    p_object = p_object[_spread(len(p_object), _SILHOUETTE_POINTS, rng)]
     return Separation(region, findings, tuple(outside), voxels, p_object)
 
 
@@ -292,24 +279,19 @@ def _spread(count: int, most: int, rng: np.random.Generator) -> ndarray:
     return np.arange(count) if count <= most else np.sort(rng.choice(count, most, replace=False))
 
 
-def _voxel_size(points: Sequence[FramePoints], region: ViewedRegion, settings: SeparationSettings) -> float:
+def _voxel_size(points: Sequence[FramePoints], region: ViewedRegion) -> float:
     """Small beside the viewed region, but with several points of a frame on a surface through it."""
     inside = [int(region.contains(p.p_world).sum()) for p in points]
     spacing = region.radius * float(np.sqrt(np.pi / max(np.median(inside), 1.0)))
-    return max(region.radius / settings.voxels, 3 * spacing)
+    return max(region.radius / _VOXELS, 3 * spacing)
 
 
 def _surroundings(
-    finding: PlaneFinding,
-    points: Sequence[FramePoints],
-    pose_noise: float,
-    region: ViewedRegion,
-    size: float,
-    settings: SeparationSettings,
+    finding: PlaneFinding, points: Sequence[FramePoints], pose_noise: float, region: ViewedRegion, size: float
 ) -> Surroundings:
     plane = finding.plane
-    own = tuple(plane_in_frame(plane, p, pose_noise, region.radius, settings) for p in points)
-    bare = find_bare_places(plane, list(zip(points, own, strict=True)), size / 2, settings)
+    own = tuple(plane_in_frame(plane, p, pose_noise, region.radius) for p in points)
+    bare = find_bare_places(plane, list(zip(points, own, strict=True)), size / 2)
     heights = [
         f.noise * float(np.median(p.sigma_along(plane.normal))) for f, p in zip(own, points, strict=True) if len(p)
     ]

@@ -31,7 +31,13 @@ from sl_nerfstudio.registration.result import (
     without_frames,
 )
 from sl_nerfstudio.registration.surfaces import FrameCloud
-from sl_nerfstudio.review.agreement import CrossFrameAgreement, VerdictSettings, agreeing_groups, compare_frames
+from sl_nerfstudio.review.agreement import (
+    GOOD_EXCESS,
+    GOOD_SHARE,
+    CrossFrameAgreement,
+    agreeing_groups,
+    compare_frames,
+)
 
 _ROUNDS = 4
 _MOVES = 3  # times that frames are tried at other places
@@ -182,22 +188,19 @@ def _with_agreeing(
     return _adjusted(clouds, without_groups(more, [[k] for k in doubtful]), settings) if doubtful else with_more
 
 
-def registered_only(
-    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None = None
-) -> ConsistentFrames:
+def registered_only(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
     """All registered frames where registration put them; they are compared within the uncertainty of that.
 
     Raises UserError if fewer than two frames are registered.
     """
-    kept = keep_registered(clouds, registration, settings)
+    kept = keep_registered(clouds, registration)
     return ConsistentFrames(registration, kept, _compared(clouds, registration, kept, exact=False))
 
 
 def _agrees_well(found: _Group, k: int) -> bool:
     """Whether a frame agrees with the others as well as frames of a good scan do."""
-    limits = VerdictSettings()
     frame = found.cross.frames[int(found.registration.registered[:k].sum())]
-    return frame.excess <= limits.good_excess and frame.share >= limits.good_share
+    return frame.excess <= GOOD_EXCESS and frame.share >= GOOD_SHARE
 
 
 @one_library_thread()

@@ -42,7 +42,8 @@ from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.processing.video import VideoChoice, is_video, video_frames
 from sl_nerfstudio.registration.result import KnownLength, is_index, parse_known_length
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
-from sl_nerfstudio.relative_pose.intrinsics import CameraEstimate, FrameOfCamera, estimate_camera
+from sl_nerfstudio.relative_pose.intrinsics import CameraEstimate, estimate_camera
+from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from sl_nerfstudio.scan.document import Faults, Fields, FileError, document_faults, frame_label, read_document
 from sl_nerfstudio.scan.images import refuse_mosaic
 from sl_nerfstudio.scan.read import POSES, read_pose
@@ -142,14 +143,12 @@ def refine_camera(
     """
     refined, again, found = job, list(results), None
     for _ in range(_ROUNDS):
-        frames = [
-            FrameOfCamera(*correspondences_of(cloud.coords), (T[:3, :3], T[:3, 3]))
-            for cloud in clouds_of(again)
-            for T in (cloud.pose.T_camera_projector,)
-        ]
+        own = clouds_of(again)
+        frames = [FrameMatches(cloud.name, *correspondences_of(cloud.coords), refined.camera) for cloud in own]
+        poses = [(cloud.pose.T_camera_projector[:3, :3], cloud.pose.T_camera_projector[:3, 3]) for cloud in own]
         if not frames:
             break
-        found = estimate_camera(frames, job.camera, job.projector, start.sigma, job.seed, refined.camera)
+        found = estimate_camera(frames, poses, job.camera, job.projector, start.sigma, job.seed)
         refined = replace(job, camera=found.camera)
         worker, clouds = FrameWorker(refined), LargeClouds()
         again = [

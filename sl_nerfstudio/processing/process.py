@@ -245,7 +245,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
 
     settings = adjustment_settings(config.rig, found)
     if config.no_adjust:
-        consistent = registered_only(clouds, registration, settings)
+        consistent = registered_only(clouds, registration)
     else:
         consistent = store.kept(
             "adjustment",

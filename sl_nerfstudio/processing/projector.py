@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    DEPENDENCE,
     AdjustedFrames,
     ProjectorKnowledge,
     RegisteredFramesSettings,
@@ -52,18 +53,8 @@ from sl_nerfstudio.relative_pose.estimation import (
     relative_pose_near,
 )
 from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEvidence, Role, check_intrinsics
-from sl_nerfstudio.relative_pose.unknown_projector import (
-    CX,
-    CY,
-    K1,
-    LOG_ASPECT,
-    LOG_FOCAL,
-    Cause,
-    FrameMatches,
-    NoProjector,
-    ProjectorEstimate,
-    estimate_projector,
-)
+from sl_nerfstudio.relative_pose.joint_fit import CX, CY, K1, LOG_ASPECT, LOG_FOCAL, FrameMatches
+from sl_nerfstudio.relative_pose.unknown_projector import Cause, NoProjector, ProjectorEstimate, estimate_projector
 
 # Sentences on a projector that was, or could not be, found.
 
@@ -292,7 +283,7 @@ def find_projector(job: FrameJob, results: Sequence[FrameStageResult], stated: b
 
 
 def sigma_of_fields(device: Device, C: Float64[ndarray, "5 5"]) -> tuple[float, float, float, float, float]:
-    """1 sigma of fl_x, fl_y, cx, cy, k1, from the covariance of `parameters.NAMES`."""
+    """1 sigma of fl_x, fl_y, cx, cy, k1, from the covariance of `joint_fit.NAMES`."""
     log_fl_y = C[LOG_FOCAL, LOG_FOCAL] + 2 * C[LOG_FOCAL, LOG_ASPECT] + C[LOG_ASPECT, LOG_ASPECT]
     s = np.sqrt([C[LOG_FOCAL, LOG_FOCAL], max(log_fl_y, 0.0), C[CX, CX], C[CY, CY], C[K1, K1]])
     unit = np.array([device.fl_x, device.fl_y, device.w, device.w, 1.0])
@@ -364,7 +355,7 @@ def refine_projector(
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:
             break
-        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma, settings)
+        clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma)
     return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance))
 
 
@@ -374,11 +365,9 @@ def _chi_square(calibration: SelfCalibration) -> float:
     return float(step @ torch.linalg.solve(uncertainty, step))
 
 
-def _covariance(
-    calibration: SelfCalibration, camera_sigma: Shares, settings: RegisteredFramesSettings
-) -> Float[Tensor, "3 3"]:
+def _covariance(calibration: SelfCalibration, camera_sigma: Shares) -> Float[Tensor, "3 3"]:
     """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
-    return settings.dependence**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
+    return DEPENDENCE**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
 
 
 def _with_sigma(found: FoundProjector, projector: Device, covariance: Float[Tensor, "3 3"] | None) -> FoundProjector:

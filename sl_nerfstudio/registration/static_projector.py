@@ -20,15 +20,14 @@ from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
-from sl_nerfstudio.relative_pose.unknown_projector import (
+from sl_nerfstudio.relative_pose.joint_fit import (
     CX,
     CY,
     K1,
     LOG_ASPECT,
     LOG_FOCAL,
-    IntrinsicsPrior,
+    PRIOR_SIGMA,
     device_with,
-    prior_sigma,
     values_of,
 )
 
@@ -517,7 +516,7 @@ class _Adjustment:
     @property
     def sigma(self) -> Float64[ndarray, "free"]:
         """Standard deviations of the prior."""
-        return prior_sigma(IntrinsicsPrior())[list(self.free)]
+        return PRIOR_SIGMA[list(self.free)]
 
     def departure(self, scene: StaticScene) -> Float64[ndarray, "free"]:
         """Free intrinsics less their means."""

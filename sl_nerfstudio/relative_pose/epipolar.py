@@ -1,251 +1,52 @@
-"""Robust non-linear fit of a projector's pose relative to its camera, with its covariance.
+"""The epipolar geometry of one frame: rays of matched pixels, Sampson's residual, and the fit of the relative pose.
 
-The length of the baseline is one. Residuals and unknowns are those of `sampson`.
+The residual is the distance, to first order, of a decoded coordinate from the epipolar curve of its camera pixel, in
+projector pixels (Sampson 1982; Hartley and Zisserman, Multiple View Geometry, 11.4.3). Only the projector's side has an
+error, because camera pixels are exact centres. It is computed from rays alone and therefore holds for pinhole,
+distorted and diffractive projectors. One frame does not show the length of its baseline, which is set to one.
+
+Five unknowns (w, b): `R <- exp(w) R` rotates the projector about its own centre, in camera axes, and
+`t <- exp(B b) t` rotates the unit baseline, where B = `direction_basis(t)` spans the plane perpendicular to it.
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
+from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled
 
-# Settings of relative pose estimation.
+BLOCKS_ALONG = 25  # squares along the pattern's longer side; errors within one may depend on each other
+BLOCK_NUMBERS = (5 * BLOCKS_ALONG) ** 2  # all numbers that `blocks_of` gives are below this
+MOST_PIXELS = 600_000  # of larger images every second, third, .. row and column is used
+NOISE_FLOOR_PX = 1e-3  # noise that is assumed at least, projector pixels
+KERNEL_SIGMAS = 3.0  # width of the robust kernel, standard deviations of the residuals
+
+UnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
 
 
-@dataclass(frozen=True)
-class SeparationSettings:
-    """How far two relative poses must differ to count as two solutions: in rotation or in direction."""
-
-    rotation_rad: float
-    """angle between the rotations, radian (to first order)"""
-    direction: float
-    """distance between the unit baselines"""
-
-
-@dataclass(frozen=True)
-class FivePointSettings:
-    """Random minimal samples, and the choice of the best solutions."""
-
-    samples: int = 100
-    """samples of five correspondences; with a third of them wrong, no sample is good with probability 1e-6"""
-    scoring_rays: int = 300
-    """correspondences on which the solutions of all samples are scored"""
-    outlier_px: float = 4.0
-    """residual, in projector pixels, beyond which a correspondence counts as wrong in the score"""
-    least_cosine: float = 1e-3
-    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
-    starts: int = 8
-    """number of solutions that are kept"""
-    separation: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.05, 0.1))
-    """by how much they differ from each other"""
-
-
-@dataclass(frozen=True)
-class PlaneSettings:
-    """The plane that holds most correspondences, and its two reconstructions."""
-
-    fewest: int = 20
-    """correspondences with which a plane is looked for"""
-    outlier_px: float = 4.0
-    """distance from the plane's image, in projector pixels, within which a correspondence lies in the plane"""
-    least_cosine: float = 1e-3
-    """cosine between ray and optical axis below which a ray cannot be written as an image point"""
-    least_translation: float = 1e-6
-    """translation, in distances of the plane, below which two devices differ by a rotation alone"""
-
-
-@dataclass(frozen=True)
-class CandidateSettings:
-    """Refinement and ranking of the first solutions."""
-
-    polishing_rays: int = 800
-    """correspondences with which solutions are refined before they are compared"""
-    polishing_iterations: int = 12
-    """iterations of that refinement"""
-    ranking_rays: int = 4000
-    """correspondences by which the refined solutions are compared"""
-    inlier_sigmas: float = 3.0
-    """standard deviations of the noise within which a correspondence votes on which side the surface lies"""
-    least_in_front: float = 0.5
-    """share of these that must lie in front of both devices"""
-    separation: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.02, 0.05))
-    """by how much the refined solutions differ from each other"""
-    rival_share: float = 0.03
-    """share of the correspondences that a solution may explain less than the best one and still be a rival"""
-    rival_errors: float = 3.0
-    """standard errors of the difference within which a solution is a rival"""
-    most: int = 3
-    """solutions of a frame, the best one included, at most"""
-
-
-@dataclass(frozen=True)
-class EpipolarFitSettings:
-    """Levenberg-Marquardt on the distances from the epipolar curves."""
-
-    noise_floor_px: float = 1e-3
-    """noise that is assumed at least, in projector pixels"""
-    kernel_sigmas: float = 3.0
-    """width of the robust kernel, in standard deviations of the residuals"""
-    iterations: int = 30
-    """iterations at most"""
-    converged_rad: float = 1e-10
-    """size of a step, in radian, below which the fit has converged"""
-    damping: float = 1e-4
-    """damping of the first step, relative to the diagonal of the normal equations"""
-    damping_factor: float = 10.0
-    """factor by which the damping falls after a good step and rises after a bad one"""
-    least_damping: float = 1e-12
-    """below this the damping does not fall"""
-    tries: int = 8
-    """dampings that are tried before the fit ends"""
-
-
-@dataclass(frozen=True)
-class PatternBlocks:
-    """Squares of the pattern within which decoding errors may depend on each other."""
-
-    along_longer_side: int = 25
-    """squares along the longer side of the pattern: with 50 grid lines, two periods each"""
-
-
-@dataclass(frozen=True)
-class LatticeSettings:
-    """Which pixels of large images the pose is found from, and where points are."""
-
-    most_pixels: int = 600_000
-    """pixels of an image of which every one is used; of larger ones, every second, third, .. row and column"""
-    rows: int = 64
-    """rows whose other pixels are compared with the pose at a time, which bounds the memory"""
-
-
-@dataclass(frozen=True)
-class DegeneracyLimits:
-    """When a frame's correspondences count as degenerate."""
-
-    least_points: int = 200
-    """correspondences that agree with the pose, at least"""
-    least_block_share: float = 30 / 625
-    """share of the squares of the pattern that must hold points, so that their errors can be judged"""
-    least_relief_sigmas: float = 6.0
-    """standard deviations of the noise by which points must depart from a plane, and from a pure rotation"""
-    least_parallax_deg: float = 2.0
-    """angle between camera ray and projector ray, in degrees, below which depth hangs on tiny errors"""
-    largest_outlier_share: float = 0.3
-    """share of the correspondences that may disagree with the pose"""
-    largest_noise_px: float = 2.0
-    """noise of the residuals, in projector pixels"""
-    largest_sigma_rotation_deg: float = 0.5
-    """standard deviation of the rotation, in degrees"""
-    largest_sigma_direction_deg: float = 1.5
-    """standard deviation of the direction of the baseline, in degrees"""
-    relief_iterations: int = 10
-    """iterations of the robust fits of a plane and of a pure rotation"""
-    relief_kernel_medians: float = 3.0
-    """width of their kernel, in medians of the residuals"""
-    relief_share: float = 0.9
-    """share of the smallest residuals that the relief is measured on: wrong coordinates are among the others"""
-    epipole_sectors: int = 8
-    """sectors around the baseline that must all hold rays for an epipole to be in view"""
-
-
-@dataclass(frozen=True)
-class RelativePoseSettings:
-    """All settings of the relative pose of one frame."""
-
-    fewest: int = 20
-    """correspondences: enough for five unknowns and a judgement of the result"""
-    most: int = 20000
-    """correspondences in the fit at most; neighbouring pixels add nothing new"""
-    inlier_sigmas: float = 4.0
-    """standard deviations of the noise within which a correspondence agrees with the pose"""
-    least_inlier_share: float = 0.3
-    """share of the correspondences that must agree with the pose"""
-    largest_noise_share: float = 0.02
-    """noise beyond which nothing fits, as a share of the pattern's width"""
-    fewest_in_block: int = 20
-    """correspondences in a square of the pattern from which its own noise is measured"""
-    largest_local_noise: float = 3.0
-    """noise in a square of the pattern at most, relative to that of the whole frame"""
-    solutions: SeparationSettings = field(default_factory=lambda: SeparationSettings(0.0354, 0.1))
-    """by how much two solutions of a frame differ: by more than unfinished refinements do"""
-    blocks: PatternBlocks = field(default_factory=PatternBlocks)
-    """squares of the pattern"""
-    lattice: LatticeSettings = field(default_factory=LatticeSettings)
-    """pixels of large images"""
-    five_point: FivePointSettings = field(default_factory=FivePointSettings)
-    """first solutions from random samples"""
-    plane: PlaneSettings = field(default_factory=PlaneSettings)
-    """first solutions from the dominant plane"""
-    candidates: CandidateSettings = field(default_factory=CandidateSettings)
-    """their refinement and ranking"""
-    fit: EpipolarFitSettings = field(default_factory=EpipolarFitSettings)
-    """the fit of the best one"""
-    degeneracy: DegeneracyLimits = field(default_factory=DegeneracyLimits)
-    """when a frame is degenerate"""
-
-
-RELATIVE_POSE_DEFAULTS = RelativePoseSettings()
-
-
-@dataclass(frozen=True)
-class CameraEstimateSettings:
-    """Refinement of a camera whose focal length is only roughly known."""
-
-    most: int = 3000
-    """correspondences of each frame"""
-    iterations: int = 12
-    """Gauss-Newton steps, at most"""
-    largest_step: float = 0.05
-    """change of any unknown in one step"""
-    difference_step: float = 1e-5
-    """the same for derivatives"""
-    converged: float = 1e-8
-    """step below which the search ends"""
-    sigma_centre: float = 0.01
-    """how far principal points are from the middle, as a share of the image's longer side"""
-    sigma_k1: float = 0.03
-    """first term of the distortion of a usual lens"""
-    kernel_sigmas: float = 3.0
-    """width of the robust kernel, in standard deviations of the residuals"""
-
-
-CAMERA_ESTIMATE_DEFAULTS = CameraEstimateSettings()
-
-# Squares of the pattern: decoding errors of neighbouring pixels depend on each other, those of two squares do not.
-
-
-def blocks_of(uv_projector: Float[ndarray, "n 2"], projector: Device, settings: PatternBlocks) -> Int64[ndarray, "n"]:
-    """Number of the square in which each coordinate lies; the same number, the same square."""
-    n = settings.along_longer_side
-    side_px = max(projector.w, projector.h) / n
+def blocks_of(uv_projector: Float[ndarray, "n 2"], projector: Device) -> Int64[ndarray, "n"]:
+    """Number of the square of the pattern in which each coordinate lies."""
+    side_px = max(projector.w, projector.h) / BLOCKS_ALONG
     # Coordinates outside the pattern have squares too, out to four times its longer side.
-    column, row = np.floor(uv_projector / side_px).astype(np.int64).clip(-1, 4 * n).T
-    return (row + 1) * (5 * n) + column + 1
+    column, row = np.floor(uv_projector / side_px).astype(np.int64).clip(-1, 4 * BLOCKS_ALONG).T
+    return (row + 1) * (5 * BLOCKS_ALONG) + column + 1
 
 
-def block_numbers(settings: PatternBlocks) -> int:
-    """All numbers that `blocks_of` gives are below this."""
-    return (5 * settings.along_longer_side) ** 2
-
-
-def block_count(projector: Device, settings: PatternBlocks) -> int:
+def block_count(projector: Device) -> int:
     """Number of squares of the whole pattern, with those that its border cuts."""
-    n, (shorter, longer) = settings.along_longer_side, sorted((projector.w, projector.h))
-    return n * -(-n * shorter // longer)
-
-
-# Correspondences of one frame as pairs of rays, with what is needed to measure errors in projector pixels.
+    shorter, longer = sorted((projector.w, projector.h))
+    return BLOCKS_ALONG * -(-BLOCKS_ALONG * shorter // longer)
 
 
 @dataclass(frozen=True)
 class RayPairs:
-    """Unit rays in each device's own axes."""
+    """Correspondences of one frame as unit rays, each in its device's axes."""
 
     d_camera: Float64[ndarray, "n 3"]
     d_projector: Float64[ndarray, "n 3"]
@@ -269,8 +70,8 @@ class RayPairs:
 
 
 def lattice_step(h: int, w: int) -> int:
-    """Of large images every second, third, .. row and column is enough: neighbouring coordinates err together."""
-    return max(1, math.ceil(math.sqrt(h * w / RELATIVE_POSE_DEFAULTS.lattice.most_pixels)))
+    """Step between the rows and columns that are used: in large images, neighbouring coordinates err together."""
+    return max(1, math.ceil(math.sqrt(h * w / MOST_PIXELS)))
 
 
 def correspondences_of(
@@ -288,7 +89,6 @@ def ray_pairs(
     uv_projector: Float[ndarray, "n 2"],
     camera: Device,
     projector: Device,
-    blocks: PatternBlocks = RELATIVE_POSE_DEFAULTS.blocks,
 ) -> tuple[RayPairs, Int64[ndarray, "m"]]:
     """Rays of correspondences, and the indices of those that have a ray in both devices.
 
@@ -296,7 +96,7 @@ def ray_pairs(
     """
     d_camera, (d_projector, by_uv) = directions(camera, uv_camera), directions_by_uv(projector, uv_projector)
     usable = np.flatnonzero(np.isfinite(d_camera).all(-1) & np.isfinite(d_projector).all(-1))
-    block = blocks_of(uv_projector[usable], projector, blocks)
+    block = blocks_of(uv_projector[usable], projector)
     return RayPairs(d_camera[usable], d_projector[usable], by_uv[usable], block), usable
 
 
@@ -342,18 +142,6 @@ def _by_uv(code, parameters, d, by_uv):
         by_uv[i, 0, 1], by_uv[i, 1, 1], by_uv[i, 2, 1] = b * ux + c * vx, b * uy + c * vy, b * uz + c * vz
 
 
-# Sampson's residual of a relative pose, and increments of the pose.
-#
-# The residual is the distance, to first order, of a decoded coordinate from the epipolar curve of its camera pixel,
-# in
-# projector pixels. Only the projector's side has an error, because camera pixels are exact centres. It is computed
-# from
-# rays alone and therefore holds for pinhole, distorted and diffractive projectors.
-#
-# Five unknowns (w, b): `R <- exp(w) R` rotates the projector about its own centre, in camera axes, and
-# `t <- exp(B b) t` rotates the unit baseline, where B = `direction_basis(t)` spans the plane perpendicular to it.
-
-
 def direction_basis(t: Float64[ndarray, "3"]) -> Float64[ndarray, "3 2"]:
     """Two unit vectors perpendicular to `t` and to each other, the same ones for the same `t`."""
     B = np.empty((3, 2))
@@ -378,7 +166,7 @@ def sampson(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs
 def sampson_of_frames(
     R: Float64[ndarray, "frames 3 3"], t: Float64[ndarray, "frames 3"], rays: RayPairs, frame: Int64[ndarray, "n"]
 ) -> Float64[ndarray, "n"]:
-    """The same of rays in several frames, each with a pose of its own."""
+    """Residuals of rays in several frames, each of which has its own pose."""
     r = np.empty(len(rays))
     _residuals(np.ascontiguousarray(R), t, frame, rays.d_camera, rays.d_projector, rays.d_projector_by_uv, r)
     return r
@@ -497,74 +285,41 @@ class EpipolarFit:
     t: Float64[ndarray, "3"]  # unit direction from the camera to the projector, in camera axes
     residual: Float64[ndarray, "n"]  # projector pixels
     noise_px: float  # robust standard deviation of the residuals
-    cost: float  # robust sum of squared residuals over that of outliers alone: 0 perfect, 1 nothing fits
 
 
-def noise_of(residual: Float64[ndarray, "n"], floor_px: float = RELATIVE_POSE_DEFAULTS.fit.noise_floor_px) -> float:
+def noise_of(residual: Float64[ndarray, "n"]) -> float:
     """Robust standard deviation about zero."""
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), floor_px)
-
-
-def distinct(
-    a: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]],
-    b: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]],
-    separation: SeparationSettings,
-) -> bool:
-    """Whether two poses (R, t) are two solutions rather than one."""
-    rotation_rad = np.linalg.norm(a[0] - b[0]) / np.sqrt(2)  # for small angles
-    return bool(rotation_rad > separation.rotation_rad or np.linalg.norm(a[1] - b[1]) > separation.direction)
-
-
-def distinct_fits(fits: Iterable[EpipolarFit], separation: SeparationSettings) -> list[EpipolarFit]:
-    """Without those that are close to an earlier one: unfinished refinements may have the same end."""
-    kept: list[EpipolarFit] = []
-    for fit in fits:
-        if all(distinct((fit.R, fit.t), (other.R, other.t), separation) for other in kept):
-            kept.append(fit)
-    return kept
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), NOISE_FLOOR_PX)
 
 
 def fit_epipolar(
-    R: Float64[ndarray, "3 3"],
-    t: Float64[ndarray, "3"],
-    rays: RayPairs,
-    settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit,
+    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs, iterations: int = 30
 ) -> EpipolarFit:
     """Levenberg-Marquardt from a start that is right to within a few degrees.
 
     The kernel follows the noise as it falls, and never widens again (graduated non-convexity).
     """
-    damping, step_size = settings.damping, np.inf
     width = np.inf
-    for _ in range(settings.iterations):
-        r, J = sampson_jacobian(R, t, rays)
-        width = min(width, settings.kernel_sigmas * noise_of(r, settings.noise_floor_px))
-        w = geman_mcclure_weight((r / width) ** 2)
-        H, g = (J * w[:, None]).T @ J, J.T @ (w * r)
-        cost = _cost(r, width)
-        for _ in range(settings.tries):
-            step = -np.linalg.lstsq(H + damping * np.diag(np.diag(H)), g, rcond=1e-14)[0]
-            R_new, t_new = moved(R, t, step)
-            if _cost(sampson(R_new, t_new, rays), width) <= cost:
-                R, t, step_size = R_new, t_new, float(np.abs(step).max())
-                damping = max(damping / settings.damping_factor, settings.least_damping)
-                break
-            damping *= settings.damping_factor
-        else:
-            break
-        if step_size < settings.converged_rad:
-            break
+
+    def narrow(pose: UnitPose) -> None:
+        nonlocal width
+        width = min(width, KERNEL_SIGMAS * noise_of(sampson(*pose, rays)))
+
+    def equations(pose: UnitPose) -> NormalEquations:
+        r, J = sampson_jacobian(*pose, rays)
+        return NormalEquations.of(J, r, geman_mcclure_weight((r / width) ** 2))
+
+    def cost(pose: UnitPose) -> float:
+        return width**2 * float(geman_mcclure_cost((sampson(*pose, rays) / width) ** 2).sum()) / 2
+
+    R, t = minimise(
+        (R, t), equations, lambda pose, step: moved(*pose, step), cost, narrow=narrow, iterations=iterations
+    ).state
     r = sampson(R, t, rays)
-    return EpipolarFit(R, t, r, noise_of(r, settings.noise_floor_px), _cost(r, width) / (len(r) * width**2))
+    return EpipolarFit(R, t, r, noise_of(r))
 
 
-def _cost(r: Float64[ndarray, "n"], width: float) -> float:
-    return width**2 * float(geman_mcclure_cost((r / width) ** 2).sum())
-
-
-def covariance(
-    found: EpipolarFit, rays: RayPairs, settings: EpipolarFitSettings = RELATIVE_POSE_DEFAULTS.fit
-) -> Float64[ndarray, "5 5"]:
+def covariance(found: EpipolarFit, rays: RayPairs) -> Float64[ndarray, "5 5"]:
     """Covariance of (w, b), robust against errors that depend on each other (the cluster-robust sandwich estimator).
 
     Within a square of the pattern residuals may depend on each other in any way: their gradients are summed before
@@ -572,7 +327,7 @@ def covariance(
     lens parameters, cannot be seen in any frame alone and are not included.
     """
     r, J = sampson_jacobian(found.R, found.t, rays)
-    width = settings.kernel_sigmas * found.noise_px
+    width = KERNEL_SIGMAS * found.noise_px
     x = (r / width) ** 2
     w = geman_mcclure_weight(x)
     curvature = w - 4 * x / (1 + x) ** 3  # of the kernel: what a residual adds to the cost's second derivative
@@ -583,6 +338,6 @@ def covariance(
     blocks = len(gradients)
     meat = gradients.T @ gradients * (blocks / max(blocks - 5, 1))
     # Where everything fits exactly, the least noise is assumed.
-    meat = meat + settings.noise_floor_px**2 * (J.T @ J)
+    meat = meat + NOISE_FLOOR_PX**2 * (J.T @ J)
     inverse = np.linalg.pinv(bread, rcond=1e-14, hermitian=True)
     return inverse @ meat @ inverse

@@ -1,7 +1,6 @@
-"""Whether the epipolar geometry of all frames contradicts the stated intrinsics, and whose.
+"""Intrinsics judged by the epipolar geometry of all frames: a rough camera refined, stated devices contradicted.
 
-Focal length and principal point of the projector become free, with all relative poses; then those of the camera
-instead. A frame's own pose absorbs part of a wrong value; what several frames demand together, it cannot.
+A frame's own pose absorbs part of a wrong value; what several frames demand together, it cannot.
 """
 
 from collections.abc import Sequence
@@ -13,33 +12,41 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.numerics import geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import (
-    CAMERA_ESTIMATE_DEFAULTS,
-    CameraEstimateSettings,
+    KERNEL_SIGMAS,
     RayPairs,
+    UnitPose,
     direction_basis,
-    moved,
+    directions,
+    directions_by_uv,
     noise_of,
-    ray_pairs,
-    sampson,
-    sampson_jacobian,
-    subsample,
 )
-from sl_nerfstudio.relative_pose.unknown_projector import (
+from sl_nerfstudio.relative_pose.joint_fit import (
+    CX,
+    CY,
     FOCAL_AND_CENTRE,
-    UNKNOWN_PROJECTOR_DEFAULTS,
+    K1,
+    LOG_FOCAL,
+    MOST_PER_FRAME,
     FrameMatches,
     JointProblem,
     PointMatches,
-    Poses,
-    Prior,
-    UnitPose,
-    UnknownProjectorSettings,
-    prior_sigma,
+    device_with,
     values_of,
 )
+
+SIGMA_CENTRE = 0.01  # of principal points around the middle, share of the image's longer side
+SIGMA_K1 = 0.03  # first term of the distortion of a usual lens
+MOST_STEPS, LARGEST_STEP, CONVERGED = 12, 0.05, 1e-8  # Gauss-Newton steps of the camera, and their size
+MOST_CHECKED = 20_000  # correspondences of all frames with which stated intrinsics are tested
+CONTRADICTION = 30.0
+"""Chi square (three degrees of freedom) above which the frames contradict stated intrinsics: chance alone exceeds it
+once in a million, but the errors of squares and frames are not quite independent."""
+LEAST_CHANGE = 0.01
+"""Share of the focal length by which stated intrinsics must be wrong to be reported: real lenses and decoders err by up
+to 0.3 % in ways that no sigma of two frames includes."""
+EXPLAINED = 16.0  # chi square (one or two degrees of freedom) that may remain where a part explains it all
 
 # Depth along camera rays from one pose of the projector, and how it changes with that pose.
 
@@ -95,26 +102,9 @@ def _cross(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[nd
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
 
 
-# The camera's intrinsics from the coordinates of all frames, where its focal length is only roughly known.
-#
-# All frames share four unknowns: focal length, principal point, first term of the distortion. Each frame has five
-# more,
-# its relative pose, which are eliminated. What is known beforehand (what the camera itself stated, a principal
-# point near
-# the middle, a lens with little distortion) counts as a measurement with its own uncertainty.
+# A camera whose focal length is only roughly known.
 
-UNKNOWNS = ("log_focal", "centre_x", "centre_y", "k1")  # centres as shares of the image's longer side
-
-CameraUnitPose = tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3"]]  # R and unit t, projector to camera
-
-
-@dataclass(frozen=True)
-class FrameOfCamera:
-    """Correspondences of one frame that agree with its relative pose, as found with the rough focal length."""
-
-    uv_camera: Float64[ndarray, "n 2"]
-    uv_projector: Float64[ndarray, "n 2"]
-    pose: CameraUnitPose
+CAMERA_UNKNOWNS = (LOG_FOCAL, CX, CY, K1)
 
 
 @dataclass(frozen=True)
@@ -122,7 +112,7 @@ class CameraEstimate:
     """The camera, and the covariance of its unknowns; it allows for errors shared within squares of the pattern."""
 
     camera: Device
-    covariance: Float64[ndarray, "4 4"]  # of UNKNOWNS
+    covariance: Float64[ndarray, "4 4"]  # of CAMERA_UNKNOWNS
 
     @property
     def sigma_focal_px(self) -> float:
@@ -132,7 +122,7 @@ class CameraEstimate:
     @property
     def sigma_centre_px(self) -> tuple[float, float]:
         """1 sigma of the principal point."""
-        x, y = (max(self.camera.w, self.camera.h) * float(np.sqrt(self.covariance[k, k])) for k in (1, 2))
+        x, y = (self.camera.w * float(np.sqrt(self.covariance[k, k])) for k in (1, 2))
         return x, y
 
     @property
@@ -142,106 +132,49 @@ class CameraEstimate:
 
 
 def estimate_camera(
-    frames: Sequence[FrameOfCamera],
+    frames: Sequence[FrameMatches],
+    poses: Sequence[UnitPose],
     camera: Device,
     projector: Device,
     sigma: float,
     seed: int = 0,
-    current: Device | None = None,
-    settings: CameraEstimateSettings = CAMERA_ESTIMATE_DEFAULTS,
 ) -> CameraEstimate:
     """The camera with the smallest epipolar errors of all frames together, near the stated one.
 
-    `sigma` is the relative uncertainty of the stated focal length; `current` is the camera with which the poses of the
-    frames were found, by default the stated one. Raises ValueError without frames.
+    `poses` are those found with the frames' camera, which may be another than the stated one; correspondences are those
+    that agree with them. `sigma` is the relative uncertainty of the stated focal length. What is known beforehand of a
+    camera weighs by the errors of whole squares of the pattern, so they are Gauss-Newton steps. Raises ValueError
+    without frames.
     """
     if not frames:
         raise ValueError("no frames")
-    rng = np.random.default_rng(seed)
-    chosen = [subsample(np.arange(len(frame.uv_camera)), settings.most, rng) for frame in frames]
-    prior = np.diag(1 / np.square([sigma, settings.sigma_centre, settings.sigma_centre, settings.sigma_k1]))
-    poses, value = [frame.pose for frame in frames], _change(camera, current or camera)
-    information = prior
+    matches = PointMatches.of(frames, projector, MOST_PER_FRAME, np.random.default_rng(seed))
+    d_projector, by_uv = directions_by_uv(projector, matches.uv_projector)
 
-    def rays_at(where: Float64[ndarray, "4"]) -> list[RayPairs]:
-        device = changed(camera, where)
-        return [
-            ray_pairs(frame.uv_camera[index], frame.uv_projector[index], device, projector)[0]
-            for frame, index in zip(frames, chosen, strict=True)
-        ]
+    def rays(device: Device) -> RayPairs:
+        return RayPairs(directions(device, matches.uv_camera), d_projector, by_uv, matches.block)
 
-    for _ in range(settings.iterations):
-        rays = rays_at(value)
-        around = [(rays_at(value + h), rays_at(value - h)) for h in settings.difference_step * np.eye(len(UNKNOWNS))]
-        residuals = np.concatenate([sampson(*pose, own) for pose, own in zip(poses, rays, strict=True)])
-        width = settings.kernel_sigmas * noise_of(residuals)
-        normals = [
-            _normal(poses[k], rays[k], [(ahead[k], behind[k]) for ahead, behind in around], width, settings)
-            for k in range(len(frames))
-        ]
-        H, g = sum(n.H for n in normals), sum(n.g for n in normals)
-        spread = sum(n.block_gradients.T @ n.block_gradients for n in normals)
-        scale = max(float(np.mean(np.diag(spread) / np.diag(H).clip(1e-300))), 1e-12)  # squared error of a measurement
-        information = H / scale + prior
-        step = np.linalg.solve(information, -g / scale - prior @ value)
-        step *= min(1.0, settings.largest_step / max(float(np.abs(step).max()), 1e-300))
-        value = value + step
-        poses = [moved(*pose, n.pose_step - n.pose_slope @ step) for pose, n in zip(poses, normals, strict=True)]
-        if np.abs(step).max() < settings.converged:
+    index, mean = list(CAMERA_UNKNOWNS), values_of(camera)
+    problem = JointProblem(matches, frames[0].camera, CAMERA_UNKNOWNS, mean, rays)
+    centre = SIGMA_CENTRE * max(camera.w, camera.h) / camera.w
+    prior = np.diag(1 / np.square([sigma, centre, centre, SIGMA_K1]))
+    state, information = problem.start(poses), prior
+    for _ in range(MOST_STEPS):
+        at = problem.linearised(state, KERNEL_SIGMAS * noise_of(problem.residuals(state)))
+        normal, scores = at.equations.reduced(), problem.scores(at)
+        # Squared error of a measurement, where errors within a square of the pattern are shared.
+        scale = max(float(np.mean((scores**2).sum(0) / np.diag(normal.H).clip(1e-300))), 1e-12)
+        information = normal.H / scale + prior
+        step = np.linalg.solve(information, -normal.g / scale - prior @ (state.values - mean)[index])
+        step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        state = problem.moved(state, (step, at.equations.blocks_after(step)))
+        if np.abs(step).max() < CONVERGED:
             break
-    return CameraEstimate(changed(camera, value), np.linalg.inv(information))
+    return CameraEstimate(device_with(camera, state.values), np.linalg.inv(information))
 
 
-def changed(camera: Device, value: Float64[ndarray, "4"]) -> Device:
-    """The camera after a change of the logarithm of its focal length, its centre (shares of the longer side) and k1."""
-    factor, side = float(np.exp(value[0])), max(camera.w, camera.h)
-    return replace(
-        camera,
-        fl_x=camera.fl_x * factor,
-        fl_y=camera.fl_y * factor,
-        cx=camera.cx + side * float(value[1]),
-        cy=camera.cy + side * float(value[2]),
-        k1=camera.k1 + float(value[3]),
-    )
-
-
-def _change(camera: Device, other: Device) -> Float64[ndarray, "4"]:
-    """The change that makes a camera the other one."""
-    side = max(camera.w, camera.h)
-    x, y = (other.cx - camera.cx) / side, (other.cy - camera.cy) / side
-    return np.array([np.log(other.fl_x / camera.fl_x), x, y, other.k1 - camera.k1])
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """Normal equations of one frame with the pose eliminated: what it adds for the camera."""
-
-    H: Float64[ndarray, "4 4"]
-    g: Float64[ndarray, "4"]
-    block_gradients: Float64[ndarray, "blocks 4"]
-    pose_step: Float64[ndarray, "5"]  # of the pose while the camera stays
-    pose_slope: Float64[ndarray, "5 4"]  # change of the pose with the camera
-
-
-def _normal(
-    pose: CameraUnitPose,
-    rays: RayPairs,
-    around: Sequence[tuple[RayPairs, RayPairs]],
-    width: float,
-    settings: CameraEstimateSettings,
-) -> _Normal:
-    """`around`: the same correspondences with each unknown of the camera larger and smaller."""
-    apart = 2 * settings.difference_step
-    r, J = sampson_jacobian(*pose, rays)
-    j = np.stack([(sampson(*pose, ahead) - sampson(*pose, behind)) / apart for ahead, behind in around], 1)
-    w = geman_mcclure_weight((r / width) ** 2)[:, None]
-    A = (J * w).T @ J
-    slope = np.linalg.lstsq(A, (J * w).T @ j, rcond=1e-13)[0]
-    unexplained = j - J @ slope  # what the frame's own pose cannot explain
-    weighted = w * r[:, None] * unexplained
-    pose_step = -np.linalg.lstsq(A, (J * w).T @ r, rcond=1e-13)[0]
-    return _Normal((unexplained * w).T @ unexplained, weighted.sum(0), rays.block_sums(weighted), pose_step, slope)
-
+# Whether stated intrinsics can be right: focal length and principal point of the projector become free, with all
+# relative poses; then those of the camera instead.
 
 Role = Literal["projector", "camera"]
 Part = Literal["focal length", "principal point", "focal length and principal point"]
@@ -288,14 +221,14 @@ class IntrinsicsEvidence:
             *(replace(one, covariance=one.covariance + doubt) for one in (self.projector, self.camera))
         )
 
-    def contradicts(self, settings: UnknownProjectorSettings = UNKNOWN_PROJECTOR_DEFAULTS) -> bool:
+    def contradicts(self) -> bool:
         """Whether the stated intrinsics cannot be right."""
         return all(
-            one.chi_square > settings.contradiction and bool((np.abs(one.change) > settings.least_change).any())
+            one.chi_square > CONTRADICTION and bool((np.abs(one.change) > LEAST_CHANGE).any())
             for one in (self.projector, self.camera)
         )
 
-    def explanations(self, settings: UnknownProjectorSettings = UNKNOWN_PROJECTOR_DEFAULTS) -> list[Explanation]:
+    def explanations(self) -> list[Explanation]:
         """What would explain the contradiction: a single part of one device, if one does; else either device.
 
         A wrong projector and a wrong camera look alike. But a focal length of the one is focal length and principal
@@ -303,7 +236,7 @@ class IntrinsicsEvidence:
         """
         both: tuple[tuple[Role, DeviceEvidence], ...] = (("projector", self.projector), ("camera", self.camera))
         found = [_alone(role, one, part) for role, one in both for part in _PARTS]
-        enough = [e for e in found if e.left < settings.explained]
+        enough = [e for e in found if e.left < EXPLAINED]
         if enough:
             return enough
         whole: Part = "focal length and principal point"
@@ -329,30 +262,21 @@ def check_intrinsics(
     poses: Sequence[UnitPose],
     projector: Device,
     seed: int = 0,
-    settings: UnknownProjectorSettings = UNKNOWN_PROJECTOR_DEFAULTS,
 ) -> IntrinsicsEvidence:
     """Test of the stated values. `poses` are those found with them; cameras must all have the same intrinsics."""
     swapped = [FrameMatches(f.name, f.uv_projector, f.uv_camera, projector) for f in frames]
     turned = [(R.T, -R.T @ t) for R, t in poses]
     return IntrinsicsEvidence(
-        _evidence(frames, poses, projector, seed, settings),
-        _evidence(swapped, turned, frames[0].camera, seed, settings),
+        _evidence(frames, poses, projector, seed),
+        _evidence(swapped, turned, frames[0].camera, seed),
     )
 
 
-def _evidence(
-    frames: Sequence[FrameMatches],
-    poses: Sequence[UnitPose],
-    device: Device,
-    seed: int,
-    settings: UnknownProjectorSettings,
-) -> DeviceEvidence:
-    most = max(min(settings.fit.most_per_frame, settings.check_most // len(frames)), 1)
-    matches = PointMatches.of(frames, device, settings.blocks, most, np.random.default_rng(seed))
-    prior = Prior(values_of(device), prior_sigma(settings.prior))
-    held = JointProblem(matches, device, (), prior, settings.fit).fit(Poses.of(poses))
-    free = JointProblem(matches, device, FOCAL_AND_CENTRE, prior, settings.fit).fit(held.poses)
-    index, focal = list(FOCAL_AND_CENTRE), device.fl_x
-    step = (values_of(free.projector) - values_of(device))[index]
-    unit = np.array([1.0, device.w / focal, device.w / focal])
+def _evidence(frames: Sequence[FrameMatches], poses: Sequence[UnitPose], device: Device, seed: int) -> DeviceEvidence:
+    most = max(min(MOST_PER_FRAME, MOST_CHECKED // len(frames)), 1)
+    matches, usual = PointMatches.of(frames, device, most, np.random.default_rng(seed)), values_of(device)
+    held = JointProblem(matches, device, (), usual).fit(poses)
+    free = JointProblem(matches, device, FOCAL_AND_CENTRE, usual).fit(held.poses)
+    step = (values_of(free.device) - usual)[list(FOCAL_AND_CENTRE)]
+    unit = np.array([1.0, device.w / device.fl_x, device.w / device.fl_x])
     return DeviceEvidence(device, step * unit, free.covariance * np.outer(unit, unit), (held.noise_px, free.noise_px))

@@ -1,7 +1,13 @@
-"""Figures of cross-frame agreement: of pairs of frames, of each frame, and of the scan."""
+"""Cross-frame agreement: coordinates of one frame, through its own two devices, into those of another.
+
+A point is triangulated in one frame and projected into another camera; the coordinate decoded *there* is compared with
+where that frame's projector has the point. A point in front of what the other camera saw contradicts it: it would have
+been seen instead. One behind it may be hidden and is not judged; if it is a contradiction, that shows in the other
+direction, where the other frame's points then lie in front.
+"""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,107 +23,36 @@ from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inve
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels, evenly_spaced, geman_mcclure_weight
 from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate
 from sl_nerfstudio.parallel import one_library_thread
-from sl_nerfstudio.scan.types import Frame, PoseSigma, Scan
+from sl_nerfstudio.scan.types import PoseSigma, Scan
 
-# Limits of the verdict: multiples of the measured noise, shares of pixels and of frames; no lengths.
+_PIXELS_PER_FRAME, _MOST_PIXELS, _LEAST_PIXELS_PER_FRAME = 500, 12000, 60  # that are looked up in other frames
+_COMPARED_FRAMES = 150  # most frames of which each is compared with every other
+_PARTNERS = 32  # other frames that a frame is compared with, about, where there are more
+LEAST_COSINE = 0.2  # between surface normal and ray, below which a device counts as not seeing a point
+_SIGMAS = 4.0  # of a residual, from noise and stated uncertainty of the poses, up to which a point agrees: chance alone
+# exceeds it once in 3000 points
+_FOOTPRINT = 0.25  # error that no calibration and no look-up is assumed to be free of, 1 sigma, in camera pixels
+_LARGEST_NOISE_RATIO = 3.0  # of a frame's noise to the median frame's; beyond, a wrong pose of its projector makes it
+FEWEST_JUDGED = 30  # points below which nothing is said of a frame or of a pair of frames
 
+# Pairs are compared at this quantile of their residuals: wrong decodings do not reach it, and a plane on which two
+# frames agree by chance rarely holds so much of them.
+_TYPICAL_QUANTILE = 0.8
+_LEAST_TYPICAL = 0.5  # noises: below, look-ups decide, not poses
+_LARGEST_TYPICAL = 1.5  # expected sigmas in a scan's better pairs; normal errors in two dimensions have 1.8, and the
+# expected sigma is generous
+_ROUGH_FACTOR = 1.6  # on the limits where the stated uncertainty of the poses makes up the expected sigma: an error of
+# a pose is common to all points of a pair, so right pairs differ by chance
+_REFERENCE_QUANTILE = 0.25  # over all pairs, with which each is compared: a quarter of the pairs must be right
+CONTRADICTING_EXCESS = 2.5  # residual of a pair over that reference, beyond which its frames contradict each other
 
-@dataclass(frozen=True)
-class CrossFrameSettings:
-    """When the coordinates of two frames agree."""
-
-    pixels_per_frame: int = 500
-    """Decoded pixels of each frame that are looked up in the others."""
-    most_pixels: int = 12000
-    """The same over all frames, at most."""
-    least_pixels_per_frame: int = 60
-    """The same of each frame, at least, however many frames there are."""
-    partners: int = 32
-    """Other frames that a frame is compared with, about, where there are more than `compared_frames`."""
-    compared_frames: int = 150
-    """Most frames of which each is compared with every other."""
-    least_cosine: float = 0.2
-    """Cosine between surface normal and ray below which a device counts as not seeing a point."""
-    sigmas: float = 4.0
-    """Standard deviations of a residual, from noise and stated uncertainty of the poses, up to which a point agrees:
-    chance alone exceeds it once in 3000 points."""
-    footprint: float = 0.25
-    """Error that no calibration and no look-up is assumed to be free of, 1 sigma, in camera pixels."""
-    largest_noise_ratio: float = 3.0
-    """Noise of a frame relative to the median frame's, beyond which it does not count as noise: a wrong pose of its
-    projector makes it."""
-    fewest_judged: int = 30
-    """Judged points below which a pair of frames shares too little to say anything."""
-    typical_quantile: float = 0.8
-    """Quantile of a pair's residuals by which it is compared with other pairs: wrong decodings do not reach it, and a
-    plane on which two frames agree by chance rarely holds so much of them."""
-    least_typical: float = 0.5
-    """Smallest such residual that counts, in units of the noise: below, look-ups decide, not poses."""
-    largest_typical: float = 1.5
-    """Largest such residual, in units of the expected sigma, that a scan's better pairs may have: normal errors in two
-    dimensions have 1.8, and the expected sigma is generous."""
-    rough_factor: float = 1.6
-    """Factor on the limits where the stated uncertainty of the poses, not noise, makes up the expected sigma: an error
-    of a pose is common to all points of a pair, so right pairs differ by chance."""
-    reference_quantile: float = 0.25
-    """Quantile of those residuals over all pairs with which each is compared: a quarter of the pairs must be right."""
-    contradicting_excess: float = 2.5
-    """Residual of a pair relative to that reference, beyond which the two frames contradict each other."""
-
-    def pixels_of_each(self, frames: int) -> int:
-        """Decoded pixels of each of so many frames that are looked up."""
-        return max(self.least_pixels_per_frame, min(self.pixels_per_frame, self.most_pixels // frames))
+GOOD_EXCESS = 2.0  # the same of a frame that agrees well with the others
+GOOD_SHARE = 0.95  # of the judged points, those that must agree in such a frame
 
 
-@dataclass(frozen=True)
-class MissingSurfaceSettings:
-    """When a frame should have seen a surface."""
-
-    margin: float = 0.02
-    """Distance from all that a frame saw of the pattern, as a share of the image's longer side, beyond which it saw
-    nothing; as far inside the image and the pattern must a point lie."""
-    least_cosine: float = 0.35
-    """Cosine between a surface's normal and its rays to both devices above which it would be lit and seen."""
-    cells: int = 60
-    """Places along the longer side of an image at which it is known what lies nearest to the device."""
-    thickness: float = 0.08
-    """Distance behind what is nearest from which points count as hidden, as a share of the surface's radius."""
-    fewest_judged: int = 30
-    """Points below which nothing is said of a frame."""
-
-
-@dataclass(frozen=True)
-class VerdictSettings:
-    """What makes a scan good, acceptable or poor. A single frame beyond a limit keeps it from being good."""
-
-    most_frames: float = 0.25
-    """Share of the frames that may be left out, undecided, unconfirmed or weakly decoded before the scan is poor."""
-    least_decoded: float = 0.5
-    """Share of the surface that other frames show which must be decoded in every frame; of the visible pattern, where
-    others show too little."""
-    most_missing: float = 0.05
-    """Share of the surface that others show, and that a frame should have seen, of which it may have seen nothing; in a
-    single frame, something may have cast a shadow."""
-    least_own_share: float = 0.5
-    """Share of a frame's decoded pixels that must agree with the frame's own pose of its projector: with less, another
-    pose could explain the majority."""
-    good_sigma_deg: float = 1.0
-    """Standard deviation of a frame's rotation, in degrees, up to which a scan is good, and beyond which it is
-    acceptable: edges of the object may be smeared by a hundredth of its size."""
-    largest_sigma_deg: float = 3.0
-    """Standard deviation of a frame's rotation, in degrees, beyond which the frame may well be wrong and the scan is
-    poor."""
-    least_seen: float = 0.15
-    """Share of a frame's points that other frames must be able to judge: registration demands the same overlap."""
-    good_share: float = 0.95
-    """Share of the judged points that must agree for a scan to be good, in every frame and over all."""
-    least_share: float = 0.85
-    """The same for an acceptable scan."""
-    good_excess: float = 2.0
-    """Residual of a frame relative to the better pairs of the scan, up to which a scan is good; frames beyond
-    `cross.contradicting_excess` make it poor."""
-    cross: CrossFrameSettings = field(default_factory=CrossFrameSettings)
-    """When frames agree with each other."""
+def pixels_of_each(frames: int) -> int:
+    """Decoded pixels of each of so many frames that are looked up."""
+    return max(_LEAST_PIXELS_PER_FRAME, min(_PIXELS_PER_FRAME, _MOST_PIXELS // frames))
 
 
 # The decoding noise of every frame, measured so that an error of its pose does not count as noise.
@@ -212,9 +147,9 @@ class CrossFrameAgreement:
     pairs: tuple[PairAgreement, ...]  # with enough judged points
 
 
-def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> CrossFrameAgreement:
+def summarise(found: LookUps, noise_px: float) -> CrossFrameAgreement:
     """Figures of the pairs, the frames and all together."""
-    pairs = _pairs(found, settings)
+    pairs = _pairs(found)
     seen = np.zeros(len(found.source), bool)
     seen[found.anchor] = True
     of_frame: list[list[PairAgreement]] = [[] for _ in range(found.frames)]
@@ -223,7 +158,7 @@ def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> 
             of_frame[k].append(pair)
     return CrossFrameAgreement(
         noise_px=noise_px,
-        share=_mean(found.normalised < settings.sigmas),
+        share=_mean(found.normalised < _SIGMAS),
         px_median=_quantile(found.px, 0.5),
         px_p95=_quantile(found.px, 0.95),
         frames=tuple(_frame(seen[found.source == k], of_frame[k]) for k in range(found.frames)),
@@ -231,44 +166,37 @@ def summarise(found: LookUps, noise_px: float, settings: CrossFrameSettings) -> 
     )
 
 
-def _pairs(found: LookUps, settings: CrossFrameSettings) -> list[PairAgreement]:
+def _pairs(found: LookUps) -> list[PairAgreement]:
     first, second = np.sort(np.stack([found.source[found.anchor], found.viewer]), 0)
     pair = first * found.frames + second
     order = np.argsort(pair, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(pair[order])) + 1) if len(order) else []
-    groups = [mine for mine in groups if len(mine) >= settings.fewest_judged]
-    residuals = [_residual(found, mine, settings) for mine in groups]
-    allowed = settings.largest_typical * _quantile(np.array([t.stated for t in residuals]), 0.5)
-    reference = min(_quantile(np.array([t.noises for t in residuals]), settings.reference_quantile), allowed)
+    groups = [mine for mine in groups if len(mine) >= FEWEST_JUDGED]
+    residuals = np.array([_residual(found, mine) for mine in groups]).reshape(-1, 3)
+    noises, stated, chance = residuals.T
+    reference = min(_quantile(noises, _REFERENCE_QUANTILE), _LARGEST_TYPICAL * _quantile(stated, 0.5))
+    excess = noises / (reference * chance)
     return [
         PairAgreement(
             frames=(int(first[mine[0]]), int(second[mine[0]])),
             judged=len(mine),
-            share=_mean(found.normalised[mine] < settings.sigmas),
+            share=_mean(found.normalised[mine] < _SIGMAS),
             px_median=_quantile(found.px[mine], 0.5),
             px_p95=_quantile(found.px[mine], 0.95),
-            excess=t.noises / (reference * t.chance),
+            excess=float(e),
         )
-        for mine, t in zip(groups, residuals, strict=True)
+        for mine, e in zip(groups, excess, strict=True)
     ]
 
 
-@dataclass(frozen=True)
-class _PairResidual:
-    """The residual of a pair at the typical quantile."""
+def _residual(found: LookUps, mine: Int[ndarray, "m"]) -> tuple[float, float, float]:
+    """The typical residual of a pair, its expected sigma, and how much right pairs may differ.
 
-    noises: float  # in units of the noise, but not below what look-ups decide
-    stated: float  # expected sigma, with the stated uncertainty of the poses, in the same units
-    chance: float  # factor by which right pairs may differ: an error of a pose is common to all points of a pair
-
-
-def _residual(found: LookUps, mine: Int[ndarray, "m"], settings: CrossFrameSettings) -> _PairResidual:
+    The first two are in units of the noise, the last is a factor.
+    """
     by_noise = np.sqrt(1 - found.by_poses[mine])  # share of the expected sigma
-    return _PairResidual(
-        max(_quantile(found.normalised[mine] / by_noise, settings.typical_quantile), settings.least_typical),
-        float(np.median(1 / by_noise)),
-        1 + (settings.rough_factor - 1) * _mean(found.by_poses[mine]),
-    )
+    typical = max(_quantile(found.normalised[mine] / by_noise, _TYPICAL_QUANTILE), _LEAST_TYPICAL)
+    return typical, float(np.median(1 / by_noise)), 1 + (_ROUGH_FACTOR - 1) * _mean(found.by_poses[mine])
 
 
 def _frame(seen: ndarray, pairs: list[PairAgreement]) -> FrameCrossAgreement:
@@ -296,44 +224,27 @@ def _quantile(values: ndarray, q: float) -> float:
     return float(np.quantile(values, q)) if len(values) else float("nan")
 
 
-# Whether frames agree with each other: coordinates of one, through its own two devices into those of another.
-#
-# A point is triangulated in one frame and projected into another camera; the coordinate decoded *there* is compared
-# with
-# where that frame's projector has the point. A point in front of what the other camera saw contradicts it: it would
-# have
-# been seen instead. One behind it may be hidden and is not judged; if it is a contradiction, that shows the other
-# way
-# round, where the other frame's points then lie in front.
-
-
 @one_library_thread()
-def cross_frame_agreement(
-    rig: Rig,
-    maps: CoordinateMaps,
-    sigma: Float[Tensor, "frames 12"],
-    settings: CrossFrameSettings | None = None,
-) -> CrossFrameAgreement:
+def cross_frame_agreement(rig: Rig, maps: CoordinateMaps, sigma: Float[Tensor, "frames 12"]) -> CrossFrameAgreement:
     """Compare all frames. The scene must be normalised: origin at the object's centre, radius about one.
 
     `sigma` is 1 sigma of each frame's pose as a whole and of its projector against its camera (translation xyz and
     rotation xyz each), in the scene's unit and radian: what these explain is no contradiction.
     """
-    s = settings or CrossFrameSettings()
     generator = torch.Generator().manual_seed(0)
-    anchors = place_anchors(rig, maps, s.pixels_of_each(rig.frames), generator)
-    most = rig.frames if rig.frames <= s.compared_frames else s.partners
-    together = partners(rig, anchors, maps, most, s.least_cosine, generator)
-    rows = observe(rig, anchors, maps, rig.frames, float("inf"), s.least_cosine, generator, together)
+    anchors = place_anchors(rig, maps, pixels_of_each(rig.frames), generator)
+    most = rig.frames if rig.frames <= _COMPARED_FRAMES else _PARTNERS
+    together = partners(rig, anchors, maps, most, LEAST_COSINE, generator)
+    rows = observe(rig, anchors, maps, rig.frames, float("inf"), LEAST_COSINE, generator, together)
     linear = linearise(rig, anchors, rows, maps)
     noise = frame_noise(linear, anchors, rig.frames)
     usual = float(noise.nanmedian())
-    noise = noise.nan_to_num(usual).clamp_max(s.largest_noise_ratio * usual)
+    noise = noise.nan_to_num(usual).clamp_max(_LARGEST_NOISE_RATIO * usual)
     size = linear.residuals.cross.norm(dim=-1)
-    by_noise = _variance_by_noise(linear, anchors, rows, noise**2 + (s.footprint * _footprint(rig, anchors, maps)) ** 2)
+    by_noise = _variance_by_noise(linear, anchors, rows, noise**2 + (_FOOTPRINT * _footprint(rig, anchors, maps)) ** 2)
     by_poses = _variance_by_poses(linear, anchors, rows, sigma)
     normalised = size / (by_noise + by_poses).sqrt()
-    judged = linear.residuals.cross_valid & ((normalised < s.sigmas) | _in_front(rig, anchors, rows, maps))
+    judged = linear.residuals.cross_valid & ((normalised < _SIGMAS) | _in_front(rig, anchors, rows, maps))
     looked_up = LookUps(
         frames=rig.frames,
         source=anchors.frame.numpy(),
@@ -343,7 +254,7 @@ def cross_frame_agreement(
         normalised=normalised[judged].numpy(),
         by_poses=(by_poses / (by_noise + by_poses))[judged].numpy(),
     )
-    return summarise(looked_up, usual, s)
+    return summarise(looked_up, usual)
 
 
 def _footprint(rig: Rig, anchors: Anchors, maps: CoordinateMaps) -> Float[Tensor, "frames"]:
@@ -398,18 +309,10 @@ _POINTS_PER_FRAME = 500
 _EDGE = 2.0  # per cent of the points on each side that may lie outside the object's box: wrong decodings
 
 
-def compare_scan_frames(
-    scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None], settings: CrossFrameSettings | None = None
-) -> CrossFrameAgreement:
-    """The same as `compare_frames`, with the coordinates read from the scan's files, where the masks allow them."""
-    images = (_masked_coords(frame) for frame in scan.frames)
-    return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma, settings)
-
-
-def _masked_coords(frame: Frame) -> Float32[ndarray, "h w 2"]:
-    coords = frame.read_coords()
-    coords[~frame.read_mask()] = np.nan
-    return coords
+def compare_scan_frames(scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None]) -> CrossFrameAgreement:
+    """Compare the frames of a scan: `compare_frames` with coordinates from its files, where the masks allow them."""
+    images = (np.where(f.read_mask()[..., None], f.read_coords(), np.float32(np.nan)) for f in scan.frames)
+    return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma)
 
 
 def compare_frames(
@@ -418,7 +321,6 @@ def compare_frames(
     poses: DevicePoses,
     coords: Iterable[Float32[ndarray, "_h _w 2"]],
     sigma: Sequence[PoseSigma | None],
-    settings: CrossFrameSettings | None = None,
 ) -> CrossFrameAgreement:
     """Cross-frame agreement with the given poses; `sigma` in the poses' unit, None where poses count as exact."""
     maps = CoordinateMaps.of(torch.from_numpy(image) for image in coords)
@@ -426,7 +328,7 @@ def compare_frames(
     rig = Rig.of(cameras, projector, poses, S_scene_world)
     rows = [_four(s, S_scene_world.scale) for s in sigma]
     stated = torch.tensor(rows, dtype=torch.float64).repeat_interleave(3, 1)
-    return cross_frame_agreement(rig, maps, stated, settings)
+    return cross_frame_agreement(rig, maps, stated)
 
 
 def _four(s: PoseSigma | None, scale: float) -> tuple[float, float, float, float]:
@@ -437,12 +339,7 @@ def _four(s: PoseSigma | None, scale: float) -> tuple[float, float, float, float
     return s.camera_translation * scale, turns[0], s.relative_translation * scale, turns[1]
 
 
-def _scene(
-    cameras: Sequence[Device],
-    projector: Device,
-    poses: DevicePoses,
-    maps: CoordinateMaps,
-) -> Similarity:
+def _scene(cameras: Sequence[Device], projector: Device, poses: DevicePoses, maps: CoordinateMaps) -> Similarity:
     """World to scene: the centre of the decoded surface becomes the origin, its radius one."""
     parts = [np.zeros((0, 3))]
     for k, (camera, T_c, T_p) in enumerate(zip(cameras, poses.T_world_camera, poses.T_world_projector, strict=True)):
@@ -471,19 +368,18 @@ def _scene(
 Pair = tuple[int, int]
 
 
-def agreeing_groups(found: CrossFrameAgreement, settings: CrossFrameSettings | None = None) -> list[list[int]]:
+def agreeing_groups(found: CrossFrameAgreement) -> list[list[int]]:
     """Groups of frames that agree with each other and contradict the other groups, the largest first.
 
     Frames that no other frame can judge are in no group. Greedy correlation clustering: the two groups with the most
     judged points in agreeing pairs, less those in contradicting pairs, are joined as long as the agreeing ones prevail.
     All pairs between two groups thus count together: a pair that agrees by accident joins nothing.
     """
-    s = settings or CrossFrameSettings()
     frames = sorted({k for p in found.pairs for k in p.frames})
     votes = np.zeros((len(frames), len(frames)))
     for p in found.pairs:
         i, j = (frames.index(k) for k in p.frames)
-        agrees = p.excess <= s.contradicting_excess
+        agrees = p.excess <= CONTRADICTING_EXCESS
         votes[i, j] = votes[j, i] = p.judged if agrees else -p.judged
     groups = [[k] for k in frames]
     while len(groups) > 1 and (pair := _best(votes)) is not None:

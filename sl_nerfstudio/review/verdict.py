@@ -1,4 +1,8 @@
-"""Good, acceptable or poor, with the reasons."""
+"""Good, acceptable or poor, with the reasons: verdicts on scans and on calibrations.
+
+The verdict is the worst of everything that is known, not an average. Limits are multiples of the measured noise, shares
+of pixels and of frames, and degrees; no lengths.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,9 +15,11 @@ from sl_nerfstudio.bundle_adjustment.parameters import USUAL_FRAME_ROTATION_DEG
 from sl_nerfstudio.calibration.board import BoardCalibration
 from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
 from sl_nerfstudio.review.agreement import (
+    CONTRADICTING_EXCESS,
+    GOOD_EXCESS,
+    GOOD_SHARE,
     CrossFrameAgreement,
     FrameCrossAgreement,
-    VerdictSettings,
     agreeing_groups,
     bridges,
 )
@@ -97,92 +103,71 @@ def departed_reasons(found: Sequence[DepartedFrame]) -> list[Reason]:
     ]
 
 
-# The verdict on a calibration from boards, and why.
+# The verdict on a calibration from boards, and why. Limits of a good calibration, and of an acceptable one:
 
-
-@dataclass(frozen=True)
-class CalibrationLimits:
-    """What makes a calibration good, acceptable or poor."""
-
-    good_focal: float = 0.003
-    """Standard deviation of a focal length, relative to it."""
-    acceptable_focal: float = 0.01
-    """The same for an acceptable calibration."""
-    determined_focal: float = 0.05
-    """The same, beyond which the poses do not determine the focal length and no result is written."""
-    good_centre: float = 0.005
-    """Standard deviation of a principal point, relative to the focal length."""
-    acceptable_centre: float = 0.015
-    """The same for an acceptable calibration."""
-    good_rms_px: float = 0.6
-    """RMS of the corners in either device, in pixels."""
-    acceptable_rms_px: float = 1.5
-    """The same for an acceptable calibration."""
-    good_excess: float = 2.0
-    """Error of predicted corners in left-out poses, relative to the RMS of the fit."""
-    good_coverage: float = 0.3
-    """Share of the image's cells that hold corners."""
-    least_tilt_deg: float = 20.0
-    """Largest angle between two boards, below which they count as parallel."""
-    least_depth_ratio: float = 1.15
-    """Distance of the farthest board over that of the nearest, below which all stand at one distance."""
-
-
-LIMITS = CalibrationLimits()
 DEVICES = ("camera", "projector")
+_FOCAL = (0.003, 0.01)  # standard deviation of a focal length, relative to it
+_UNDETERMINED_FOCAL = 0.05  # the same, beyond which the poses do not determine it and no result is written
+_CENTRE = (0.005, 0.015)  # standard deviation of a principal point, relative to the focal length
+_RMS_PX = (0.6, 1.5)  # of the corners in either device
+_GOOD_PREDICTION = 2.0  # error of predicted corners in left-out poses, relative to the RMS of the fit
+_GOOD_COVERAGE = 0.3  # share of the image's cells that hold corners
+_LEAST_TILT_DEG = 20.0  # largest angle between two boards, below which they count as parallel
+_LEAST_DEPTH_RATIO = 1.15  # distance of the farthest board over that of the nearest, below which they stand at one
 
 
-def judge_calibration(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> Verdict:
-    """The worst of all judgements."""
-    return worst(_reasons(found, limits))
+def judge_calibration(found: BoardCalibration) -> Verdict:
+    """The verdict on a calibration with all reasons."""
+    return worst(_reasons(found))
 
 
-def undetermined(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> tuple[str, ...]:
+def undetermined(found: BoardCalibration) -> tuple[str, ...]:
     """The devices whose focal length the poses do not determine."""
     return tuple(
         name
         for name, device, sigma in zip(DEVICES, found.adjusted.rig.devices, found.sigmas, strict=False)
-        if sigma.focal() > limits.determined_focal * device.fl_x
+        if sigma.focal() > _UNDETERMINED_FOCAL * device.fl_x
     )
 
 
-def shortcomings(found: BoardCalibration, limits: CalibrationLimits = LIMITS) -> tuple[str, ...]:
-    """What the poses lack, in half sentences."""
+def shortcomings(found: BoardCalibration) -> tuple[str, ...]:
+    """Shortcomings of the poses, in half sentences."""
     c, out = found.coverage, []
-    if c.tilt_deg < limits.least_tilt_deg:
+    if c.tilt_deg < _LEAST_TILT_DEG:
         out.append(f"the boards are nearly parallel (the largest angle between two is {c.tilt_deg:.0f} degrees)")
-    if c.depth_ratio < limits.least_depth_ratio:
+    if c.depth_ratio < _LEAST_DEPTH_RATIO:
         out.append("all boards stand at one distance")
-    if c.camera < limits.good_coverage:
+    if c.camera < _GOOD_COVERAGE:
         out.append(f"corners fill only {c.camera:.0%} of the camera's image")
-    if c.projector is not None and c.projector < limits.good_coverage:
+    if c.projector is not None and c.projector < _GOOD_COVERAGE:
         out.append(f"corners fill only {c.projector:.0%} of the pattern")
     return tuple(out)
 
 
-def _reasons(found: BoardCalibration, limits: CalibrationLimits) -> Iterator[Reason]:
-    lacking = shortcomings(found, limits)
+def _reasons(found: BoardCalibration) -> Iterator[Reason]:
+    lacking = shortcomings(found)
     because = f"; {', and '.join(lacking)}" if lacking else ""
     for k, (device, sigma) in enumerate(zip(found.adjusted.rig.devices, found.sigmas, strict=True)):
         name = DEVICES[k]
         focal, centre = sigma.focal() / device.fl_x, sigma.centre() / device.fl_x
-        if focal > limits.good_focal:
-            band = "acceptable" if focal <= limits.acceptable_focal else "poor"
+        if (band := _band(focal, _FOCAL)) != "good":
             yield Reason(band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}")
-        if centre > limits.good_centre:
-            band = "acceptable" if centre <= limits.acceptable_centre else "poor"
+        if (band := _band(centre, _CENTRE)) != "good":
             yield Reason(
                 band, f"the principal point of the {name} is uncertain by {sigma.centre():.0f} px (1 sigma){because}"
             )
-        if found.rms_px[k] > limits.good_rms_px:
-            band = "acceptable" if found.rms_px[k] <= limits.acceptable_rms_px else "poor"
+        if (band := _band(found.rms_px[k], _RMS_PX)) != "good":
             yield Reason(band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them")
-        if found.left_out.error_px[k] > limits.good_excess * max(found.rms_px[k], found.adjusted.sigma_px[k]):
+        if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
                 "acceptable",
                 f"corners of left-out poses are predicted to {found.left_out.error_px[k]:.2f} px in the {name}, "
                 f"fitted ones to {found.rms_px[k]:.2f} px: more poses would help",
             )
+
+
+def _band(value: float, limits: tuple[float, float]) -> Band:
+    return "good" if not value > limits[0] else "acceptable" if value <= limits[1] else "poor"
 
 
 # What a scan is judged by, as facts. What a command does not know is None, and is not judged.
@@ -231,33 +216,46 @@ class ScanFacts:
         return tuple(frame for frame in self.frames if frame.in_scan)
 
 
-# The verdict on a scan: the worst of everything that is known of it, not an average.
+# The verdict on a scan. A single frame beyond a limit keeps it from being good.
+
+_MOST_FRAMES = 0.25  # share of frames that may be left out, undecided, unconfirmed or weakly decoded in a usable scan
+_LEAST_DECODED = 0.5  # share of the surface that other frames show which must be decoded in every frame; of the visible
+# pattern, where others show too little
+_MOST_MISSING = 0.05  # share of the surface that others show, and that a frame should have seen, of which it may have
+# seen nothing; in a single frame, something may have cast a shadow
+_LEAST_OWN_SHARE = 0.5  # of a frame's decoded pixels, those that must agree with the frame's own pose of its projector:
+# with less, another pose could explain the majority
+_GOOD_SIGMA_DEG = 1.0  # standard deviation of a frame's rotation up to which a scan is good, and beyond which it is
+# acceptable: edges of the object may be smeared by a hundredth of its size
+_LARGEST_SIGMA_DEG = 3.0  # beyond which the frame may well be wrong and the scan is poor
+_LEAST_SEEN = 0.15  # share of a frame's points that other frames must be able to judge, as registration demands
+_LEAST_SHARE = 0.85  # of the judged points, those that must agree in an acceptable scan, in every frame and over all
 
 
-def judge_scan(facts: ScanFacts, settings: VerdictSettings | None = None) -> Verdict:
+def judge_scan(facts: ScanFacts) -> Verdict:
     """The verdict with all reasons; facts that are not known are not judged."""
-    return worst(reasons_of(facts, settings or VerdictSettings()))
+    return worst(reasons_of(facts))
 
 
-def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
     """Everything that keeps the scan from being good."""
     if len(facts.in_scan) < 2:
         yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used")
         return
-    yield from _left_out(facts, settings)
-    yield from _undecided(facts, settings)
+    yield from _left_out(facts)
+    yield from _undecided(facts)
     if facts.by_order:
         yield _placed_by_order(facts.turns_deg)
     elif facts.turns_deg:
         yield Reason("poor", symmetry_sentence(facts.turns_deg))
     if facts.pairs is not None:
-        yield from _weak_connections(facts, settings)
+        yield from _weak_connections(facts)
     if facts.cross is not None:
-        yield from cross_reasons([f.name for f in facts.in_scan], facts.cross, settings)
-    yield from _decoding(facts, settings)
-    yield from _missing(facts, settings)
+        yield from cross_reasons([f.name for f in facts.in_scan], facts.cross)
+    yield from _decoding(facts)
+    yield from _missing(facts)
     degenerate = [f.name for f in facts.in_scan if f.degenerate]
-    if len(degenerate) > settings.most_frames * len(facts.in_scan):
+    if len(degenerate) > _MOST_FRAMES * len(facts.in_scan):
         yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
     if not facts.adjusted:
         yield Reason(
@@ -268,10 +266,10 @@ def reasons_of(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         yield Reason("acceptable", "the captures contradict the stated intrinsics")
 
 
-def _left_out(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def _left_out(facts: ScanFacts) -> Iterator[Reason]:
     """Frames that are not in the scan: those that form groups of their own, and single ones."""
     lost = [f for f in facts.frames if not f.in_scan]
-    band = _share_band(len(lost), len(facts.frames), settings)
+    band = _share_band(len(lost), len(facts.frames))
     apart = sorted({f.component for f in lost if f.component})
     for number in apart:
         names = [f.name for f in lost if f.component == number]
@@ -285,9 +283,9 @@ def _left_out(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         yield Reason(band, f"{len(single)} of {len(facts.frames)} frames were left out: {listed(single)}")
 
 
-def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def _undecided(facts: ScanFacts) -> Iterator[Reason]:
     """Frames in the scan whose pose is not certain."""
-    good, largest = settings.good_sigma_deg, settings.largest_sigma_deg
+    good, largest = _GOOD_SIGMA_DEG, _LARGEST_SIGMA_DEG
     lost = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > largest]
     if lost:
         yield Reason("poor", _known_only(lost, largest))
@@ -296,12 +294,12 @@ def _undecided(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
         yield Reason("acceptable", _known_only(loose, good))
     names = [f.name for f in facts.in_scan if f.undecided and f not in lost + loose]
     if names:
-        band = _share_band(len(names), len(facts.in_scan), settings)
+        band = _share_band(len(names), len(facts.in_scan))
         yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well")
 
 
 def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
-    """That the rotation of frames is uncertain, with the most uncertain one."""
+    """Say that the rotation of frames is uncertain, with the most uncertain one."""
     sigma = max(f.sigma_rotation_deg or 0.0 for f in frames)
     said = f"{sigma:.2g}" if sigma < 10 else f"{sigma:.0f}"
     return (
@@ -311,7 +309,7 @@ def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
 
 
 def symmetry_sentence(turns_deg: Sequence[float]) -> str:
-    """That the surface looks the same after turns, and what it means."""
+    """Say that the surface looks the same after turns, and what it means."""
     return (
         f"{_same_after(turns_deg)}, and pairs of frames contradict each other by it: frames may be placed at another "
         "side than they show. The surface is right if the object really is that symmetric; for the poses, capture in "
@@ -320,7 +318,7 @@ def symmetry_sentence(turns_deg: Sequence[float]) -> str:
 
 
 def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
-    """What it means that the order of capture decided which side each frame shows."""
+    """Say what it means that the order of capture decided which side each frame shows."""
     how = "each was placed by the order of capture, turned as little as possible against the one before"
     if not turns_deg:
         return Reason(
@@ -340,7 +338,7 @@ def _same_after(turns_deg: Sequence[float]) -> str:
     return f"the object looks the same after a turn by {listed([f'{angle:.0f}' for angle in turns_deg])} degrees"
 
 
-def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
     """Pairs of frames that contradict other pairs, and single pairs that hold the scan together."""
     pairs, names = facts.pairs or (), [f.name for f in facts.in_scan]
     inside = [p for p in pairs if set(p.frames) <= set(names)]
@@ -349,7 +347,7 @@ def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[R
     doubtful = [name for name in names if _support(name, inside, False) > _support(name, inside, True)]
     if doubtful:
         yield Reason(
-            _share_band(len(doubtful), len(names), settings),
+            _share_band(len(doubtful), len(names)),
             f"{listed(doubtful)}: most pairs with other frames contradict the pose found",
         )
     index = {name: k for k, name in enumerate(names)}
@@ -364,41 +362,41 @@ def _weak_connections(facts: ScanFacts, settings: VerdictSettings) -> Iterator[R
 
 
 def _support(name: str, pairs: Iterable[PairFacts], used: bool) -> float:
-    """Of the pairs of a frame that are used, or are not, together."""
+    """Sum the support of the pairs of a frame that are used, or are not."""
     return math.fsum(p.support for p in pairs if name in p.frames and p.used == used)
 
 
-def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement, settings: VerdictSettings) -> Iterator[Reason]:
-    """What the coordinates of the frames say about each other; `names` in the order of `cross.frames`."""
-    alone = [name for name, f in zip(names, cross.frames, strict=True) if not f.seen >= settings.least_seen]
+def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[Reason]:
+    """Reasons in how the coordinates of the frames agree; `names` in the order of `cross.frames`."""
+    alone = [name for name, f in zip(names, cross.frames, strict=True) if not f.seen >= _LEAST_SEEN]
     if alone:
         yield Reason(
-            _share_band(len(alone), len(names), settings),
-            f"{listed(alone)}: no other frame shows enough of the same surface (at least {settings.least_seen:.0%}) to "
+            _share_band(len(alone), len(names)),
+            f"{listed(alone)}: no other frame shows enough of the same surface (at least {_LEAST_SEEN:.0%}) to "
             "confirm the pose",
         )
     if not cross.pairs:
         return
-    groups = agreeing_groups(cross, settings.cross)
+    groups = agreeing_groups(cross)
     named = {k for group in groups[1:] for k in group}
     yield from _contradicting_groups(names, cross, groups)
     for k, (name, frame) in enumerate(zip(names, cross.frames, strict=True)):
-        band = frame_band(frame, settings)
+        band = frame_band(frame)
         if band != "good" and k not in named:
             yield Reason(band, _frame_sentence(name, frame, cross, band))
-    if cross.share < settings.good_share:
+    if cross.share < GOOD_SHARE:
         yield Reason(
-            "poor" if cross.share < settings.least_share else "acceptable",
+            "poor" if cross.share < _LEAST_SHARE else "acceptable",
             f"of all points that two frames saw, {cross.share:.0%} agree: 95 % lie within {cross.px_p95:.2g} px, the "
             f"noise is {cross.noise_px:.2g} px",
         )
 
 
-def frame_band(frame: FrameCrossAgreement, settings: VerdictSettings) -> Band:
+def frame_band(frame: FrameCrossAgreement) -> Band:
     """The judgement on one frame by its agreement with the others."""
-    if frame.share < settings.least_share or frame.excess > settings.cross.contradicting_excess:
+    if frame.share < _LEAST_SHARE or frame.excess > CONTRADICTING_EXCESS:
         return "poor"
-    return "acceptable" if frame.share < settings.good_share or frame.excess > settings.good_excess else "good"
+    return "acceptable" if frame.share < GOOD_SHARE or frame.excess > GOOD_EXCESS else "good"
 
 
 def _contradicting_groups(
@@ -440,40 +438,39 @@ def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgre
     )
 
 
-def _decoding(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def _decoding(facts: ScanFacts) -> Iterator[Reason]:
     """Frames with little decoded, and frames whose coordinates contradict their own pose."""
     own = "of the decoded pixels agree with the pose of the projector"
     seen = [(f.shared_decoded, f) for f in facts.in_scan]
     alone = [(f.decoded_share, f) for f in facts.in_scan if f.shared_decoded is None]
     for shares, least, words in (
-        (seen, settings.least_decoded, "of the surface that other frames show was decoded"),
-        (alone, settings.least_decoded, "of the visible pattern was decoded"),
-        ([(f.own_share, f) for f in facts.in_scan], settings.least_own_share, own),
+        (seen, _LEAST_DECODED, "of the surface that other frames show was decoded"),
+        (alone, _LEAST_DECODED, "of the visible pattern was decoded"),
+        ([(f.own_share, f) for f in facts.in_scan], _LEAST_OWN_SHARE, own),
     ):
         weak = [(value, f.name) for value, f in shares if value is not None and value < least]
         if weak:
             share, name = min(weak)
             others = f"; also little in {listed([n for _, n in weak if n != name])}" if len(weak) > 1 else ""
-            band = _share_band(len(weak), len(facts.in_scan), settings)
+            band = _share_band(len(weak), len(facts.in_scan))
             yield Reason(band, f"{name}: only {share:.0%} {words} (at least {least:.0%}){others}")
 
 
-def _missing(facts: ScanFacts, settings: VerdictSettings) -> Iterator[Reason]:
+def _missing(facts: ScanFacts) -> Iterator[Reason]:
     """Frames that saw nothing where others show a surface."""
-    most = settings.most_missing
-    found = [(f.missing_share, f.name) for f in facts.in_scan if f.missing_share is not None and f.missing_share > most]
+    found = [(f.missing_share, f.name) for f in facts.in_scan if (f.missing_share or 0.0) > _MOST_MISSING]
     if found:
-        worst_share = max(found)[0]
+        worst_share = max(share or 0.0 for share, _ in found)
         yield Reason(
-            _share_band(len(found), len(facts.in_scan), settings),
+            _share_band(len(found), len(facts.in_scan)),
             f"{listed([name for _, name in found])}: saw nothing of the pattern where other frames show a surface in "
-            f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {most:.0%}): something "
-            "cast a shadow, or frames are at the wrong place",
+            f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {_MOST_MISSING:.0%}): "
+            "something cast a shadow, or frames are at the wrong place",
         )
 
 
-def _share_band(count: int, total: int, settings: VerdictSettings) -> Band:
-    return "poor" if count > settings.most_frames * total else "acceptable"
+def _share_band(count: int, total: int) -> Band:
+    return "poor" if count > _MOST_FRAMES * total else "acceptable"
 
 
 def _median(values: Sequence[float]) -> float:

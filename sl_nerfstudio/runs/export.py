@@ -38,8 +38,8 @@ from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
 from sl_nerfstudio.meshing.visibility import Trimmed, trim_to_observed
 from sl_nerfstudio.model.model import RECOMMENDED_STEPS
 from sl_nerfstudio.model.run_files import plain
-from sl_nerfstudio.object_separation.planes import SEPARATION_DEFAULTS, DecodedFrame, PlaneFinding
-from sl_nerfstudio.object_separation.separate import Separation, separate
+from sl_nerfstudio.object_separation.planes import DecodedFrame, PlaneFinding
+from sl_nerfstudio.object_separation.separate import PIXELS_PER_FRAME, Separation, separate
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.runs.cameras import (
     encode_blender,
@@ -250,7 +250,7 @@ def _decoded_frames(scan: Scan, poses: DevicePoses) -> list[DecodedFrame]:
                 frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k], coords,
                 frame.read_mask(),
             )  # fmt: skip
-            frames.append(whole.thinned(SEPARATION_DEFAULTS.pixels_per_frame))
+            frames.append(whole.thinned(PIXELS_PER_FRAME))
     if not frames:
         raise UserError(
             f"{scan.root}: no frame has decoded coordinates, so --object-only cannot find the object\n"

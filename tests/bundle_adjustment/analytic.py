@@ -8,15 +8,10 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
-from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, by_kind
+from sl_nerfstudio.bundle_adjustment.parameters import INTRINSICS_SIGMA, PosePrior, by_kind, gauge_directions
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import (
-    exp_se3,
-    inverse,
-    pose,
-    transform,
-)
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, pose, transform
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
 
 BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
@@ -115,7 +110,7 @@ class ExactMaps(CoordinateMaps):
     def around(rig: Rig, size: int) -> "ExactMaps":
         """Maps that know the true poses."""
         m = CoordinateMaps.of(images_of(rig, size))
-        return ExactMaps(m.values, m.index, m.settings, m.max_roughness, rig)
+        return ExactMaps(m.values, m.index, m.half_window, m.least_pixels, m.max_roughness, rig)
 
     def look_up(self, frame: Tensor, uv_camera: Tensor, memory: object = None) -> MapSample:
         uv, part = seen(self.rig, frame, uv_camera)
@@ -149,10 +144,22 @@ def turned(rig: Rig, frame: int, degrees: float) -> Rig:
     return replace(rig, T_world_camera=cameras)
 
 
+def prior_of(frames: int, *sigmas: float, intrinsics: float = INTRINSICS_SIGMA) -> PosePrior:
+    """The same uncertainty for all frames: translation and rotation of the frame, then of its projector."""
+    return PosePrior(*(torch.full((frames,), s, dtype=torch.float64) for s in sigmas), intrinsics=intrinsics)
+
+
 def rough_prior(frames: int, degrees: float) -> PosePrior:
     """Starting poses whose rotations are known to some degrees."""
-    sigmas = (0.05, radians(degrees), 0.003, radians(0.1))
-    return PosePrior(*(torch.full((frames,), s, dtype=torch.float64) for s in sigmas))
+    return prior_of(frames, 0.05, radians(degrees), 0.003, radians(0.1))
+
+
+def without_gauge(found: Rig, true: Rig) -> Tensor:
+    """Errors of (delta, rho) less motion and growth of the scene as a whole."""
+    pairs = (found.T_world_camera, true.T_world_camera), (found.T_camera_projector, true.T_camera_projector)
+    error = torch.cat([log_se3(a @ inverse(b)).reshape(-1) for a, b in pairs])
+    G = gauge_directions(found)
+    return error - G @ torch.linalg.lstsq(G, error[:, None]).solution[:, 0]
 
 
 def decoded_at(maps: CoordinateMaps, frame: Tensor, uv: Tensor) -> Tensor:

@@ -1,22 +1,21 @@
 """A step lowers the whole objective or is not taken, and is the solution of the damped normal equations."""
 
-from dataclasses import replace
 from math import radians
 
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import LMState, damped_solver, lm_step
+from sl_nerfstudio.bundle_adjustment import levenberg_marquardt
+from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import DAMPING, LMState, damped_solver, lm_step
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import Kernel, observe, place_anchors
-from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, PriorTerm, by_frame, by_kind, free_parameters
+from sl_nerfstudio.bundle_adjustment.parameters import PriorTerm, by_frame, by_kind, free_parameters
 from sl_nerfstudio.bundle_adjustment.residuals import linearise, residuals_of
-from sl_nerfstudio.bundle_adjustment.settings import StepSettings
 
-from .analytic import ExactMaps, dense, disturbed, matrix_by_kind, rig_of
+from .analytic import ExactMaps, dense, disturbed, matrix_by_kind, prior_of, rig_of
 
 FRAMES, SIZE = 4, 80
-SETTINGS = StepSettings()
+MODES = ["free", "known-rig", "rigid-rig", "static-projector"]
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +29,12 @@ def scene():
     return true, maps, rig, anchors, rows
 
 
-def prior_of(weight: float, start, scale: float = 1.0) -> PriorTerm:
-    sigmas = (0.03 * scale, radians(1) * scale, 0.01 * scale, radians(0.3) * scale)
-    prior = PosePrior(*(torch.full((FRAMES,), s, dtype=torch.float64) for s in sigmas))
-    return PriorTerm(prior, start, weight)
+def prior_term(weight: float, start, scale: float = 1.0) -> PriorTerm:
+    return PriorTerm(prior_of(FRAMES, 0.03 * scale, radians(scale), 0.01 * scale, radians(0.3 * scale)), start, weight)
+
+
+def kernel_for(anchors, rows, width: float = 3.0) -> Kernel:
+    return Kernel(torch.full((FRAMES,), width, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
 
 
 def objective(state: LMState, rows, maps, kernel: Kernel, prior: PriorTerm, valid) -> float:
@@ -41,14 +42,14 @@ def objective(state: LMState, rows, maps, kernel: Kernel, prior: PriorTerm, vali
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-2, 1e4])
-@pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig", "static-projector"])
+@pytest.mark.parametrize("mode", MODES)
 def test_a_step_lowers_data_and_prior_together(scene, mode, weight):
     _, maps, rig, anchors, rows = scene
-    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
-    prior, state = prior_of(weight, rig), LMState(rig, anchors, SETTINGS.damping)
+    kernel = kernel_for(anchors, rows)
+    prior, state = prior_term(weight, rig), LMState(rig, anchors, DAMPING)
     for _ in range(4):
         linear = linearise(state.rig, state.anchors, rows, maps)
-        after = lm_step(state, linear, rows, maps, kernel, prior, free_parameters(mode, state.rig), SETTINGS)
+        after = lm_step(state, linear, rows, maps, kernel, prior, free_parameters(mode, state.rig))
         both = linear.residuals.cross_valid & residuals_of(after.rig, after.anchors, rows, maps).cross_valid
         if after.size == 0:
             assert after.rig is state.rig and after.damping > state.damping
@@ -60,26 +61,26 @@ def test_a_step_lowers_data_and_prior_together(scene, mode, weight):
 def test_a_step_that_lowers_only_the_data_cost_is_not_taken(scene):
     """The prior holds all poses: judged by the data alone, steps away from it would continue forever."""
     true, maps, rig, anchors, rows = scene
-    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
-    prior = prior_of(1.0, rig, scale=1e-7)
-    state = LMState(rig, anchors, SETTINGS.damping)
+    kernel = kernel_for(anchors, rows)
+    prior = prior_term(1.0, rig, scale=1e-7)
+    state = LMState(rig, anchors, DAMPING)
     for _ in range(3):
         linear = linearise(state.rig, state.anchors, rows, maps)
-        state = lm_step(state, linear, rows, maps, kernel, prior, free_parameters("free", rig), SETTINGS)
+        state = lm_step(state, linear, rows, maps, kernel, prior, free_parameters("free", rig))
     assert (state.rig.T_world_camera - rig.T_world_camera).abs().max() < 1e-6
     assert (state.rig.T_world_camera - true.T_world_camera).abs().max() > 1e-3
 
 
-def test_an_undamped_step_solves_the_normal_equations(scene):
+def test_an_undamped_step_solves_the_normal_equations(scene, monkeypatch):
     true, maps, _, _, _ = scene
     rig, generator = disturbed(true, 2, degrees=0.02, shift=0.0005, relative=0.2), torch.Generator().manual_seed(1)
     anchors = place_anchors(rig, maps, 60, generator)
     rows = observe(rig, anchors, maps, 3, 2.0, 0.1, generator)
-    kernel = Kernel(torch.full((FRAMES,), 1e3, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
-    linear, prior = linearise(rig, anchors, rows, maps), prior_of(1.0, rig)
-    settings = replace(SETTINGS, damping=0.0, least_depth=0.0, most_depth=10.0)
-    free = free_parameters("free", rig)
-    found = lm_step(LMState(rig, anchors, 0.0), linear, rows, maps, kernel, prior, free, settings)
+    kernel = kernel_for(anchors, rows, 1e3)
+    linear, prior = linearise(rig, anchors, rows, maps), prior_term(1.0, rig)
+    monkeypatch.setattr(levenberg_marquardt, "_LEAST_DEPTH", 0.0)
+    monkeypatch.setattr(levenberg_marquardt, "_MOST_DEPTH", 10.0)
+    found = lm_step(LMState(rig, anchors, 0.0), linear, rows, maps, kernel, prior, free_parameters("free", rig))
     equations = normal_equations(linear, rows, *kernel.weights(linear.residuals))
     H, g = dense(equations)
     H_prior, g_prior = prior.equations(rig)
@@ -93,19 +94,21 @@ def test_an_undamped_step_solves_the_normal_equations(scene):
 
 def test_with_nothing_free_nothing_moves(scene):
     _, maps, rig, anchors, rows = scene
-    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
+    kernel = kernel_for(anchors, rows)
     state, linear = LMState(rig, anchors, 0.1), linearise(rig, anchors, rows, maps)
-    found = lm_step(state, linear, rows, maps, kernel, prior_of(1.0, rig), free_parameters("off", rig), SETTINGS)
+    found = lm_step(state, linear, rows, maps, kernel, prior_term(1.0, rig), free_parameters("off", rig))
     assert found == LMState(rig, anchors, 0.1)
 
 
-@pytest.mark.parametrize("mode", ["free", "known-rig", "rigid-rig", "static-projector"])
-def test_conjugate_gradients_end_where_factorisation_does(scene, mode):
+@pytest.mark.parametrize("mode", MODES)
+def test_conjugate_gradients_end_where_factorisation_does(scene, mode, monkeypatch):
     _, maps, rig, anchors, rows = scene
-    kernel = Kernel(torch.full((FRAMES,), 3.0, dtype=torch.float64), anchors.frame, rows.pairs(anchors))
-    linear, prior = linearise(rig, anchors, rows, maps), prior_of(1e-2, rig)
+    kernel = kernel_for(anchors, rows)
+    linear, prior = linearise(rig, anchors, rows, maps), prior_term(1e-2, rig)
     equations, free = normal_equations(linear, rows, *kernel.weights(linear.residuals)), free_parameters(mode, rig)
-    iterative = replace(SETTINGS, factorised_frames=0, iterative_tolerance=1e-9)
-    exact, found = (damped_solver(equations, prior.equations(rig), free, s)(1e-4) for s in (SETTINGS, iterative))
+    exact = damped_solver(equations, prior.equations(rig), free)(1e-4)
+    monkeypatch.setattr(levenberg_marquardt, "_FACTORISED_FRAMES", 0)
+    monkeypatch.setattr(levenberg_marquardt, "_ITERATIVE_TOLERANCE", 1e-9)
+    found = damped_solver(equations, prior.equations(rig), free)(1e-4)
     assert exact is not None and found is not None
     assert (found - exact).norm() < 1e-6 * exact.norm()

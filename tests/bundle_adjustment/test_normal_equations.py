@@ -13,15 +13,19 @@ from .analytic import ExactMaps, columns_of, dense, disturbed, rig_of, without_p
 FRAMES, SIZE = 3, 60
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_eliminated_depths_change_no_step(seed):
-    """Dense equations of poses and depths together, their Schur complement, and the depths that follow from a step."""
-    true = rig_of(FRAMES, SIZE)
-    maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(seed)
-    rig = disturbed(true, seed, degrees=0.3, shift=0.01, relative=0.5)
+def linear_system(seed: int):
+    """Anchors, rows and derivatives at disturbed poses."""
+    true, generator = rig_of(FRAMES, SIZE), torch.Generator().manual_seed(seed)
+    maps, rig = ExactMaps.around(true, SIZE), disturbed(true, seed, degrees=0.3, shift=0.01, relative=0.5)
     anchors = place_anchors(rig, maps, 25, generator)
     rows = observe(rig, anchors, maps, 2, float("inf"), 0.1, generator)
-    linear = linearise(rig, anchors, rows, maps)
+    return anchors, rows, linearise(rig, anchors, rows, maps), generator
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_eliminated_depths_change_no_step(seed):
+    """Dense equations of poses and depths together, their Schur complement, and the depths that follow from a step."""
+    anchors, rows, linear, generator = linear_system(seed)
     own_weight = torch.rand(len(anchors.frame), generator=generator, dtype=torch.float64) + 0.1
     cross_weight = torch.rand(len(rows.anchor), generator=generator, dtype=torch.float64) * linear.residuals.cross_valid
     found = normal_equations(linear, rows, own_weight, cross_weight)
@@ -57,13 +61,8 @@ def test_eliminated_depths_change_no_step(seed):
 
 @pytest.mark.parametrize("frames", [[2, 0], [1]])
 def test_some_frames_have_their_part_of_the_equations(frames):
-    true = rig_of(FRAMES, SIZE)
-    maps, generator = ExactMaps.around(true, SIZE), torch.Generator().manual_seed(3)
-    rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
-    anchors = place_anchors(rig, maps, 25, generator)
-    rows = observe(rig, anchors, maps, 2, float("inf"), 0.1, generator)
-    linear, ones = linearise(rig, anchors, rows, maps), torch.ones(len(anchors.frame), dtype=torch.float64)
-    weights = ones, linear.residuals.cross_valid.double()
+    anchors, rows, linear, _ = linear_system(3)
+    weights = torch.ones(len(anchors.frame), dtype=torch.float64), linear.residuals.cross_valid.double()
     some, n = torch.tensor(frames), 12 * len(frames)
     part, whole = normal_equations(linear, rows, *weights, some), normal_equations(linear, rows, *weights)
     H = without_prior(whole).reshape(FRAMES, 12, FRAMES, 12)[some][:, :, some].reshape(n, n)

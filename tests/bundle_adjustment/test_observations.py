@@ -1,17 +1,26 @@
-"""Which pixels take part, and which other frames see them: against ray casting of an analytic scene."""
+"""Which pixels take part, which other frames see them (against ray casting), and how the robust kernel weighs them."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
+from sl_nerfstudio.bundle_adjustment import observations
 from sl_nerfstudio.bundle_adjustment.observations import (
+    Kernel,
     away_from_borders,
-    involving,
+    frame_medians,
+    narrowed,
+    noise_of,
+    noise_ratios,
     observe,
     partners,
     place_anchors,
+    useful_distance,
 )
+from sl_nerfstudio.bundle_adjustment.residuals import Residuals
 from sl_nerfstudio.geometry.lie import rotate, transform
 
 from .analytic import ExactMaps, cast, rig_of
@@ -88,24 +97,12 @@ def test_surfaces_seen_at_a_flat_angle_are_left_out(scene):
         assert ((way * normal[strict.anchor]).sum(-1) > 0.6).all()
 
 
-@pytest.mark.parametrize("most", [1, 2])
-def test_no_anchor_is_looked_up_more_often_than_wanted(scene, most):
+def test_no_anchor_is_looked_up_more_often_than_wanted(scene):
     rig, maps, anchors = scene
-    rows = observe(rig, anchors, maps, most, ALL, 0.1, torch.Generator().manual_seed(1))
-    count = torch.bincount(rows.anchor)
-    assert count.max() == most
     everything = torch.bincount(observe(rig, anchors, maps, FRAMES, ALL, 0.1, torch.Generator().manual_seed(2)).anchor)
-    assert torch.equal(count, everything.clamp_max(most))
-
-
-def test_around_one_frame_selects_all_observations_that_involve_it(scene):
-    rig, maps, anchors = scene
-    generator = torch.Generator().manual_seed(1)
-    rows = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator)
-    around = observe(rig, anchors, maps, FRAMES, ALL, 0.1, generator, involving(2, FRAMES))
-    mine = (anchors.frame[rows.anchor] == 2) | (rows.frame == 2)
-    wanted = set(zip(rows.anchor[mine].tolist(), rows.frame[mine].tolist(), strict=True))
-    assert set(zip(around.anchor.tolist(), around.frame.tolist(), strict=True)) == wanted
+    for most in (1, 2):
+        rows = observe(rig, anchors, maps, most, ALL, 0.1, torch.Generator().manual_seed(1))
+        assert torch.equal(torch.bincount(rows.anchor), everything.clamp_max(most))
 
 
 def test_partners_see_the_same_surface_and_are_few(scene):
@@ -139,3 +136,127 @@ def test_what_is_near_the_border_falls_away_with_its_rows(scene):
     expected = (own >= limit[anchors.frame])[rows.anchor] & (seen >= limit[rows.frame])
     assert torch.equal(left.frame, rows.frame[expected])
     assert torch.equal(kept.depth[left.anchor], anchors.depth[rows.anchor[expected]])
+
+
+# The robust kernel.
+
+FRAME = torch.tensor([0, 0, 1, 2])  # of four anchors
+PAIR = torch.tensor([[0, 0, 1, 2, 2], [1, 2, 0, 0, 1]])  # of five rows
+
+
+def residuals(seed: int, size: float = 1.0, invalid: bool = False) -> Residuals:
+    generator = torch.Generator().manual_seed(seed)
+    own, cross = (size * torch.randn(n, 2, generator=generator, dtype=torch.float64) for n in (4, 5))
+    valid = torch.ones(5, dtype=torch.bool)
+    valid[3] = not invalid
+    return Residuals(own, cross, valid)
+
+
+def kernel(*widths: float) -> Kernel:
+    return Kernel(torch.tensor(widths, dtype=torch.float64), FRAME, PAIR)
+
+
+@given(st.integers(0, 50), st.floats(0.05, 20.0), st.booleans())
+def test_weights_are_the_derivative_of_the_cost(seed, size, invalid):
+    """Half the gradient of the cost is weight times residual, so a step of the normal equations descends."""
+    r, k = residuals(seed, size, invalid), kernel(0.5, 2.0, 1.0)
+    own, cross = r.own.clone().requires_grad_(), r.cross.clone().requires_grad_()
+    (w_own, w_cross), own2, cross2 = k.weights(r), k.width[FRAME] ** 2, k.width[PAIR].amax(0) ** 2
+    squares = ((own**2).sum(-1), own2), ((cross**2).sum(-1)[r.cross_valid], cross2[r.cross_valid])
+    cost = k.narrowest**2 * sum((r2 / (w2 + r2)).sum() for r2, w2 in squares)
+    assert k.cost(r, r.cross_valid) == pytest.approx(cost.item(), rel=1e-12)
+    g_own, g_cross = torch.autograd.grad(cost, (own, cross))
+    assert torch.allclose(g_own / 2, w_own[:, None] * r.own, rtol=1e-10, atol=1e-14)
+    assert torch.allclose(g_cross / 2, w_cross[:, None] * r.cross, rtol=1e-10, atol=1e-14)
+
+
+@given(st.integers(0, 50), st.floats(0.05, 1.0), st.booleans())
+def test_curvature_is_that_of_the_cost_relative_to_its_weights(seed, size, invalid):
+    r, k = residuals(seed, size, invalid), kernel(0.5, 2.0, 1.0)
+    squares = torch.cat([k.width[FRAME] ** 2, k.width[PAIR].amax(0)[r.cross_valid] ** 2])
+    values = torch.cat([r.own, r.cross[r.cross_valid]])
+
+    def cost(x):
+        r2 = (x.reshape(-1, 2) ** 2).sum(-1)
+        return k.narrowest**2 * (r2 / (squares + r2)).sum()
+
+    hessian = torch.autograd.functional.hessian(cost, values.reshape(-1))
+    weights = torch.cat([k.weights(r)[0], k.weights(r)[1][r.cross_valid]])
+    assert k.curvature(r) == pytest.approx(float(hessian.trace() / 4 / weights.sum()), rel=1e-9, abs=1e-12)
+
+
+def test_a_gross_error_costs_the_same_at_any_width_and_what_cannot_be_seen_has_no_weight():
+    far = Residuals(*(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)), torch.ones(5, dtype=torch.bool))
+    for widths in ((0.5, 2.0, 1.0), (0.5, 0.5, 0.5)):
+        assert kernel(*widths).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
+    r = residuals(1, invalid=True)
+    weight = kernel(1.0, 1.0, 1.0).weights(r)[1]
+    assert weight[3] == 0 and (weight[r.cross_valid] > 0).all()
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=40), st.integers(0, 1000))
+def test_medians_are_of_the_residuals_that_involve_a_frame_also_with_equal_values(values, seed):
+    """Each row involves frames 0 and 1, half of them in the other order; frame 2 has none."""
+    size = torch.tensor(values, dtype=torch.float64)
+    valid = torch.rand(len(values), generator=torch.Generator().manual_seed(seed)) < 0.8
+    rows = torch.stack([size, torch.zeros_like(size)], -1)
+    turned = torch.arange(len(values)) % 2
+    found = frame_medians(Residuals(torch.zeros(1, 2).double(), rows, valid), torch.stack([turned, 1 - turned]), 3)
+    expected = size[valid].median() if valid.any() else torch.tensor(float("inf")).double()
+    assert (found[:2] == expected).all() and torch.isinf(found[2])
+
+
+@given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
+def test_widths_narrow_gradually_and_never_widen(width, target):
+    old, new = (torch.tensor([value], dtype=torch.float64) for value in (width, target))
+    found = float(narrowed(old, new))
+    assert found == pytest.approx(min(width, max(target, width / observations._FASTEST)), rel=1e-12)
+    assert float(narrowed(torch.full_like(old, float("inf")), new)) == pytest.approx(target)
+
+
+def test_the_noise_is_the_robust_sigma_of_the_inliers():
+    generator = torch.Generator().manual_seed(0)
+    cross = 0.3 * torch.randn(20000, 2, generator=generator, dtype=torch.float64)
+    cross[::10] += 50.0
+    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20000, dtype=torch.bool))
+    assert noise_of(r, 0.9) == pytest.approx(0.3, rel=0.03)
+    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
+    assert noise_of(exact, 0.9) == observations.NOISE_FLOOR_PX
+
+
+def test_look_ups_that_see_obliquely_are_as_noisy_as_their_residuals_say():
+    """Residuals three times as large below a cosine of 0.5: their kernel is as much wider, their weight smaller."""
+    generator = torch.Generator().manual_seed(3)
+    cosine = torch.rand(20_000, generator=generator, dtype=torch.float64)
+    noise = torch.where(cosine < 0.5, 0.3, 0.1).double()
+    cross = noise[:, None] * torch.randn(20_000, 2, generator=generator, dtype=torch.float64)
+    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20_000, dtype=torch.bool))
+    ratio = noise_ratios(r, cosine)
+    assert ratio[cosine < 0.48].median() / ratio[cosine > 0.52].median() == pytest.approx(3.0, rel=0.1)
+    pair = torch.zeros(2, 20_000, dtype=torch.long)
+    one = Kernel(torch.tensor([1.0], dtype=torch.float64), torch.tensor([0]), pair, ratio)
+    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
+    assert torch.allclose(one.weights(exact)[1], 1 / ratio**2)
+    none = Residuals(torch.zeros(1, 2).double(), torch.zeros(3, 2).double(), torch.zeros(3, dtype=torch.bool))
+    assert (noise_ratios(none, torch.rand(3).double()) == 1).all()
+
+
+def noisy(worse_below: float, factor: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances up to 40 pixels, and residuals that are larger near the border."""
+    generator = torch.Generator().manual_seed(4)
+    distance = (40 * torch.rand(20000, generator=generator, dtype=torch.float64)).floor()
+    size = torch.randn(20000, 2, generator=generator, dtype=torch.float64).norm(dim=-1)
+    return distance, torch.where(distance < worse_below, factor * size, size)
+
+
+def test_look_ups_are_useful_from_where_residuals_are_no_larger_than_usual():
+    """Classes are an eighth of all, five pixels wide."""
+    assert useful_distance(*noisy(10, 2.0)) == pytest.approx(10, abs=1)
+    assert useful_distance(*noisy(0, 1.0)) == 0
+    assert useful_distance(torch.zeros(0), torch.zeros(0)) == 0
+    # at most half of the look-ups fall away
+    distance, size = noisy(30, 3.0)
+    least = useful_distance(distance, torch.where(distance < 20, 3 * size, size))
+    assert least == pytest.approx(20, abs=1)
+    distance, size = noisy(0, 1.0)
+    assert useful_distance(distance, torch.where(distance > 30, 9 * size, size)) == 0

@@ -7,7 +7,7 @@ from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.evaluate import Evaluation
 from sl_nerfstudio.evaluation.judgement import judge
 from sl_nerfstudio.review.verdict import DepartedFrame
-from tests.verdict.cases import ring
+from tests.review.cases import ring
 
 FRAME = FrameAgreement("frame_00000", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)
 AGREEMENT = CaptureAgreement(0.35, 1.0, 0.2, 0.95, 0.99, 0.5, 20.0, (FRAME, replace(FRAME, name="frame_00001")))

@@ -60,3 +60,9 @@ def _at(camera: Device, projector: Device, T: Float64[ndarray, "4 4"]) -> _Geome
     length = np.sqrt(1 + (row / 2.6) ** 2 + (column / 2.6) ** 2)
     far, near = 0.245 + 0.03 * column + 0.015 * row, 0.27 - 0.02 * column
     return _Geometry(EpipolarLines.of(camera, projector, T), np.where(row < 0.05, near, far) / length)
+
+
+def across(lines: EpipolarLines, w: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w 2"]:
+    """Unit vectors perpendicular to the lines in the pattern's image."""
+    slope = lines.slopes(w)
+    return np.stack([-slope[..., 1], slope[..., 0]], -1) / np.linalg.norm(slope, axis=-1, keepdims=True)

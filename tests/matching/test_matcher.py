@@ -1,13 +1,17 @@
-"""Captures matched along the lines of their poses."""
+"""Captures matched along the lines of their poses, the fit to the image, and what tells right matches from wrong."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sl_nerfstudio.matching.lines import MATCHING_DEFAULTS, enlarged, pixels_a_period
-from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from tests.matching.scene import PATTERN, PERIOD, step_scene
+from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
+from sl_nerfstudio.matching import matcher
+from sl_nerfstudio.matching.costs import StereoMatches
+from sl_nerfstudio.matching.matcher import FEATURES, RIGHT, DecodedImage, LineFit, LineMatcher, Logistic, features_of
+from tests.matching.scene import PATTERN, PERIOD, across, step_scene
+
+SIZE = 200 / 15
 
 
 def decoded_of(scene, seed=2):
@@ -21,6 +25,11 @@ def decoded_of(scene, seed=2):
     return DecodedImage(scene.image, coords, np.ones(coords.shape[:2], bool))
 
 
+def match(scene, image, T=None):
+    pose = scene.T_camera_projector if T is None else T
+    return LineMatcher(PATTERN).match(image, scene.camera, scene.projector, pose)
+
+
 @pytest.fixture(scope="module")
 def scene():
     return step_scene()
@@ -28,11 +37,11 @@ def scene():
 
 @pytest.fixture(scope="module")
 def matched(scene):
-    return LineMatcher(PATTERN).match(decoded_of(scene), scene.camera, scene.projector, scene.T_camera_projector)
+    return match(scene, decoded_of(scene))
 
 
-def share_right(scene, coords, within=2.0):
-    return (np.linalg.norm(coords - scene.coords, axis=-1) < within).mean()
+def share_right(scene, coords):
+    return (np.linalg.norm(coords - scene.coords, axis=-1) < 2).mean()
 
 
 def test_what_was_not_decoded_is_matched_up_to_the_step(scene, matched):
@@ -47,29 +56,22 @@ def test_what_was_not_decoded_is_matched_up_to_the_step(scene, matched):
 def test_the_unit_of_length_does_not_matter(scene, matched):
     longer = scene.T_camera_projector.copy()
     longer[:3, 3] *= 1000
-    again = LineMatcher(PATTERN).match(decoded_of(scene), scene.camera, scene.projector, longer)
-    np.testing.assert_allclose(again, matched, atol=2e-3)
+    np.testing.assert_allclose(match(scene, decoded_of(scene), longer), matched, atol=2e-3)
 
 
-def test_a_wrong_pose_changes_nothing(scene):
+def test_a_wrong_pose_or_hardly_anything_decoded_changes_nothing(scene):
     image, wrong = decoded_of(scene), scene.T_camera_projector.copy()
     wrong[:3, 3] = [0.0, 1.0, 0.0]
-    assert LineMatcher(PATTERN).match(image, scene.camera, scene.projector, wrong) is image.coords
-
-
-def test_hardly_anything_decoded_changes_nothing(scene):
-    image = decoded_of(scene)
+    assert match(scene, image, wrong) is image.coords
     coords = np.full_like(image.coords, np.nan)
     coords[50:58, 50:58] = image.coords[50:58, 50:58]
-    few = replace(image, coords=coords)
-    assert LineMatcher(PATTERN).match(few, scene.camera, scene.projector, scene.T_camera_projector) is coords
+    assert match(scene, replace(image, coords=coords)) is coords
 
 
-def test_strips_give_what_the_whole_gives(scene, matched):
-    small = replace(MATCHING_DEFAULTS, most_bytes=200 * 40 * 3 * 120, strip_margin=4.0)
-    strips = LineMatcher(PATTERN, small).match(
-        decoded_of(scene), scene.camera, scene.projector, scene.T_camera_projector
-    )
+def test_strips_give_what_the_whole_gives(monkeypatch, scene, matched):
+    monkeypatch.setattr(matcher, "MOST_BYTES", 200 * 40 * 3 * 120)
+    monkeypatch.setattr(matcher, "STRIP_MARGIN", 4.0)
+    strips = match(scene, decoded_of(scene))
     both = np.isfinite(strips[..., 0]) & np.isfinite(matched[..., 0])
     assert both.mean() > 0.98 * np.isfinite(matched[..., 0]).mean()
     assert (np.linalg.norm(strips - matched, axis=-1)[both] > 0.2).mean() < 0.01
@@ -77,37 +79,136 @@ def test_strips_give_what_the_whole_gives(scene, matched):
 
 def test_large_images_are_matched_on_means_of_squares():
     scene = step_scene(side=600)
-    matched = LineMatcher(PATTERN).match(decoded_of(scene), scene.camera, scene.projector, scene.T_camera_projector)
+    matched = match(scene, decoded_of(scene))
     error = np.linalg.norm(matched - scene.coords, axis=-1)
     known = np.isfinite(error)
     assert matched.shape == scene.coords.shape and known.mean() > 0.95
     assert np.median(error[known]) < 0.1 and (error[known] > 2).mean() < 0.015
 
 
-@pytest.mark.parametrize("pixels", [8.0, 15.0, 40.0])
-def test_the_size_of_a_period_is_measured(pixels):
-    y, x = np.mgrid[:120, :130] * PERIOD / pixels
-    coords = np.stack([0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y], -1).astype(np.float32)
-    coords[30:50] = np.nan
-    assert pixels_a_period(coords, PERIOD) == pytest.approx(pixels, rel=1e-3)
-    assert pixels_a_period(np.full_like(coords, np.nan), PERIOD) is None
+# ------------------------------------------------------------------ the fit to the image
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3])
-def test_coordinates_are_enlarged_exactly_where_surfaces_are_flat(factor):
-    """Also beside a jump, where what lies beyond must not be mixed in; pixels beyond the last square are unknown."""
-    h, w = 61, 47
-    y, x = np.mgrid[:h, :w] + 0.5
-    fine = np.stack([1.3 * x + 0.2 * y, 0.9 * y - 0.1 * x], -1)
-    fine[:, 24:] += 300.0
-    middle = (slice(0, h // factor * factor), slice(0, w // factor * factor))
-    coarse = fine[middle].reshape(h // factor, factor, w // factor, factor, 2).mean((1, 3)).astype(np.float32)
-    coarse[3, 4] = np.nan
-    out = enlarged(coarse, factor, (h, w), PERIOD)
-    known = np.isfinite(out[..., 0])
-    assert not known[3 * factor : 4 * factor, 4 * factor : 5 * factor].any()
-    assert not known[h // factor * factor :].any() and not known[:, w // factor * factor :].any()
-    split = 24 // factor * factor
-    whole = known.copy()
-    whole[:, split : split + factor] &= 24 % factor == 0  # squares on both sides of the jump
-    np.testing.assert_allclose(out[whole], fine[whole], atol=1e-3)
+def fitted(scene, start, lines=None):
+    grid = draw_sharpnesses(PATTERN.render(), PERIOD)[0]
+    return LineFit(grid, SIZE).fitted(scene.image, lines or scene.lines, start)
+
+
+def errors(scene, coords):
+    """Errors along the lines and across them, pattern pixels, away from the image's border and from the step."""
+    inner = np.ones(coords.shape[:2], bool)
+    inner[:10], inner[-10:], inner[:, :10], inner[:, -10:], inner[100:120] = (False,) * 5
+    beside = across(scene.lines, scene.inverse_distance)
+    apart = coords - scene.coords
+    along = apart[..., 0] * beside[..., 1] - apart[..., 1] * beside[..., 0]
+    return along[inner], (apart * beside).sum(-1)[inner]
+
+
+def moved_start(scene, pixels):
+    """Matches that are some pattern pixels off."""
+    return scene.inverse_distance + pixels / np.linalg.norm(scene.lines.slopes(scene.inverse_distance), axis=-1)
+
+
+def rough_start(scene):
+    """Matches as the steps of the inverse distance leave them: half a pattern pixel off, differently everywhere."""
+    return moved_start(scene, np.random.default_rng(1).normal(0, 0.5, scene.inverse_distance.shape))
+
+
+def test_rough_matches_become_exact_on_both_sides_of_a_step(scene):
+    along, beside = errors(scene, fitted(scene, rough_start(scene)))
+    assert np.isfinite(along).all()
+    assert np.sqrt((along**2).mean()) < 0.06 and np.sqrt((beside**2).mean()) < 0.05
+
+
+def test_a_match_that_is_off_everywhere_is_drawn_to_the_image(scene):
+    along, _ = errors(scene, fitted(scene, moved_start(scene, 0.8)))
+    assert abs(np.median(along)) < 0.15
+
+
+def test_a_pose_that_is_off_shows_across_the_lines(scene):
+    """The offset is what tells the joint adjustment where the projector stands: it must not be taken away."""
+    moved = np.array([0.3, 0.5], np.float32)
+    lines = replace(scene.lines, offset=scene.lines.offset - moved)  # as lines of a wrong pose run
+    _, beside = errors(scene, fitted(scene, lines.nearest(scene.coords), lines))
+    missed = abs((moved * across(scene.lines, scene.inverse_distance)).sum(-1)).mean()
+    assert missed > 0.3 and abs(np.median(beside)) < 0.35 * missed
+
+
+@pytest.mark.parametrize("noise, share", [(0.05, 0.9), (0.15, 0.8)])
+def test_noise_is_not_taken_for_detail(monkeypatch, noise, share):
+    """What the image says is weighed against the flat surface: errors along the lines stay below those without it."""
+    scene = step_scene(noise=noise)
+    rms = []
+    for detail in (0.02, 10.0):
+        monkeypatch.setattr(matcher, "DETAIL", detail)
+        along, _ = errors(scene, fitted(scene, rough_start(scene)))
+        rms.append(np.sqrt((along**2).mean()))
+    assert rms[0] < share * rms[1]
+
+
+def test_small_regions_are_left_out(scene):
+    start = scene.inverse_distance.copy()
+    start[40:46, 40:46] *= 1.2
+    coords = fitted(scene, start)
+    assert np.isnan(coords[41:45, 41:45]).all() and np.isfinite(coords[20:38, 20:38]).all()
+
+
+# ------------------------------------------------------------------ which matches are right
+
+COUNT = len(FEATURES)
+
+
+def flat_matches(shape=(40, 50)):
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    matches = (np.full(shape, 7, np.float32), np.full(shape, 20, np.uint8), np.full(shape, 99, np.float32))
+    return StereoMatches(*matches), np.stack([1.4 * x, 1.4 * y], -1)
+
+
+def features(matches, coords, decoded=None, mask=None):
+    decoded = coords if decoded is None else decoded
+    mask = np.ones(coords.shape[:2], bool) if mask is None else mask
+    correlation = np.full(coords.shape[:2], 0.9, np.float32)
+    return features_of(matches, coords, correlation, decoded, mask, 20.0, 14.0)
+
+
+def test_features_are_what_their_names_say():
+    matches, coords = flat_matches()
+    coords[:, 25:] += 40  # a jump between columns 24 and 25
+    matches.index[:, 25:] = 12
+    decoded = coords.copy()
+    decoded[:10] = np.nan
+    decoded[10:20, :, 0] += 5
+    found = features(matches, coords, decoded, np.arange(50)[None] < np.full((40, 1), 45))
+    margin, cost, at, elsewhere, mask, jump, correlation, between = np.moveaxis(found, -1, 0)
+    assert np.allclose(margin, np.log(100))
+    assert (cost == 20).all() and (correlation == np.float32(0.9)).all()
+    assert not at[:20].any() and at[20:].all()
+    assert not elsewhere[:10].any() and elsewhere[10:20].all() and not elsewhere[20:].any()
+    assert mask[:, :45].all() and not mask[:, 45:].any()
+    # The two columns beside the jump are at distance zero; the next ones are 1, 2, .. pixels of 14 a period away.
+    expected = np.log(np.minimum(np.abs(np.arange(50) - 24.5) - 0.5, 28) / 14 + 0.07)
+    np.testing.assert_allclose(jump[20], expected, atol=1e-5)
+    assert (between[:, 5:20] == 1).all() and (between[:, 24] < 0.7).all()
+
+
+def test_matches_on_a_steep_plane_lie_between_their_neighbours():
+    matches, coords = flat_matches()
+    y, x = np.mgrid[:40, :50].astype(np.float32)
+    steep = StereoMatches((3 * x - 2 * y + 90).astype(np.float32), matches.cost, matches.margin)
+    assert (features(steep, coords)[4:-4, 4:-4, -1] == 1).all()
+
+
+def test_a_match_at_the_decoded_place_far_from_jumps_is_right_and_a_lonely_one_beside_them_is_not():
+    matches, coords = flat_matches()
+    assert RIGHT.probability(features(matches, coords)).min() > 0.95
+    index = np.random.default_rng(0).uniform(0, 60, (40, 50)).astype(np.float32)
+    wild = StereoMatches(index, np.full((40, 50), 90, np.uint8), matches.margin * 0)
+    nowhere = np.full_like(coords, np.nan)
+    assert RIGHT.probability(features(wild, coords * 20, nowhere, np.zeros((40, 50), bool))).max() < 0.2
+
+
+def test_the_probability_is_logistic():
+    weights = np.arange(1.0, COUNT + 1) / 10
+    x = np.random.default_rng(1).normal(size=(3, 4, COUNT)).astype(np.float32)
+    expected = 1 / (1 + np.exp(-(0.3 + (x * weights).sum(-1))))
+    np.testing.assert_allclose(Logistic(0.3, tuple(weights)).probability(x), expected, rtol=1e-5)

@@ -33,8 +33,7 @@ def surface(folder: Path) -> np.ndarray:
     """Vertices of the observed surface after a short run, in world units."""
     loaded = load_scan(folder)
     config = SLModelConfig(schedule_iterations=STEPS)
-    alone, none = replace(config.adjustment.other_minima, searches=0), replace(config.adjustment.hops, most=0)
-    config.adjustment = replace(config.adjustment, anchors_per_frame=100, other_minima=alone, hops=none)
+    config.adjustment = replace(config.adjustment, anchors_per_frame=100, other_minima=0, hops=0)
     config.sdf.levels, config.sdf.max_resolution, config.sdf.hidden = 3, 64, 32
     torch.manual_seed(0)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

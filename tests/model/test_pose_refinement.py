@@ -13,7 +13,7 @@ import torch
 from sl_nerfstudio.bundle_adjustment.covariance import with_known_length
 from sl_nerfstudio.bundle_adjustment.parameters import gauge_directions
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, HopSettings, OtherMinimaSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import LoadedScan, PixelSamples, build_samples, scan_fingerprint
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, IntrinsicsChange
@@ -45,8 +45,8 @@ QUICK = AdjustmentSettings(
     anchors_per_frame=80,
     frames_per_anchor=3,
     max_iterations=14,
-    hops=HopSettings(most=0),
-    other_minima=OtherMinimaSettings(searches=0),
+    hops=0,
+    other_minima=0,
 )
 
 
@@ -101,7 +101,7 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
 
 def adjusted_poses(scan: Scan, samples: PixelSamples) -> ScanAdjustment:
     """The result of the adjustment without cross-validation."""
-    maps, _ = maps_and_held_out(scan, samples, QUICK)
+    maps, _ = maps_and_held_out(scan, samples)
     prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
     return adjusted(scan, S_SCENE_WORLD, scene_rig(scan, S_SCENE_WORLD), maps, "free", prior, QUICK)
 

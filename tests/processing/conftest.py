@@ -1,11 +1,9 @@
 """The toy pattern and decoder, known to sl-process for the length of a test, and one set of captures."""
 
-from dataclasses import replace
-
 import pytest
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.decoding.decoders import DECODERS
 from sl_nerfstudio.pattern.files import LAYOUTS
 from tests.decoding.ramps_decoder import RampsDecoder
@@ -14,9 +12,7 @@ from tests.processing.ramp_scan import RampScan, make_ramp_scan
 
 # For tests of what is made of an adjustment: rough, and without the question whether there are other minima.
 SHORT = RegisteredFramesSettings(
-    adjustment=AdjustmentSettings(
-        anchors_per_frame=200, max_iterations=16, other_minima=replace(AdjustmentSettings().other_minima, searches=0)
-    )
+    adjustment=AdjustmentSettings(anchors_per_frame=200, max_iterations=16, other_minima=0)
 )
 
 

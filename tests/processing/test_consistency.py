@@ -8,12 +8,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
+from sl_nerfstudio.bundle_adjustment import search as one_search
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
     RegisteredFramesSettings,
     adjust_registered,
     find_registered_minimum,
 )
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings, RelocalisationSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
@@ -43,7 +44,12 @@ NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
 
 
 QUICK = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
-ONE_START = replace(QUICK, adjustment=replace(QUICK.adjustment, relocalisation=RelocalisationSettings(1, starts=1)))
+
+
+def search_briefly(monkeypatch) -> None:
+    """Place lost frames once, from one start."""
+    monkeypatch.setattr(one_search, "_ROUNDS", 1)
+    monkeypatch.setattr(one_search, "_STARTS", 1)
 
 
 @pytest.fixture(autouse=True)
@@ -165,8 +171,9 @@ def test_a_frame_that_contradicts_again_where_it_was_placed_is_not_placed_a_thir
         return without_groups(true, [[k] for k in registration_gaps(registration) if k not in candidates])
 
     monkeypatch.setattr(consistency, "include_left_out", all_of_them)
+    search_briefly(monkeypatch)
     log = []
-    found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append, ONE_START)
+    found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append, QUICK)
     assert asked == [[1, MOVED]]
     assert adjusted == [[0, *everything[2:]], rest, everything, sorted([1, *rest])]
     assert np.flatnonzero(~found.registration.registered).tolist() == [MOVED]
@@ -229,15 +236,16 @@ def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_
     """On a plane along which frames slide; a stranger among them makes two adjustments of it."""
     monkeypatch.setattr(analytic, "BALLS", ())
     clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.02)), []
+    search_briefly(monkeypatch)
     search = adjustment.search
     monkeypatch.setattr(adjustment, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
     monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
-    found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None, ONE_START)
+    found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None, QUICK)
     kept = [k for k in range(FRAMES) if k != MOVED]
     assert np.flatnonzero(found.registration.registered).tolist() == kept
-    assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + QUICK.adjustment.other_minima.searches)]
-    wanted = adjust_registered(clouds, found.registration, ONE_START)
-    alone = find_registered_minimum(clouds, found.registration, ONE_START).frames
+    assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + QUICK.adjustment.other_minima)]
+    wanted = adjust_registered(clouds, found.registration, QUICK)
+    alone = find_registered_minimum(clouds, found.registration, QUICK).frames
     np.testing.assert_array_equal(found.adjusted.poses.T_world_camera, wanted.poses.T_world_camera)
     assert found.adjusted.sigma == wanted.sigma
     assert max(found.adjusted.sigma[k].camera_translation / alone.sigma[k].camera_translation for k in kept) > 1.5

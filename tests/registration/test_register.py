@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import RegisteredFramesSettings, adjust_registered
-from sl_nerfstudio.bundle_adjustment.settings import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.registered_frames import (
+    RegisteredFramesSettings,
+    adjust_registered,
+)
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.processing.result import contradiction
@@ -342,8 +345,7 @@ def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
 
 def small(anchors: int, iterations: int) -> RegisteredFramesSettings:
     """Settings without the question whether there are other minima."""
-    alone = replace(AdjustmentSettings().other_minima, searches=0)
-    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=alone)
+    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=0)
     return RegisteredFramesSettings(adjustment=adjustment)
 
 

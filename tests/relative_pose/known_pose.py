@@ -5,15 +5,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.relative_pose.epipolar import (
-    RELATIVE_POSE_DEFAULTS,
-    EpipolarFit,
-    covariance,
-    noise_of,
-    ray_pairs,
-    sampson,
-)
-from sl_nerfstudio.relative_pose.estimation import RelativePose
+from sl_nerfstudio.relative_pose.epipolar import EpipolarFit, covariance, noise_of, ray_pairs, sampson
+from sl_nerfstudio.relative_pose.estimation import INLIER_SIGMAS, RelativePose
 
 
 def known_pose(
@@ -23,13 +16,12 @@ def known_pose(
     camera: Device,
     projector: Device,
 ) -> RelativePose:
-    settings = RELATIVE_POSE_DEFAULTS
-    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector, settings.blocks)
+    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector)
     T = T_camera_projector.copy()
     T[:3, 3] /= np.linalg.norm(T[:3, 3])
     r = sampson(T[:3, :3], T[:3, 3], rays)
-    fit = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r, settings.fit.noise_floor_px), 0.0)
+    fit = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r))
     inliers, noise_px = np.zeros(len(uv_camera), dtype=bool), np.full(len(uv_camera), np.nan)
-    inliers[usable] = np.abs(r) < settings.inlier_sigmas * fit.noise_px
+    inliers[usable] = np.abs(r) < INLIER_SIGMAS * fit.noise_px
     noise_px[usable] = fit.noise_px
-    return RelativePose(T, covariance(fit, rays, settings.fit), inliers, fit.noise_px, noise_px, 1.0, ())
+    return RelativePose(T, covariance(fit, rays), inliers, fit.noise_px, noise_px, 1.0, ())

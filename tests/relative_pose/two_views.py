@@ -7,12 +7,7 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 
 CAMERA = Device(640, 480, 800.0, 790.0, 322.0, 238.0)
 PROJECTORS = {
@@ -90,3 +85,14 @@ def errors_deg(T_found: ndarray, T_true: ndarray) -> tuple[float, float]:
     a, b = (T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (T_found, T_true))
     swing = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
     return float(np.degrees(turn)), float(np.degrees(swing))
+
+
+def true_pose(frame: View) -> tuple[ndarray, ndarray]:
+    """The rotation and the unit baseline of a frame."""
+    T = frame.T_camera_projector
+    return T[:3, :3], T[:3, 3] / np.linalg.norm(T[:3, 3])
+
+
+def matrix_of(R: ndarray, t: ndarray) -> ndarray:
+    """A pose as a matrix."""
+    return np.block([[R, t[:, None]], [np.zeros(3), 1.0]])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.calibration.board_adjustment import find_corners
+from sl_nerfstudio.calibration.board_captures import find_corners
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.pattern.gray_code import GrayCode

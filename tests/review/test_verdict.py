@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
-from tests.verdict.cases import ring
+from tests.review.cases import ring
 
 N = 12
 NAMES = [f"f{k:02d}" for k in range(N)]
@@ -25,56 +25,43 @@ def test_a_scan_without_any_doubt_is_good():
     verdict = judge_scan(scan())
     assert verdict.band == "good" and verdict.reasons == ()
     assert judge_scan(ScanFacts(GOOD)).band == "good"  # what is not known is not judged
+    background = {k: {"decoded_share": 0.2, "shared_decoded": 0.8} for k in range(N)}  # that no frame decodes
+    assert judge_scan(scan(background)).band == "good"
 
 
 @pytest.mark.parametrize(
-    ("change", "one", "words"),
+    ("change", "fact"),
     [
-        ({"undecided": True}, "acceptable", "f03: the pose is undecided; along the surface, others fit as well"),
-        ({"sigma_rotation_deg": 5.0}, "poor", "f03: rotation known only to 5 degrees"),
-        ({"decoded_share": 0.2}, "acceptable", "f03: only 20% of the visible pattern was decoded (at least 50%)"),
-        (
-            {"decoded_share": 0.9, "shared_decoded": 0.3},
-            "acceptable",
-            "f03: only 30% of the surface that other frames show was decoded (at least 50%)",
-        ),
-        ({"decoded_share": 0.0}, "acceptable", "f03: only 0% of the visible pattern was decoded"),
-        ({"missing_share": 0.07}, "acceptable", "f03: saw nothing of the pattern where other frames show a surface"),
-        ({"missing_share": 0.2}, "acceptable", "(20% of it in the worst of them; at most 5%)"),
-        ({"own_share": 0.1}, "acceptable", "f03: only 10% of the decoded pixels agree with the pose of the projector"),
-        ({"in_scan": False, "component": None}, "acceptable", "1 of 12 frames were left out: f03"),
-        (
-            {"in_scan": False, "component": 1},
-            "acceptable",
-            "f03: stands alone; the connection to the other frames is not",
-        ),
+        ({"undecided": True}, "the pose is undecided"),
+        ({"sigma_rotation_deg": 5.0}, "to 5 degrees"),
+        ({"decoded_share": 0.2}, "only 20% of the visible pattern"),
+        ({"decoded_share": 0.9, "shared_decoded": 0.3}, "only 30% of the surface that other frames show"),
+        ({"decoded_share": 0.0}, "only 0% of the visible pattern"),
+        ({"missing_share": 0.07}, "saw nothing of the pattern"),
+        ({"missing_share": 0.2}, "(20% of it in the worst of them; at most 5%)"),
+        ({"own_share": 0.1}, "only 10% of the decoded pixels"),
+        ({"in_scan": False, "component": None}, "1 of 12 frames were left out"),
+        ({"in_scan": False, "component": 1}, "stands alone"),
     ],
 )
-def test_one_frame_is_enough_and_many_make_it_poor(change, one, words):
+def test_one_frame_is_enough_and_many_make_it_poor(change, fact):
     verdict = judge_scan(scan({3: change}))
-    assert verdict.band == one
-    assert any(words in reason for reason in verdict.reasons)
+    assert verdict.band == ("poor" if "sigma_rotation_deg" in change else "acceptable")
+    assert any("f03" in reason and fact in reason for reason in verdict.reasons)
     assert judge_scan(scan({k: change for k in range(4)})).band == "poor"  # more than a quarter
 
 
 @pytest.mark.parametrize("frames", [1, N])
 def test_rotations_known_to_a_degree_are_acceptable_however_many(frames):
     verdict = judge_scan(scan({k: {"sigma_rotation_deg": 1.3 + 0.1 * k} for k in range(frames)}))
-    worst = 1.3 + 0.1 * (frames - 1)
     assert verdict.band == "acceptable" and len(verdict.reasons) == 1
-    assert f"rotation known only to {worst:.2g} degrees (1 sigma of the least certain; at most 1)" in verdict.reasons[0]
+    assert f"{1.3 + 0.1 * (frames - 1):.2g} degrees" in verdict.reasons[0] and "at most 1)" in verdict.reasons[0]
 
 
 def test_frames_that_are_lost_and_frames_that_are_loose_are_named_apart():
     verdict = judge_scan(scan({3: {"sigma_rotation_deg": 5.0}, 4: {"sigma_rotation_deg": 1.3}}))
     lost, loose = verdict.reasons[:2]
-    assert lost.startswith("f03: rotation known only to 5 degrees") and "at most 3)" in lost
-    assert loose.startswith("f04: rotation known only to 1.3 degrees") and "at most 1)" in loose
-
-
-def test_background_that_no_frame_decodes_is_no_fault():
-    verdict = judge_scan(scan({k: {"decoded_share": 0.2, "shared_decoded": 0.8} for k in range(N)}))
-    assert verdict.band == "good" and verdict.reasons == ()
+    assert lost.startswith("f03:") and "at most 3)" in lost and loose.startswith("f04:") and "at most 1)" in loose
 
 
 def test_the_usual_uncertainty_of_a_registration_is_no_fault_of_its_frames():
@@ -88,23 +75,17 @@ def test_the_usual_uncertainty_of_a_registration_is_no_fault_of_its_frames():
 def test_an_object_that_looks_the_same_from_several_sides_is_never_trusted():
     verdict = judge_scan(scan(turns_deg=(60.0, 119.8)))
     assert verdict.band == "poor"
-    assert verdict.reasons[0].startswith("the object looks the same after a turn by 60, 120 degrees, and pairs of")
+    assert "the same after a turn by 60, 120 degrees" in verdict.reasons[0]
     ordered = judge_scan(scan(turns_deg=(60.0, 119.8), by_order=True))
-    assert ordered.band == "poor"
-    assert "placed by the order of capture" in ordered.reasons[0]
-    assert "in steps of less than 30 degrees" in ordered.reasons[0]
-
-
-def test_sides_that_the_order_of_capture_decided_are_not_certain():
-    verdict = judge_scan(scan(by_order=True))
-    assert verdict.band == "acceptable"
-    assert verdict.reasons[0].startswith("frames fit at several sides of the object; each was placed by the order of")
+    assert ordered.band == "poor" and "in steps of less than 30 degrees" in ordered.reasons[0]
+    alone = judge_scan(scan(by_order=True))
+    assert alone.band == "acceptable" and "placed by the order of capture" in alone.reasons[0]
 
 
 def test_a_group_of_its_own_is_named():
     verdict = judge_scan(scan({k: {"in_scan": False, "component": 1} for k in (2, 3, 4)}))
     assert verdict.band == "acceptable"
-    assert verdict.reasons[0].startswith("f02, f03, f04: form a group of their own; the connection to the other frames")
+    assert verdict.reasons[0].startswith("f02, f03, f04: form a group of their own")
 
 
 def test_pairs_that_contradict_others_and_pairs_on_which_everything_hangs():
@@ -131,7 +112,7 @@ def test_frames_that_agree_less_well_and_parts_that_share_nothing():
     frames = tuple(replace(f, excess=2.2 if k == 4 else 1.0) for k, f in enumerate(cross.frames))
     verdict = judge_scan(scan(cross=replace(cross, frames=frames)))
     assert verdict.band == "acceptable"
-    assert verdict.reasons[0].startswith("f04: agrees less well with the frames that saw the same surface: 2.2 times")
+    assert verdict.reasons[0].startswith("f04: agrees less well") and "2.2 times" in verdict.reasons[0]
     parts = np.where(np.arange(N)[:, None] // 6 == np.arange(N)[None] // 6, 1.0, np.nan)
     verdict = judge_scan(scan(cross=ring(parts)))
     assert verdict.band == "poor" and "no surface in common with the other frames" in verdict.reasons[0]

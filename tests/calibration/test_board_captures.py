@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_nerfstudio.calibration.board_adjustment import Corners, find_corners, other_board_seen
-from sl_nerfstudio.calibration.board_captures import corners_in_pattern
+from sl_nerfstudio.calibration.board_adjustment import Corners
+from sl_nerfstudio.calibration.board_captures import corners_in_pattern, find_corners, other_board_seen
 from sl_nerfstudio.pattern.boards import CharucoBoard, Chessboard, draw_board
 
 SQUARE_PX = 40

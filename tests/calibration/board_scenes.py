@@ -7,32 +7,17 @@ import torch
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.calibration.board_adjustment import (
-    BoardRig,
-    BoardView,
-    Corners,
-    FreeIntrinsics,
-    board_points,
-    sightings,
-)
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
+from sl_nerfstudio.calibration.board_adjustment import BoardRig, BoardView, Corners, board_points, sightings
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.pattern.boards import Chessboard
 
 BOARD = Chessboard(7, 5, 30.0)
 POINTS = board_points(BOARD.corners())
 CAMERA = Device(1280, 960, 1500.0, 1500.0, 652.0, 470.0, -0.1, 0.05)
 PLAIN_CAMERA = Device(1280, 960, 1500.0, 1500.0, 652.0, 470.0)
-PROJECTOR = Device(
-    1280, 800, 1700.0, 1700.0, 630.0, 960.0, -0.05
-)  # lens shift: centre 1.2 heights below the upper edge
+PROJECTOR = Device(1280, 800, 1700.0, 1700.0, 630.0, 960.0, -0.05)  # centre 1.2 heights below the upper edge
 PLAIN_PROJECTOR = Device(1280, 800, 1700.0, 1700.0, 630.0, 960.0)
 DOE = Device(800, 800, 900.0, 900.0, 405.0, 390.0, model="DOE")
-TERMS = {0: FreeIntrinsics(), 1: FreeIntrinsics(False, 1), 2: FreeIntrinsics(False, 2)}
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,9 @@ import pytest
 from sl_nerfstudio.calibration.board import calibrate, next_pose
 from sl_nerfstudio.cli.calibrate import next_pose_words, require_determined
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.review.verdict import (
-    CalibrationLimits,
-    judge_calibration,
-    shortcomings,
-    undetermined,
-)
-from tests.calibration.board.scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
+from sl_nerfstudio.review import verdict as verdicts
+from sl_nerfstudio.review.verdict import judge_calibration, shortcomings, undetermined
+from tests.calibration.board_scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
 
 pytestmark = pytest.mark.slow
 
@@ -90,16 +86,22 @@ def test_parallel_boards_are_refused_with_the_cause():
         require_determined(found)
 
 
-def test_a_verdict_names_the_device_and_what_lacks(both):
+def test_a_verdict_names_the_device_and_what_lacks(both, monkeypatch):
     _, found = both
-    strict = CalibrationLimits(good_focal=1e-9, acceptable_focal=1e-8, good_rms_px=0.01, least_tilt_deg=180.0)
-    verdict = judge_calibration(found, strict)
+
+    def limits(**changed) -> None:
+        for name, value in changed.items():
+            monkeypatch.setattr(verdicts, name, value)
+
+    limits(_FOCAL=(1e-9, 1e-8), _RMS_PX=(0.01, 1.5), _LEAST_TILT_DEG=180.0)
+    verdict = judge_calibration(found)
     assert verdict.band == "poor"
     assert "focal length of the camera is uncertain" in verdict.reasons[0] and "nearly parallel" in verdict.reasons[0]
     assert any("where the projector should see them" in reason for reason in verdict.reasons)
-    lenient = CalibrationLimits(good_focal=1.0, good_centre=1.0, good_rms_px=9.0, good_excess=99.0)
-    assert judge_calibration(found, lenient).band == "good" and not judge_calibration(found, lenient).reasons
-    assert shortcomings(found, CalibrationLimits(good_coverage=1.1))[-2:] == (
+    limits(_FOCAL=(1.0, 1.0), _CENTRE=(1.0, 1.0), _RMS_PX=(9.0, 9.0), _GOOD_PREDICTION=99.0)
+    assert judge_calibration(found).band == "good" and not judge_calibration(found).reasons
+    limits(_GOOD_COVERAGE=1.1)
+    assert shortcomings(found)[-2:] == (
         f"corners fill only {found.coverage.camera:.0%} of the camera's image",
         f"corners fill only {found.coverage.projector:.0%} of the pattern",
     )
