@@ -230,12 +230,6 @@ def test_trajectories_see_the_corner_at_the_right_pixel(kind):
         np.testing.assert_allclose(uv, pixel(PINHOLE, posed.T_world_device, CORNER), atol=1e-6)
 
 
-def test_tum_leaves_out_frames_that_are_not_placed_and_keeps_the_numbers_of_the_others():
-    times, _ = _tum(encode_tum(frames().cameras, (True, False, True), 1.0))
-    assert times.tolist() == [0, 2]
-    assert len(encode_kitti(frames().cameras, 1.0).splitlines()) == 3
-
-
 def test_the_script_holds_the_lens_and_whether_a_frame_is_placed():
     text = encode_blender(frames(placed=(True, False, True)), None).decode()
     devices = json.loads(text.split('r"""')[1].split('"""')[0])

@@ -1,4 +1,4 @@
-"""What the other process compiles is what a step calls."""
+"""What another process compiles is what a step calls."""
 
 import os
 import subprocess
@@ -11,7 +11,8 @@ from sl_nerfstudio.model.loop import finish, start
 
 STEP = """
 import torch
-from sl_nerfstudio.field.kernels import fused, grid, rows
+from sl_nerfstudio.field.numba_backend import evaluate_fused, pull_back_fused, pull_back_gradient_fused
+from sl_nerfstudio.field.numba_grid import adam, clear, scatter_level
 from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.field import FieldConfig, SDFField
 
@@ -23,12 +24,13 @@ for _ in range(2):
     value, gradient = field.sdf_and_gradient(p)
     (field.sdf(p).square().sum() + value.sum() + gradient.norm()).backward()
     optimizer.step()
-kernels = fused.evaluate, fused.pull_back, fused.pull_back_gradient, grid.scatter_level, rows.adam, rows.clear
+kernels = evaluate_fused, pull_back_fused, pull_back_gradient_fused, scatter_level, adam, clear
 print([sum(kernel.stats.cache_misses.values()) for kernel in kernels])
 print([sum(kernel.stats.cache_hits.values()) for kernel in kernels])
 """
 
 
+@pytest.mark.slow
 def test_a_step_finds_all_its_loops_compiled(tmp_path, monkeypatch):
     """In a folder of its own, so that nothing is compiled before."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))

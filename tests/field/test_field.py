@@ -1,21 +1,18 @@
-"""The field: both implementations against torch's own derivatives, and its behaviour as a distance."""
+"""The field: all implementations against torch's own derivatives, its behaviour as a distance, its cached grid."""
 
 import copy
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.field.backend import TableGradient
-from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
 from sl_nerfstudio.field.torch_backend import knee
 from tests.field.fields import make_field, plain_sdf, points_around, relative
 
 CASES = [("torch", torch.float64, 1e-12), ("torch", torch.float32, 1e-5), ("numba", torch.float32, 1e-5)]
 CASES += [("warp", torch.float32, 1e-5)]
-OPTIONS = [{}, {"smooth": True}, {"hidden_layers": 1, "hidden": 40}, {"hidden_layers": 3}]
 WEIGHTS = torch.tensor([1.0, 0.5, 0.0, 0.25])
 
 
@@ -23,9 +20,9 @@ def gradients(field: SDFField) -> list[Tensor]:
     return [torch.zeros_like(x) if x.grad is None else x.grad.clone() for x in field.parameters()]
 
 
-def reference(options: dict[str, Any], p: Tensor, g: Tensor, v: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
+def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list[Tensor], list[Tensor]]:
     """Values (f, df/dp) and parameter gradients of `g f + v . grad f`, by torch's double backward in float64."""
-    field = make_field("torch", torch.float64, **options)
+    field = make_field("torch", torch.float64, hidden=hidden)
     field.set_level_weights(WEIGHTS.double())
     p = p.clone().requires_grad_()
     f = plain_sdf(field, p)
@@ -36,37 +33,27 @@ def reference(options: dict[str, Any], p: Tensor, g: Tensor, v: Tensor | None) -
 
 
 @pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
-@pytest.mark.parametrize("options", OPTIONS)
-def test_values_and_all_first_derivatives(
-    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, Any]
+@pytest.mark.parametrize("hidden", [24, 40])
+@pytest.mark.parametrize("of_gradients", [False, True])
+def test_values_and_derivatives_are_those_of_double_backward(
+    backend: str, dtype: torch.dtype, tolerance: float, hidden: int, of_gradients: bool
 ) -> None:
+    """Of values by points and parameters, and of values and gradients by the parameters."""
     p, g = points_around(300), torch.randn(300).double()
-    (f_true, n_true), parameters_true = reference(options, p, g, None)
-    field = make_field(backend, dtype, **options)
+    v = torch.randn(300, 3).double() if of_gradients else None
+    (f_true, n_true), parameters_true = reference(p, g, v, hidden)
+    field = make_field(backend, dtype, hidden=hidden)
     field.set_level_weights(WEIGHTS.to(dtype))
     q = p.to(dtype).requires_grad_()
-    f = field.sdf(q)
-    (f * g.to(dtype)).sum().backward()
-    assert q.grad is not None
+    if v is None:
+        f = field.sdf(q)
+        (f * g.to(dtype)).sum().backward()
+        assert relative(q.grad, g[:, None] * n_true) < tolerance
+    else:
+        f, n = field.sdf_and_gradient(q)
+        ((f * g.to(dtype)).sum() + (n * v.to(dtype)).sum()).backward()
+        assert relative(n, n_true) < tolerance
     assert relative(f, f_true) < tolerance
-    assert relative(q.grad, g[:, None] * n_true) < tolerance
-    for got, wanted in zip(gradients(field), parameters_true, strict=True):
-        assert relative(got, wanted) < tolerance
-
-
-@pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
-@pytest.mark.parametrize("options", OPTIONS)
-def test_the_gradient_trains_all_parameters_as_double_backward_does(
-    backend: str, dtype: torch.dtype, tolerance: float, options: dict[str, Any]
-) -> None:
-    p, g, v = points_around(300), torch.randn(300).double(), torch.randn(300, 3).double()
-    (f_true, n_true), parameters_true = reference(options, p, g, v)
-    field = make_field(backend, dtype, **options)
-    field.set_level_weights(WEIGHTS.to(dtype))
-    f, n = field.sdf_and_gradient(p.to(dtype))
-    ((f * g.to(dtype)).sum() + (n * v.to(dtype)).sum()).backward()
-    assert relative(f, f_true) < tolerance
-    assert relative(n, n_true) < tolerance
     for got, wanted in zip(gradients(field), parameters_true, strict=True):
         assert relative(got, wanted) < tolerance
 
@@ -82,10 +69,10 @@ def test_activation_is_a_relu_outside_its_corner_and_twice_differentiable_in_it(
 
 def test_starts_as_a_sphere() -> None:
     torch.manual_seed(3)
-    field = SDFField(FieldConfig(sphere_radius=0.4))
+    field = SDFField(FieldConfig())
     p = torch.rand(5000, 3) * 2 - 1
     f, n = field.sdf_and_gradient(p)
-    error = (f - (p.norm(dim=-1) - 0.4)).detach()[p.norm(dim=-1) > 0.1]
+    error = (f - (p.norm(dim=-1) - 0.5)).detach()[p.norm(dim=-1) > 0.1]
     assert float(error.abs().max()) < 0.05
     assert float(error.std()) < 0.01
     direction = torch.nn.functional.cosine_similarity(n.detach(), p, dim=-1)
@@ -114,16 +101,6 @@ def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> No
     assert bool(f[17].isnan()) and bool(n[17].isnan().any())
     others = torch.arange(200) != 17
     torch.testing.assert_close(f[others].detach(), clean[others])
-
-
-@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
-def test_without_gradients_there_is_no_buffer_for_them(backend: str) -> None:
-    field, p = make_field(backend), points_around(50).float()
-    with torch.inference_mode():
-        f, n = field.sdf_and_gradient(p)
-    assert TableGradient.known(field.encoding.table) is None
-    got, normal = field.sdf_and_gradient(p)
-    assert torch.equal(f, got.detach()) and torch.equal(n, normal.detach())
 
 
 def test_infinite_points_do_not_crash_the_compiled_kernels() -> None:
@@ -171,20 +148,6 @@ def test_negligible_points_are_left_out_and_no_others() -> None:
     compiled.zero_grad()
     compiled.sdf(p).backward(g)
     assert all(bool(x.isnan().any()) for x in gradients(compiled))
-
-
-def test_a_switched_off_level_gets_no_gradient_and_has_no_effect() -> None:
-    field = make_field("numba")
-    field.set_level_weights(torch.tensor([1.0, 1.0, 0.0, 0.0]))
-    p = points_around(100).float()
-    field.sdf_and_gradient(p)[1].square().sum().backward()
-    layout, grad = field.encoding.layout, field.encoding.table.grad
-    assert grad is not None and float(grad[: layout.offsets[2]].abs().max()) > 0
-    assert float(grad[layout.offsets[2] :].abs().max()) == 0
-    before = field.sdf(p).detach()
-    with torch.no_grad():
-        field.encoding.table[layout.offsets[2] :].normal_()
-    assert torch.equal(field.sdf(p).detach(), before)
 
 
 def test_backward_accumulates_and_starts_from_zero_after_zero_grad() -> None:
@@ -263,22 +226,6 @@ def test_state_dict_and_copies_carry_the_whole_field() -> None:
     assert torch.equal(copy.deepcopy(field).sdf(p), field.sdf(p))
 
 
-def test_numba_is_rejected_by_name_and_replaced_by_auto_if_it_does_not_support_a_field() -> None:
-    p = points_around(10)
-    refusal = "needs 8 features per level, the field has 4; choose the backend auto or torch"
-    with pytest.raises(UserError, match=refusal):
-        make_field("numba", features=4).sdf(p.float())
-    with pytest.raises(UserError, match="computes in float32"):
-        make_field("numba", torch.float64).sdf(p)
-    assert make_field("auto", features=4).sdf(p.float()).shape == (10,)
-    assert make_field("auto", torch.float64).sdf(p).dtype == torch.float64
-
-
-def test_auto_uses_the_compiled_kernels_on_a_cpu() -> None:
-    p = points_around(10).float()
-    assert torch.equal(make_field("auto").sdf(p), make_field("numba").sdf(p))
-
-
 @pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
 def test_mixed_precision_does_not_affect_the_field(backend: str) -> None:
     field, p = make_field(backend), points_around(50).float()
@@ -288,3 +235,65 @@ def test_mixed_precision_does_not_affect_the_field(backend: str) -> None:
     torch.testing.assert_close(mixed, exact)
     gradient.square().sum().backward()
     assert field.encoding.table.grad is not None and field.encoding.table.grad.dtype == torch.float32
+
+
+def test_numba_is_rejected_by_name_and_replaced_by_auto_if_it_does_not_support_a_field() -> None:
+    p = points_around(10)
+    with pytest.raises(UserError, match=r"computes in float32.*choose the backend auto or torch"):
+        make_field("numba", torch.float64).sdf(p)
+    assert make_field("auto", torch.float64).sdf(p).dtype == torch.float64
+    assert torch.equal(make_field("auto").sdf(p.float()), make_field("numba").sdf(p.float()))
+
+
+class PlaneField(SDFField):
+    """An analytic field, linear in the point, that counts the points at which it is evaluated."""
+
+    def __init__(self, normal: tuple[float, float, float], offset: float) -> None:
+        nn.Module.__init__(self)
+        self.normal, self.offset, self.evaluated = torch.tensor(normal), offset, 0
+
+    def sdf(self, p: Tensor) -> Tensor:
+        self.evaluated += len(p)
+        return p @ self.normal - self.offset
+
+
+NORMAL = (0.48, 0.6, 0.64)
+
+
+def points(half: float = 1.0) -> Tensor:
+    return (torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1) * half
+
+
+def test_a_plane_is_reproduced_exactly_in_the_whole_box():
+    cache, field = CachedGrid(12), PlaneField(NORMAL, 0.1)
+    cache.refresh(field)
+    p = torch.cat([points(), torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])])
+    assert torch.allclose(cache.look_up(p), p @ field.normal - 0.1, atol=2e-6)  # each axis has its own slope
+    assert torch.allclose(
+        cache.look_up(3 * p), (3 * p).clamp(-1, 1) @ field.normal - 0.1, atol=2e-6
+    )  # as at the border
+    assert field.evaluated == 12**3 and cache.cell == 2 / 11
+
+
+def test_later_only_the_neighbourhood_of_the_surface_is_updated():
+    cache, before = CachedGrid(20), PlaneField((0.0, 0.0, 1.0), 0.0)
+    cache.refresh(before)
+    after = PlaneField((0.0, 0.0, 1.0), 0.05)
+    cache.refresh(after)
+    z = torch.linspace(-1, 1, 20)
+    near = z.abs() < 3 * cache.cell
+    assert torch.allclose(cache.values[near][:, 0, 0], z[near] - 0.05, atol=1e-6)
+    assert torch.allclose(cache.values[~near][:, 0, 0], z[~near], atol=1e-6)
+    assert after.evaluated == int(near.sum()) * 400
+
+
+def test_it_is_saved_in_a_checkpoint():
+    """A resumed run continues with the same values, and updates only those that an uninterrupted one would."""
+    cache, field = CachedGrid(20), PlaneField((0.0, 0.0, 1.0), 0.0)
+    cache.refresh(field)
+    resumed = CachedGrid(20)
+    resumed.load_state_dict(cache.state_dict())
+    assert torch.equal(resumed.values, cache.values)
+    for one in (cache, resumed):
+        one.refresh(PlaneField((0.0, 0.0, 1.0), 0.05))
+    assert torch.equal(resumed.values, cache.values)

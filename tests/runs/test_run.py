@@ -9,13 +9,14 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.runs.run import read_config
+
 with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
     warnings.simplefilter("ignore")
     from sl_nerfstudio.methods import sl_neus, sl_neus_paper
 
-from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.runs.run import read_config
 
 TEXT = yaml.dump(sl_neus.config)
 ATTACK = '!!python/object/apply:os.system ["touch {ran}"]'
@@ -61,7 +62,10 @@ FAULTS = {
     "a word": ("words", "is not a training configuration"),
     "plain mapping": ("a: 1\n", "is not a training configuration"),
     "no pipeline": (re.sub(r"\npipeline:.*?\n(?=\w)", "\n", TEXT, flags=re.S), "lacks the setting 'pipeline'"),
-    "a setting of another version": (TEXT + "colour: red\n", "has no setting 'colour'"),
+    "a setting of another version": (
+        TEXT + "colour: red\n",
+        "trained by an earlier version(.|\n)*has no setting 'colour'",
+    ),
     "text for a number": (TEXT.replace("seed: 42", "seed: many"), "'many' is no value for MachineConfig.seed"),
     "a list for settings": (re.sub(r"machine: .*?\n(?=\w)", "machine: []\n", TEXT, flags=re.S), "is no value for"),
     "unknown choice": (TEXT.replace("refine_poses: free", "refine_poses: all"), "'all' is no value"),
@@ -94,6 +98,26 @@ FAULTS = {
 def test_what_is_no_configuration(tmp_path, text, words):
     assert text != TEXT
     with pytest.raises(UserError, match=words):
+        read(tmp_path, text)
+
+
+EARLIER = """\
+!!python/object:sl_nerfstudio.model.trainer.SLTrainerConfig
+_target: !!python/name:sl_nerfstudio.model.training.loop.SLTrainer ''
+cuda_graph: true
+pipeline: !!python/object:sl_nerfstudio.model.pipeline.SLPipelineConfig
+  model: !!python/object:sl_nerfstudio.model.config.SLModelConfig
+    sdf: !!python/object:sl_nerfstudio.field.sdf_field.FieldConfig
+      features: 8
+"""
+
+
+@pytest.mark.parametrize("text", [EARLIER, re.sub("_target.*\n", "", EARLIER)])
+def test_a_run_of_an_earlier_version_is_said_to_be_one(tmp_path, text):
+    """With class paths and settings that are gone; it would take its sources to open it."""
+    with pytest.raises(
+        UserError, match=r"line \d+: this run was trained by an earlier version(.|\n)*remedy: train again"
+    ):
         read(tmp_path, text)
 
 
