@@ -25,7 +25,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.lines import pixels_a_period
 from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from sl_nerfstudio.parallel import cores, one_library_thread, only_one_library_thread
+from sl_nerfstudio.parallel import cores, memory_of_process, one_library_thread, only_one_library_thread
 from sl_nerfstudio.processing.cache import StageStore, stage_key
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -41,7 +41,6 @@ from sl_nerfstudio.relative_pose.estimation import (
 )
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import as_grey, read_photograph
-from sl_nerfstudio.storage import memory_of_process
 
 # One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation.
 

@@ -19,7 +19,6 @@ from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import scan_fingerprint, scan_root
 from sl_nerfstudio.errors import UserError, first_line, last_line
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.late_imports import compiler_on_demand, shapes_without_symbols
 from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.outputs import TrainedModel
@@ -261,7 +260,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
     Raises UserError for anything missing, broken or made by another method.
     """
-    with warnings.catch_warnings(), compiler_on_demand():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
         from sl_nerfstudio.dataparser.dataparser import load_scan
         from sl_nerfstudio.model.pipeline import SLPipeline, require_together
@@ -281,8 +280,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
-    with shapes_without_symbols():
-        pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
+    pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
     _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
     try:
         pipeline.load_pipeline(checkpoint.weights, checkpoint.step)
