@@ -1,4 +1,14 @@
-"""The file that sl-calibrate writes: plain JSON that sl-process reads, with the uncertainty of every number."""
+"""Intrinsics of camera and projector from corners of a board in several poses, with the uncertainty of every number.
+
+Which intrinsics are fitted is decided by left-out views, whose boards are placed by their corners in the camera; their
+corners in the projector are then predicted outright. Of all models the simplest is taken that is not worse than the
+best one with certainty (a paired t test over the views): terms that only overfit are left out.
+
+Uncertainty is the larger of two: by the noise of the corners, and by how much the views disagree (the jackknife; Efron
+and Tibshirani, "An Introduction to the Bootstrap", 11), because a bent board or a lens that is not quite what its model
+says makes errors that are common to all corners of a view. To it is added how far the numbers move with another model
+that predicts left-out views no worse.
+"""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,14 +47,7 @@ from sl_nerfstudio.calibration.board_adjustment import (
 from sl_nerfstudio.geometry.devices import DEVICE_FIELDS, PARAMETERS, Device, DeviceKind, Intrinsics, project, unproject
 from sl_nerfstudio.pattern.boards import Board, Chessboard
 
-# Which intrinsics to fit: what predicts views that were left out, and nothing that does not pay for itself.
-#
-# A left-out view keeps only its board's pose free, which its corners in the camera give. Its corners in the
-# projector are
-# then predicted outright. Of all models the simplest is taken that is not worse than the best one with certainty (a
-# paired t test over the views): terms that only overfit are left out. How far the result moves with the better one
-# is
-# part of the stated uncertainty.
+# The choice of the model.
 
 _TERMS = (0, 1, 2, 4)
 _RICH = FreeIntrinsics(False, 2)  # of the projector while the camera's model is chosen
@@ -151,14 +154,7 @@ def _simplest(scores: Sequence[ModelScore]) -> int:
     return min((k for k, one in enumerate(scores) if as_good(one)), key=lambda k: scores[k].model.columns().shape[1])
 
 
-# How uncertain the intrinsics are: by the noise of the corners, and by how much the views disagree.
-#
-# The noise alone says too little where a board is bent, or where a lens is not quite what its model says: such
-# errors are
-# common to all corners of a view. Leaving views out (the jackknife; Efron and Tibshirani, "An Introduction to the
-# Bootstrap", 11) shows them, and the larger of the two counts. To it is added how far the numbers move with another
-# lens
-# model that predicts left-out views no worse than the one chosen.
+# Uncertainty.
 
 
 @dataclass(frozen=True)
@@ -168,16 +164,16 @@ class DeviceSigma:
     values: dict[str, float]  # by the names in PARAMETERS
 
     def focal(self) -> float:
-        """Of the focal length, in pixels."""
+        """The sigma of the focal length, in pixels."""
         return max(self.values["fl_x"], self.values["fl_y"])
 
     def centre(self) -> float:
-        """Of the principal point, in pixels."""
+        """The sigma of the principal point, in pixels."""
         return max(self.values["cx"], self.values["cy"])
 
 
 def device_sigmas(adjusted: AdjustedBoard, left_out: LeftOut, models: Sequence[ModelScore]) -> tuple[DeviceSigma, ...]:
-    """Of each device."""
+    """The standard deviations of each device."""
     formal = formal_sigmas(adjusted.free, adjusted.information)
     out = []
     for k, one in enumerate(formal):
@@ -202,7 +198,7 @@ def _by_model(scores: Sequence[ModelScore]) -> Float64[ndarray, "8"]:
 
 
 def formal_sigmas(free: Free, information: Float64[ndarray, "s s"]) -> list[Float64[ndarray, "8"]]:
-    """Of PARAMETERS of each device, by the noise of the corners; `information` as in `Adjusted`."""
+    """Sigmas of PARAMETERS of each device by the noise of the corners; `information` as in `AdjustedBoard`."""
     found, out, place = covariance(information), [], 0
     for one in free:
         columns = one.columns()
@@ -315,13 +311,13 @@ def _added(adjusted: AdjustedBoard, T: ndarray, p_board: Float64[ndarray, "m 3"]
 
 
 def _relative_sigma(adjusted: AdjustedBoard, information: Float64[ndarray, "s s"]) -> tuple[float, float]:
-    """Of focal length and principal point together, the worse device; and of the focal length alone."""
+    """Sigma of focal length and principal point together, of the worse device; and of the focal length alone."""
     sigmas = formal_sigmas(adjusted.free, information)
     relative = [s[:4] / device.fl_x for s, device in zip(sigmas, adjusted.rig.devices, strict=True)]
     return max(float(np.linalg.norm(s)) for s in relative), max(float(s[:2].max()) for s in relative)
 
 
-# Intrinsics of camera and projector from the corners of a board in several poses.
+# The whole calibration, and its file.
 
 FEWEST_VIEWS = 3  # two determine focal length and principal point; a third can contradict them
 Size = tuple[int, int]
@@ -366,7 +362,7 @@ def calibrate(
     model: DeviceKind,
     track: Track,
 ) -> BoardCalibration:
-    """From at least three views. `pattern_size` None: the camera alone. `model` is the projector's."""
+    """Calibrate from at least three views. `pattern_size` None: the camera alone. `model` is the projector's."""
     assert len(views) >= FEWEST_VIEWS
     p_board = board_points(board.corners())
     if pattern_size is None:
@@ -394,11 +390,11 @@ def calibrate(
 
 
 MARK = b'"sl_calibration": 1'
-"""By which an earlier result of this command is known."""
+"""Text by which an earlier result of this command is known."""
 
 
 def encode_calibration(found: BoardCalibration, verdict: str, reasons: tuple[str, ...]) -> bytes:
-    """The text of the file."""
+    """Encode a calibration as the JSON that sl-process reads."""
     document: dict[str, Any] = {"sl_calibration": 1, "units": "mm", "verdict": verdict, "reasons": list(reasons)}
     for name, device, sigma in zip(("camera", "projector"), found.adjusted.rig.devices, found.sigmas, strict=False):
         document[name] = _device(device, sigma)

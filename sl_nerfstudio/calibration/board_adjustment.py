@@ -66,7 +66,7 @@ class FreeIntrinsics:
         return np.stack([*focal, unit[2], unit[3], *unit[4 : 4 + self.terms]], -1)
 
     def __str__(self) -> str:
-        """In words."""
+        """Name the free numbers."""
         lens = ("no lens distortion", "k1", "k1, k2", "", "k1, k2, p1, p2")[self.terms]
         return f"{'two focal lengths' if self.aspect else 'one focal length'}, {lens}"
 
@@ -196,7 +196,7 @@ def _by_parameters(device: Device, p: torch.Tensor) -> Float64[ndarray, "n 2 8"]
 
 
 Free = tuple[FreeIntrinsics, ...]
-"""Of the camera, and of the projector if there is one."""
+"""Free intrinsics of the camera, and of the projector if there is one."""
 Seen = tuple[CornerSightings, ...]
 Sigma = tuple[float, ...]
 

@@ -24,7 +24,6 @@ from sl_nerfstudio.scan.images import as_grey, read_photograph
 
 LEAST_IN_PATTERN = 8  # corners of a view that the pattern must reach
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
-
 LEAST_CORNERS = 8  # of a ChArUco board of which only a part is in view
 _FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 _SEARCHED = 1600  # longest side of the image in which a chessboard is searched; it is measured in the full one
@@ -156,7 +155,7 @@ def _pattern_and_plain(pose: BoardPhotographs) -> tuple[Float32[ndarray, "h w"],
 
 
 def _mean(paths: Sequence[Path]) -> Float32[ndarray, "h w"]:
-    """Of photographs, of which one at a time is in memory."""
+    """The mean of photographs, of which one at a time is in memory."""
     total = as_grey(read_photograph(paths[0]))
     for path in paths[1:]:
         total = total + as_grey(read_photograph(path))
@@ -252,7 +251,7 @@ def _refined(grey: UInt8[ndarray, "h w"], uv: Float64[ndarray, "n 2"], share: fl
 
 
 def _find_charuco(grey: UInt8[ndarray, "h w"], board: CharucoBoard) -> Corners | None:
-    """With the layout of either version of OpenCV: only one of them has the markers where they are."""
+    """Corners with the layout of either version of OpenCV: only one of them has the markers where they are."""
     found = [_charuco_corners(grey, board, legacy) for legacy in (False, True)]
     return max((corners for corners in found if corners is not None), key=lambda c: len(c.ids), default=None)
 
@@ -341,7 +340,7 @@ def _at_origin(xy: Float64[ndarray, "n 2"], uv: Float64[ndarray, "n 2"]) -> Floa
 def _homography(
     xy: Float64[ndarray, "n 2"], uv: Float64[ndarray, "n 2"], weight: Float64[ndarray, "n"]
 ) -> Float64[ndarray, "3 3"] | None:
-    """By least squares, with 1 in the last place: the origin, where it is looked up, is never at infinity."""
+    """Fit a homography, with 1 in the last place: the origin, where it is looked up, is never at infinity."""
     x, y = xy.T
     o, one = np.zeros_like(x), np.ones_like(x)
     rows = np.concatenate(

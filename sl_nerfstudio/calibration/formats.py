@@ -334,11 +334,9 @@ def _require_camera_matrix(path: Path, label: str, K: Float64[ndarray, "3 3"]) -
 
 # Plain JSON: `camera` and `projector` objects.
 #
-# The centre of the first pixel is (0.5, 0.5), or (0, 0) where the file says `"pixel_centre": 0`. The camera's keys
-# may be
-# at the top level, as in transforms.json. Several cameras are objects in `cameras`, by their names. `sigma`,
-# optional in
-# each device, holds 1 sigma of its `fl_x`, `cx` and `cy` in pixels.
+# The centre of the first pixel is (0.5, 0.5), or (0, 0) where the file says `"pixel_centre": 0`. The camera's keys may
+# be at the top level, as in transforms.json. Several cameras are objects in `cameras`, by their names. `sigma`,
+# optional in each device, holds 1 sigma of its `fl_x`, `cx` and `cy` in pixels.
 
 
 def read_json_entries(path: Path) -> list[DeviceEntry]:

@@ -1,4 +1,4 @@
-"""A start for the camera's intrinsics from what the camera wrote into its photographs (EXIF 2.32, JEITA CP-3451)."""
+"""What is stated of the intrinsics: their uncertainty in a file, and what the camera wrote into its photographs."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import exif_numbers
 
-# How uncertain the intrinsics in a file are, where the file says so: sl-calibrate's does.
+# Uncertainty in a file; sl-calibrate's has it.
 
 CERTAIN = (0.0, 0.0, 0.0)
 Shares = tuple[float, float, float]
@@ -77,6 +77,8 @@ def describe_change(
         )
     return lines
 
+
+# A start for the camera from EXIF data (EXIF 2.32, JEITA CP-3451).
 
 _FOCAL_MM, _FOCAL_35 = 0x920A, 0xA405  # FocalLength, FocalLengthIn35mmFilm
 _PLANE_X, _PLANE_UNIT, _STORED_W, _STORED_H = 0xA20E, 0xA210, 0xA002, 0xA003  # sensor pixels per unit, size as taken

@@ -57,9 +57,9 @@ def check(arguments: RedecodeArguments) -> None:
 
 def redecode_trained(trained: "TrainedRun", arguments: RedecodeArguments) -> str:
     """Decode the scan of a loaded run again; returns the summary to print."""
-    from sl_nerfstudio.redecoding.redecode import RedecodeSettings, redecode_run
+    from sl_nerfstudio.redecoding.redecode import redecode_run
 
-    found = redecode_run(trained, RedecodeSettings(arguments.output, arguments.resolution))
+    found = redecode_run(trained, arguments.output, arguments.resolution)
     return summary(arguments.output, trained.config.method_name, found)
 
 

@@ -51,7 +51,7 @@ def matching_costs(
     grid: DrawnGrid,
     sigma: float,
 ) -> UInt8[ndarray, "h w k"]:
-    """From 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
+    """Costs from 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
     mean, variance = statistics
     scale = 1 / np.sqrt(variance)
     picture, weights = np.ascontiguousarray(grid.layers[..., 0]), _half_window(sigma)
@@ -312,7 +312,7 @@ def _go_on(
     away: np.int16,
     out: ndarray,
 ) -> np.int16:
-    """From one pixel to the next, in 16 bits throughout; returns the least of `out`.
+    """Go from one pixel to the next, in 16 bits throughout; returns the least of `out`.
 
     The first inverse distance continues place `first` of the pixel before, the others the places after it.
     """

@@ -266,7 +266,7 @@ def _slopes(
 def _nearest(
     code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, coords: ndarray, out: ndarray
 ) -> None:
-    """From where the camera's ray passes the projector's, a few steps towards the least distance in pixels."""
+    """Take a few steps towards the least distance in pixels, from where the camera's ray passes the projector's."""
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             out[row, column] = np.nan

@@ -217,7 +217,7 @@ def _score(E, d_camera, d_projector, by_uv, limit, scores):
 
 @compiled
 def _in_front(R, t, d_camera, d_projector, front):
-    """By the signs of the depths along both rays where they are nearest to each other."""
+    """Compare the signs of the depths along both rays where they are nearest to each other."""
     for i in range(len(front)):
         a, b, c = d_camera[i, 0], d_camera[i, 1], d_camera[i, 2]
         u, v, w = d_projector[i, 0], d_projector[i, 1], d_projector[i, 2]

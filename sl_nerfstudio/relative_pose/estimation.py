@@ -427,7 +427,7 @@ def _error_px(predicted: Float64[ndarray, "n 3"], rays: RayPairs) -> Float64[nda
 
 @compiled
 def _gaps_px(predicted, decoded, by_uv, out):
-    """By least squares: the pixels whose change explains the gap between two rays best."""
+    """Length of the change of the pixel that explains the gap between two rays best, by least squares."""
     for n in range(len(out)):
         aa, ab, bb, a, b = 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(3):

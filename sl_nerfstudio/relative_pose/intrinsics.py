@@ -216,7 +216,7 @@ class IntrinsicsEvidence:
     camera: DeviceEvidence
 
     def allowing(self, doubt: Float64[ndarray, "3 3"]) -> "IntrinsicsEvidence":
-        """With stated values that are themselves uncertain; covariance of shares of the focal length."""
+        """The evidence where stated values are uncertain, by a covariance of shares of the focal length."""
         return IntrinsicsEvidence(
             *(replace(one, covariance=one.covariance + doubt) for one in (self.projector, self.camera))
         )

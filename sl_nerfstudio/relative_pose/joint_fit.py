@@ -85,7 +85,7 @@ class PointMatches:
 
     @staticmethod
     def of(frames: Sequence[FrameMatches], projector: Device, most: int, rng: np.random.Generator) -> "PointMatches":
-        """At most `most` correspondences of each frame, by chance."""
+        """Choose at most `most` correspondences of each frame, by chance."""
         parts = []
         for k, frame in enumerate(frames):
             d = directions(frame.camera, frame.uv_camera)
@@ -95,12 +95,13 @@ class PointMatches:
             uv = frame.uv_projector[usable]
             block = k * 1_000_000 + blocks_of(uv, projector)
             parts.append((frame.uv_camera[usable], d[usable], uv, np.full(len(usable), k), block))
-        return PointMatches(*(np.concatenate(part) for part in zip(*parts, strict=True)), len(frames))
+        uv_camera, d_camera, uv, number, block = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return PointMatches(uv_camera, d_camera, uv, number, block, len(frames))
 
     def chosen(self, keep: Bool[ndarray, "n"] | Int64[ndarray, "m"]) -> "PointMatches":
         """Some of the correspondences, of the same frames."""
-        parts = (self.uv_camera, self.d_camera, self.uv_projector, self.frame, self.block)
-        return PointMatches(*(part[keep] for part in parts), self.frames)
+        rays = self.uv_camera[keep], self.d_camera[keep], self.uv_projector[keep]
+        return PointMatches(*rays, self.frame[keep], self.block[keep], self.frames)
 
     def of_frame(self, k: int) -> slice:
         """Where a frame's correspondences are."""

@@ -388,7 +388,7 @@ def _left_out(
 
 
 def _gain(base: Float64[ndarray, "n"], other: Float64[ndarray, "n"], matches: PointMatches) -> tuple[float, float]:
-    """By how much the other model costs less, and the standard error; squares are independent."""
+    """How much less the other model costs, and the standard error; squares are independent."""
     _, block = np.unique(matches.block, return_inverse=True)
     sums = np.bincount(block, base - other)
     return float(sums.sum()), float(np.sqrt((sums**2).sum()))

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
-from sl_nerfstudio.calibration.formats import read_device_file, read_entries, reduce_distortion
+from sl_nerfstudio.calibration.formats import read_device_file, read_entries, read_file_storage, reduce_distortion
 from sl_nerfstudio.calibration.stated import CERTAIN, read_stated_sigma
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
@@ -17,6 +18,20 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 K = np.array([[900.0, 0, 322.3], [0, 905.0, 236.8], [0, 0, 1]])
 LENS = np.array([0.08, -0.12, 0.001, -0.0007])
 SIZE = (640, 480)
+
+
+CAMERA = {"w": 640, "h": 480, "fl_x": 900, "fl_y": 905, "cx": 322.3, "cy": 236.8}
+
+
+def xml(content):
+    return f'<?xml version="1.0"?>\n<opencv_storage>{content}</opencv_storage>'
+
+
+def camera(matrix="900. 0. 320. 0. 900. 240. 0. 0. 1.", width="640"):
+    return xml(
+        f"<image_width>{width}</image_width><image_height>480</image_height><camera_matrix>"
+        f"<rows>3</rows><cols>3</cols><dt>d</dt><data>{matrix}</data></camera_matrix>"
+    )
 
 
 def _storage(path, **values):
@@ -82,13 +97,12 @@ def test_colmap_counts_from_the_corner_of_the_first_pixel(tmp_path):
 
 def test_plain_json_says_where_the_first_pixel_is(tmp_path):
     path = tmp_path / "intrinsics.json"
-    camera = {"w": 640, "h": 480, "fl_x": 900, "fl_y": 905, "cx": 322.3, "cy": 236.8}
     lens = dict(zip(("k1", "k2", "p1", "p2"), LENS.tolist(), strict=True))
     for extra, shift in (({}, 0.0), ({"pixel_centre": 0.5}, 0.0), ({"pixel_centre": 0}, 0.5)):
-        path.write_text(json.dumps({"camera": {**camera, **lens}, "projector": {**camera, "model": "DOE"}, **extra}))
+        path.write_text(json.dumps({"camera": {**CAMERA, **lens}, "projector": {**CAMERA, "model": "DOE"}, **extra}))
         assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, shift) < 1e-9
         assert read_device_file(path, "projector", SIZE).model == "DOE"
-    path.write_text(json.dumps({"units": "mm", "camera_model": "OPENCV", **camera, "projector": camera}))
+    path.write_text(json.dumps({"units": "mm", "camera_model": "OPENCV", **CAMERA, "projector": CAMERA}))
     assert read_device_file(path, "camera", SIZE) == read_device_file(path, "projector", SIZE)
 
 
@@ -146,13 +160,7 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
     [
         ("a.json", '{"camera": {"w": 640}}', r"camera\.h: is missing|h: is missing"),
         ("a.json", '{"camera": 3}', "camera"),
-        (
-            "a.json",
-            json.dumps(
-                {"camera": {"w": 640, "h": 480, "fl_x": 900, "fl_y": 900, "cx": 1, "cy": 1, "sigma": {"cx": -1}}}
-            ),
-            r"camera\.sigma\.cx: is -1",
-        ),
+        ("a.json", json.dumps({"camera": {**CAMERA, "sigma": {"cx": -1}}}), r"camera\.sigma\.cx: is -1"),
         ("a.json", '{"frames": []}', "describes neither a camera nor a projector"),
         ("a.json", "{", "is not valid JSON"),
         ("a.txt", "1 OPENCV 640 480 900\n", "camera 1 has model OPENCV with 1 parameters"),
@@ -163,13 +171,33 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
         ("a.yml", "%YAML:1.0\n---\nfocus: 3\n", r"contains no camera matrix \(it has: focus\)"),
         ("a.xml", "<html></html>", "cannot be read as an OpenCV file"),
         ("a.toml", "x = 1", r"is of no known kind \(\.toml\)"),
-        (
-            "a.txt",
-            "1 PINHOLE 640 480 0.9 0.9 320 240\n",
-            "fl_x is 0.9 pixels, which is impossible for an image of 640 pixels",
-        ),
+        ("a.txt", "1 PINHOLE 640 480 0.9 0.9 320 240\n", "fl_x is 0.9 pixels, which is impossible"),
         ("a.txt", "1 PINHOLE 320 240 900 900 160 120\n", "was calibrated at 320 x 240, but the images are 640 x 480"),
         ("a.txt", "1 PINHOLE 640 480 9 9 3 2\n2 PINHOLE 640 480 9 9 3 2\n", "does not say which device is the camera"),
+        ("a.xml", xml("<a>" * 50_000), "nested too deeply"),
+        ("a.xml", xml("<a>" * 50_000 + "</a>" * 50_000), "nested too deeply"),
+        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]>' + xml("<a>&b;</a>"), "document type"),
+        ("a.xml", camera()[:-40], "no element found|mismatched|unclosed"),
+        ("a.xml", xml("<a>1</a><a>2</a>"), "more than once"),
+        ("a.xml", xml("<a>" + "1 " * 400_000 + "</a>"), "far more than a calibration"),
+        ("a.yml", "%YAML:1.0\n---\na: " + "[" * 100_000, "nested too deeply"),
+        ("a.yml", "%YAML:1.0\n---\na: &x [ *x ]", "an earlier part of itself"),
+        ("a.yml", "%YAML:1.0\n---\na: 1\na: 2", "more than once"),
+        ("a.yml", "%YAML:1.0\n---\n- 1", "no names with values"),
+        ("a.yml", "a: 1", "does not start with %YAML"),
+        ("a.xml", camera("1. 2. wide 4. 5. 6. 7. 8. 9."), "something that is not a number"),
+        ("a.xml", camera("1. 2. 3."), "a matrix of 3 x 3 has 3 numbers"),
+        ("a.xml", xml("<camera_matrix>none</camera_matrix>"), "is no 3 x 3 matrix of numbers"),
+        ("a.xml", camera("900. 9. 320. 0. 900. 240. 0. 0. 1."), "has a skew of 9"),
+        ("a.xml", camera("900. 0. 320. 0. 900. 240. 0. 0. 2."), "the last row 0, 0, 2"),
+        ("a.xml", camera("900. 0. 0. 0. 900. 0. 320. 240. 1."), "the last row 320, 240, 1"),
+        ("a.xml", camera(width="wide"), "the size of the image is not two whole numbers"),
+        ("a.xml", camera(width="640.5"), "the size of the image is not two whole numbers"),
+        (
+            "a.json",
+            '{"camera": {"w": 640, "h": 480, "fl_x": 900, "fl_y": 900, "cx": 320, "cy": 240, "k1": 50}}',
+            "multiply distances from the principal point by",
+        ),
     ],
 )
 def test_faults_name_file_cause_and_remedy(tmp_path, name, content, message):
@@ -182,8 +210,35 @@ def test_faults_name_file_cause_and_remedy(tmp_path, name, content, message):
 
 def test_a_file_without_the_wanted_device(tmp_path):
     path = tmp_path / "i.json"
-    path.write_text(json.dumps({"camera": {"w": 640, "h": 480, "fl_x": 900, "fl_y": 905, "cx": 322.3, "cy": 236.8}}))
+    path.write_text(json.dumps({"camera": CAMERA}))
     with pytest.raises(UserError, match="describes no projector, only camera") as caught:
         read_device_file(path, "projector", SIZE)
     assert "--projector-intrinsics" in str(caught.value)
     assert [entry.role for entry in read_entries(path)] == ["camera"]
+
+
+@pytest.mark.parametrize("suffix", ["xml", "yml", "yaml"])
+@settings(max_examples=20)
+@given(
+    matrix=arrays.arrays(np.float64, st.tuples(st.integers(1, 4), st.integers(1, 5)), elements=st.floats(-1e30, 1e30)),
+    number=st.floats(allow_nan=False, allow_infinity=False),
+    text=st.text("abc xyz", min_size=1),
+)
+def test_what_opencv_writes_is_read(tmp_path_factory, suffix, matrix, number, text):
+    path = tmp_path_factory.getbasetemp() / f"ä.{suffix}"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("matrix", matrix)
+    file.write("small", matrix.astype(np.float32))
+    file.write("number", number)
+    file.write("text", "t" + text)
+    file.release()
+    found = read_file_storage(path)
+    np.testing.assert_array_equal(found["matrix"], matrix)
+    np.testing.assert_allclose(found["small"], matrix.astype(np.float32), rtol=1e-6, atol=1e-37)
+    assert found["number"] == number and found["text"].split() == ("t" + text).split()
+
+
+def test_what_is_right_is_read(tmp_path):
+    path = tmp_path / "a.xml"
+    path.write_text(camera("900. 0.01 320. 0. 900. 240. 0. 0. 1."))  # a skew of a rounding
+    assert read_device_file(path, "camera", SIZE).cx == 320.5

@@ -103,6 +103,18 @@ def test_eliminated_blocks_give_the_steps_of_the_dense_equations(seed, damping):
     np.testing.assert_allclose(np.concatenate([shared, rest.ravel()]), dense.step(damping), rtol=1e-7, atol=1e-9)
     assert blocks.decrement() == pytest.approx(dense.decrement(), rel=1e-7)
     np.testing.assert_allclose(blocks.covariance(), dense.covariance()[:s, :s], rtol=1e-7, atol=1e-9)
+    shared = rng.normal(size=s)
+    follow = blocks.blocks_after(shared) - blocks.blocks_after(np.zeros(s))
+    np.testing.assert_allclose(follow, -blocks.slopes() @ shared, rtol=1e-6, atol=1e-9)
+    best = np.linalg.solve(dense.H[s:, s:], -(dense.g[s:] + dense.H[s:, :s] @ shared))
+    np.testing.assert_allclose(blocks.blocks_after(shared).ravel(), best, rtol=1e-6, atol=1e-9)
+
+
+def test_a_weak_unknown_of_a_block_stays_as_uncertain_as_it_is():
+    """One direction of the block is known a trillion times worse than the other, and the shared unknown hangs on it."""
+    H, coupling = np.diag([1e12, 1.0]), np.array([[[0.0, 1.0]]])
+    blocks = BlockEquations(np.array([[1.0001]]), np.zeros(1), H[None], np.zeros((1, 2)), coupling)
+    assert blocks.covariance()[0, 0] == pytest.approx(1e4, rel=1e-6)
 
 
 @given(st.floats(0, 50))
@@ -133,4 +145,28 @@ def test_a_robust_kernel_leaves_outliers_aside():
         lambda x, step: x + step,
         lambda x: 0.5 * width**2 * float(geman_mcclure_cost((residuals(x) / width) ** 2).sum()),
     )
+    np.testing.assert_allclose(found.state, truth, atol=0.03)
+
+
+def test_the_kernel_may_follow_the_noise_as_it_falls():
+    """Outliers of every size leave no trace although the kernel begins as wide as the largest."""
+    rng, truth, width = np.random.default_rng(4), np.array([2.0, 1.0, 0.5]), np.inf
+    data = curve(truth) + rng.normal(0, 0.01, len(T))
+    data[::5] += rng.uniform(0.2, 5, len(data[::5]))
+
+    def residuals(x):
+        return curve(x) - data
+
+    def narrow(x):
+        nonlocal width
+        width = min(width, 3 * float(np.median(np.abs(residuals(x)))))
+
+    found = minimise(
+        truth * 1.5,
+        lambda x: NormalEquations.of(derivatives(x), residuals(x), geman_mcclure_weight((residuals(x) / width) ** 2)),
+        lambda x, step: x + step,
+        lambda x: 0.5 * width**2 * float(geman_mcclure_cost((residuals(x) / width) ** 2).sum()),
+        narrow=narrow,
+    )
+    assert found.converged and width < 0.05
     np.testing.assert_allclose(found.state, truth, atol=0.03)

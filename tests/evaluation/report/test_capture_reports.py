@@ -32,8 +32,8 @@ def _result(frames, **changes):
 
 
 def test_everything_is_shown_and_escaped():
-    lost = FrameRecord("d", False, "decoding", "d.png: is <black>\n    cause:  dark\n    remedy: light")
-    frames = (FrameRecord("a<b", True, "", "", **GOOD), FrameRecord("c", True, "", "", **GOOD), lost)
+    lost = FrameRecord("d", False, stage="decoding", reason="d.png: is <black>\n    cause:  dark\n    remedy: light")
+    frames = (FrameRecord("a<b", **GOOD), FrameRecord("c", **GOOD), lost)
     image = np.zeros((30, 40), dtype=np.uint8)
     coords = np.full((30, 40, 2), 100, dtype=np.float32)
     previews = [make_preview(image, coords, (800, 800)), Preview(None, None), make_preview(image, None, (800, 800))]
@@ -53,7 +53,7 @@ def test_everything_is_shown_and_escaped():
 @pytest.mark.parametrize("band", ["good", "acceptable", "poor"])
 def test_the_verdict_and_its_reasons_come_first(band):
     reasons = () if band == "good" else ("c: contradicts <the others>", "d: undecided")
-    frames = tuple(FrameRecord(name, True, "", "", **GOOD, undecided=name == "d") for name in "cd")
+    frames = tuple(FrameRecord(name, **GOOD, undecided=name == "d") for name in "cd")
     page = render_processing_report(_result(frames, verdict=Verdict(band, reasons)), [Preview(None, None)] * 2)
     assert f'<div class="verdict {band}"><strong>{band.capitalize()}</strong>' in page
     linked = (
@@ -66,7 +66,10 @@ def test_the_verdict_and_its_reasons_come_first(band):
 
 
 def test_a_report_without_any_good_frame_can_be_made():
-    frames = (FrameRecord("a", False, "reading", "x"), FrameRecord("b", False, "decoding", "y"))
+    frames = (
+        FrameRecord("a", False, stage="reading", reason="x"),
+        FrameRecord("b", False, stage="decoding", reason="y"),
+    )
     page = render_processing_report(
         _result(frames, edges=(), joint_px=None, cross_px=None, scale_source="", units="arbitrary"),
         [Preview(None, None)] * 2,
@@ -105,8 +108,7 @@ def _scene_page(**changes):
     """Frames a to e: a, b, c are the scan, b undecided and not connected with c; d and e are a group."""
     names = "abcde"
     frames = tuple(
-        FrameRecord(n, n in "abc", "", "", **{**GOOD, "component": 0 if n in "abc" else 1}, undecided=n == "b")
-        for n in names
+        FrameRecord(n, n in "abc", **{**GOOD, "component": 0 if n in "abc" else 1}, undecided=n == "b") for n in names
     )
     groups = (
         PlacedGroup(0, (_placed("a", 0.0), _placed("b", 0.5), _placed("c", 1.5))),
@@ -114,7 +116,9 @@ def _scene_page(**changes):
         PlacedGroup(-1, (_placed("f", 0.0, points=0),)),
     )
     edges = (EdgeRecord(("a", "b"), 0.5, 0.9, True, False),)
-    return _result((*frames, FrameRecord("f", False, "registering", "r")), edges=edges, placed=groups, **changes)
+    return _result(
+        (*frames, FrameRecord("f", False, stage="registering", reason="r")), edges=edges, placed=groups, **changes
+    )
 
 
 def test_the_view_shows_every_group_with_devices_where_they_are():
