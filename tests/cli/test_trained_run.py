@@ -75,7 +75,7 @@ def test_surface_poses_and_record_of_a_run(config, scan_root, tmp_path, capsys):
     np.testing.assert_allclose(found.T_world_camera[:, :3, 3], scan.poses.T_world_camera[:, :3, 3], atol=0.5)  # cm
     record = json.loads((refined / "training.json").read_text())
     assert record["settings"]["method_name"] == "sl-neus" and record["settings"]["step"] == 39
-    assert record["settings"]["model"]["sdf"]["hidden"] == 32
+    assert record["settings"]["model"]["sdf"]["max_resolution"] == 64
     curves = record["curves"]
     assert curves["step"] == list(range(0, 40, 5)) and curves["loss"][-1] < 0.3 * curves["loss"][0]
     assert record["versions"]["torch"] == torch.__version__
