@@ -156,7 +156,8 @@ def test_other_dataparsers(
     pipeline = copy.deepcopy(sl_neus.config.pipeline)
     pipeline.datamanager.dataparser = NerfstudioDataParserConfig()
     message = refused(tmp_path, monkeypatch, capfd, scan, pipeline=pipeline)
-    assert message.startswith("error: NerfstudioDataParserConfig does not describe a projector")
+    assert message.startswith("error: sl-neus trains on scan folders only") and len(message.splitlines()) == 1
+    assert "NerfstudioDataParser has no projector. Leave the dataparser out." in message
 
 
 @pytest.mark.slow

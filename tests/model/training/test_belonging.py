@@ -23,7 +23,7 @@ from sl_nerfstudio.dataparser.dataparser import scan_fingerprint
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.runs.run import load_run
 from sl_nerfstudio.scan import read_scan
-from tests.model.training.small_runs import folder_of, go_on, last_state, send, settings, status, train
+from tests.model.training.small_runs import folder_of, last_state, send, settings, status, train
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -100,10 +100,8 @@ def test_settings_that_were_edited_are_refused(copy):
 
 
 def test_settings_without_effect_may_be_edited(copy):
-    config = edited(copy, lambda config: setattr(config.pipeline.model, "eval_num_rays_per_chunk", 512))
+    edited(copy, lambda config: setattr(config.pipeline.model, "eval_num_rays_per_chunk", 512))
     assert load_run(copy).step == 11
-    go_on(config)  # the run is finished: it is taken, and there is nothing left to train
-    assert last_state(copy)["step"] == 11
 
 
 @pytest.fixture(scope="module")

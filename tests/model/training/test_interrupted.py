@@ -6,11 +6,11 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -131,11 +131,11 @@ def test_checkpoints_are_written_when_time_and_steps_have_passed(scan_root, tmp_
 
 
 def test_a_signal_ends_a_training_that_is_paused_in_the_viewer(scan_root, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(SLModel, "anneal", lambda *_: pytest.fail("trained while paused"))
-    timer = threading.Timer(1.0, send, [signal.SIGTERM])
-    timer.start()
+    """It comes while nerfstudio waits for the button; not one step was trained."""
+    waits = SimpleNamespace(**{**vars(time), "sleep": sending(signal.SIGTERM, time.sleep)})
+    monkeypatch.setattr("nerfstudio.engine.trainer.time", waits)
+    monkeypatch.setattr(SLModel, "anneal", lambda self, step: pytest.fail(f"step {step} was trained"))
     assert status(train, settings(scan_root, tmp_path, start_paused=True)) == 143
-    timer.join()
     folder = folder_of(tmp_path)
     assert capfd.readouterr().err.splitlines()[-1] == f"to go on: ns-train sl-neus --load-config {folder}/config.yml"
     assert last_state(folder)["step"] == -1
@@ -239,5 +239,4 @@ def test_the_installed_command_itself(scan_root, tmp_path):
     out, err = process.communicate(timeout=120)
     assert process.returncode == 143 and "Traceback" not in out + err
     assert err.splitlines()[-1] == f"to go on: ns-train sl-neus --load-config {folder}/config.yml"
-    state = last_state(folder)
-    assert state["step"] >= -1 and state["pipeline"]["_model.device_poses.sigma"].isfinite().all()
+    assert last_state(folder)["pipeline"]["_model.device_poses.sigma"].isfinite().all()  # NaN before the adjustment
