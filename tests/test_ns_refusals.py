@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from tests.dataparser.tiny_scan import TinyScan
 
 with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
     warnings.simplefilter("ignore")
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
     from nerfstudio.scripts import train as ns_train
 
 from sl_nerfstudio.methods import sl_neus
@@ -135,6 +137,27 @@ def test_bad_settings_do_not_start(
     expected: str,
 ) -> None:
     assert expected in refused(tmp_path, monkeypatch, capfd, scan, **settings)
+
+
+def test_a_truncated_checkpoint(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "step-000000005.ckpt"
+    torch.save({"schedulers": {}, "weights": torch.zeros(1000)}, checkpoint)
+    truncate(checkpoint)
+    message = refused(tmp_path, monkeypatch, capfd, scan, load_dir=tmp_path)
+    assert message.startswith("error: ") and message.count("error: ") == 1
+    assert "step-000000005.ckpt: cannot be read as a checkpoint" in message
+
+
+def test_other_dataparsers(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pipeline = copy.deepcopy(sl_neus.config.pipeline)
+    pipeline.datamanager.dataparser = NerfstudioDataParserConfig()
+    message = refused(tmp_path, monkeypatch, capfd, scan, pipeline=pipeline)
+    assert message.startswith("error: sl-neus trains on scan folders only") and len(message.splitlines()) == 1
+    assert "NerfstudioDataParser has no projector. Leave the dataparser out." in message
 
 
 @pytest.mark.slow

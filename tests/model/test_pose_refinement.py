@@ -231,6 +231,12 @@ def test_correct_intrinsics_do_not_change_at_all(scan):
     assert text.startswith("Intrinsics NOT changed: the captures agree with them (chi square ")
 
 
+def test_refinement_starts_from_a_stated_change(scan, corrected):
+    """Intrinsics that were refined once are not contradicted again, and do not change."""
+    found = refine_intrinsics(stated_with(scan, CORRECTABLE), corrected.change, "free", PriorConfig(), QUICK)
+    assert found.change == corrected.change and not found.changed
+
+
 def settings_for(scan: Scan, **model: object) -> SLTrainerConfig:
     config = copy.deepcopy(sl_neus.config)
     assert isinstance(config, SLTrainerConfig)

@@ -59,6 +59,15 @@ def test_poses_without_an_estimated_uncertainty_state_none(scan: Scan, tmp_path)
     assert read_pose_sigmas(tmp_path / "transforms.json", scan) == [None] * 6
 
 
+@pytest.mark.slow
+def test_the_area_of_the_trimmed_surface_does_not_depend_on_the_resolution(scan: Scan, tmp_path):
+    areas = [
+        export_run(run_of(scan), ExportSettings(tmp_path / f"{n}.ply", resolution=n)).mesh.face_areas().sum()
+        for n in (64, 96)
+    ]
+    assert areas[0] == pytest.approx(areas[1], rel=0.03)
+
+
 def test_a_frame_that_cannot_be_placed_is_marked_and_states_no_uncertainty(scan: Scan, tmp_path):
     run = run_of(scan, np.ones((6, 4)))
     run.model.last_unplaced = True

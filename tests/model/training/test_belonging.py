@@ -23,7 +23,7 @@ from sl_nerfstudio.dataparser.dataparser import scan_fingerprint
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.runs.run import load_run
 from sl_nerfstudio.scan import read_scan
-from tests.model.training.small_runs import folder_of, send, settings, status, train
+from tests.model.training.small_runs import folder_of, last_state, send, settings, status, train
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -76,6 +76,14 @@ def test_a_changed_scan_is_refused_by_export_and_resume(scan_root, copy, tmp_pat
     assert "sphere: does not belong to" in capfd.readouterr().err and not (tmp_path / "new").exists()
 
 
+def test_a_scan_that_was_only_moved_is_taken(scan_root, copy, tmp_path):
+    moved = Path(shutil.copytree(scan_root, tmp_path / "elsewhere"))
+    assert load_run(copy, moved).step == 11
+    resumed = settings(moved, tmp_path / "new", steps=1, load_dir=copy / "nerfstudio_models")
+    train(resumed)
+    assert last_state(tmp_path / "new" / "elsewhere" / "sl-neus" / "first")["step"] == 12
+
+
 def edited(copy: Path, change: Callable[[object], None]) -> Path:
     config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
     change(config)
@@ -89,6 +97,11 @@ def test_settings_that_were_edited_are_refused(copy):
         load_run(copy)
     with pytest.raises(UserError, match=r"its settings are not those that the run was started with"):
         check_run_folder(copy)
+
+
+def test_settings_without_effect_may_be_edited(copy):
+    edited(copy, lambda config: setattr(config.pipeline.model, "eval_num_rays_per_chunk", 512))
+    assert load_run(copy).step == 11
 
 
 @pytest.fixture(scope="module")

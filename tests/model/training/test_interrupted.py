@@ -4,10 +4,13 @@ import copy
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +21,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel
-from sl_nerfstudio.model.run_files import Interruption, checkpoints_in
+from sl_nerfstudio.model.run_files import Interrupted, Interruption, checkpoints_in
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.runs.run import load_run
 from tests.model.training.small_runs import (
@@ -127,6 +130,17 @@ def test_checkpoints_are_written_when_time_and_steps_have_passed(scan_root, tmp_
     assert saved == [-1, 11]
 
 
+def test_a_signal_ends_a_training_that_is_paused_in_the_viewer(scan_root, tmp_path, monkeypatch, capfd):
+    """It comes while nerfstudio waits for the button; not one step was trained."""
+    waits = SimpleNamespace(**{**vars(time), "sleep": sending(signal.SIGTERM, time.sleep)})
+    monkeypatch.setattr("nerfstudio.engine.trainer.time", waits)
+    monkeypatch.setattr(SLModel, "anneal", lambda self, step: pytest.fail(f"step {step} was trained"))
+    assert status(train, settings(scan_root, tmp_path, start_paused=True)) == 143
+    folder = folder_of(tmp_path)
+    assert capfd.readouterr().err.splitlines()[-1] == f"to go on: ns-train sl-neus --load-config {folder}/config.yml"
+    assert last_state(folder)["step"] == -1
+
+
 def test_control_c_in_the_viewer_of_a_finished_training_is_its_normal_end(scan_root, tmp_path, monkeypatch):
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: send(signal.SIGINT))
     train(settings(scan_root, tmp_path, steps=1))
@@ -145,6 +159,37 @@ def test_a_second_signal_ends_the_process_at_once(first, second):
 
     _, result = os.waitpid(child(work), 0)
     assert os.waitstatus_to_exitcode(result) == SIGNALS[second]
+
+
+def test_an_ignored_signal_stays_ignored():
+    """As for a job that a script starts in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interruption = Interruption()
+    interruption.install()
+    try:
+        send(signal.SIGINT)
+        with pytest.raises(Interrupted):
+            send(signal.SIGTERM)
+    finally:
+        interruption.remove()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_two_trainings_are_equal_whatever_else_the_machine_does(scan_root, tmp_path):
+    """Bit for bit, with several threads and other processes that take the processor away."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    busy: list[int] = []
+    try:
+        train(settings(scan_root, tmp_path, "alone", steps=6))
+        busy = [child(lambda: [sum(range(1000)) for _ in iter(int, 1)]) for _ in range(os.cpu_count() or 1)]
+        train(settings(scan_root, tmp_path, "beside others", steps=6))
+    finally:
+        torch.set_num_threads(before)
+        for pid in busy:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+    require_equal(last_state(folder_of(tmp_path, "beside others")), last_state(folder_of(tmp_path, "alone")))
 
 
 def test_a_killed_training_goes_on_or_starts_again(scan_root, finished, tmp_path):
@@ -178,3 +223,20 @@ def _killed(pid: int, seconds: float) -> bool:
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
     return True
+
+
+def test_the_installed_command_itself(scan_root, tmp_path):
+    """A real process, stopped as a scheduler would stop it."""
+    flags = ["--data", scan_root, "--output-dir", "out", "--timestamp", "first", "--max-num-iterations", 100000]
+    process = subprocess.Popen(
+        [Path(sys.executable).with_name("ns-train"), "sl-neus", *map(str, flags)],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    folder = folder_of(tmp_path / "out")
+    while not checkpoints_in(folder / "nerfstudio_models") and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 143 and "Traceback" not in out + err
+    assert err.splitlines()[-1] == f"to go on: ns-train sl-neus --load-config {folder}/config.yml"
+    assert last_state(folder)["pipeline"]["_model.device_poses.sigma"].isfinite().all()  # NaN before the adjustment
