@@ -139,6 +139,13 @@ def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, t
     }  # fmt: skip
 
 
+def test_an_image_that_breaks_after_it_was_found_is_a_failure_of_its_frame(copy, tmp_path):
+    frame = _found(copy).frames[0]
+    frame.images[1].write_bytes(b"")
+    result = FrameWorker(copy.job(tmp_path / "w"))(frame)
+    assert result.stage == "reading" and "1.png: is empty" in result.reason and result.cloud is None
+
+
 def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
     worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
     result = worker(_found(ramp_scan).frames[1])

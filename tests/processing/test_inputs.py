@@ -15,9 +15,11 @@ from sl_nerfstudio.processing.inputs import (
     align_to,
     read_cameras,
     read_given_poses,
+    read_inputs,
     refine_camera,
     require_intrinsics,
 )
+from tests.processing.ramp_scan import NAMES
 
 AT_PLACE, TURNED = np.eye(4).tolist(), np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
 
@@ -118,3 +120,12 @@ def test_a_file_with_the_projector_alone_needs_photographs_that_state_the_focal_
 def test_what_only_the_adjustment_can_do_cannot_be_asked_for_without_it(ramp_scan, tmp_path, more):
     with pytest.raises(UserError, match=r"--no-adjust and --(rig|estimate-projector)"):
         ramp_scan.config(tmp_path / "s", no_adjust=True, **more).check()
+
+
+def test_inputs_are_read_before_anything_is_written(ramps_registered, ramp_scan, tmp_path):
+    inputs = read_inputs(ramp_scan.config(tmp_path / "s", known_length="baseline of frame 3 = 1 m"))
+    assert [frame.name for frame in inputs.captures.frames] == list(NAMES)
+    assert inputs.known.frames == (NAMES[3],) and inputs.given is None
+    assert inputs.job.decoder.name == "ramps" and inputs.job.work == tmp_path / "s.work"
+    assert (inputs.job.camera, inputs.job.projector) == (ramp_scan.camera, ramp_scan.projector)
+    assert list(tmp_path.iterdir()) == []

@@ -137,6 +137,20 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
 
 
+@pytest.mark.slow
+def test_a_frame_that_registration_left_out_is_placed_after_the_adjustment(lose, ramp_scan, tmp_path):
+    lose(NAMES[3], back=True)
+    result, log = _run(ramp_scan.config(tmp_path / "s"))
+    assert "registered 3 of 4 frames" in log
+    assert f"placed against the adjusted frames: {NAMES[3]}; adjusting again with them" in log
+    assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES)
+    assert all(frame.in_scan for frame in result.frames) and result.recapture == ()
+    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
+    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
+    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
+    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 2e-3 * distance
+
+
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
     lose(*NAMES[1:])
     config = ramp_scan.config(tmp_path / "s")
@@ -165,6 +179,18 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     assert (f"\n  {NAMES[2]}: registered\n" in said) == (usable == 1)
     assert NAMES[3] not in said
     assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
+
+
+def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tmp_path):
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    (tmp_path / "c" / "images" / NAMES[0] / "0.png").write_bytes(b"broken")
+    rough = _poses(tmp_path / "r.json", {name: ramp_scan.T_world_camera[k] for k, name in enumerate(NAMES[:2])})
+    copy = replace(ramp_scan, root=tmp_path / "c")
+    with pytest.raises(UserError, match="1 of the 2 frames with given poses could be registered") as caught:
+        _run(copy.config(tmp_path / "s", poses=rough))
+    said = str(caught.value)
+    assert f"{NAMES[0]}: left out in reading: " in said and "0.png: is not an image that can be read" in said
+    assert f"{NAMES[1]}: registered" in said
 
 
 def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):

@@ -12,6 +12,7 @@ from sl_nerfstudio.scan.check_conventions import (
     Correspondences,
     apply_interpretation,
     convention_problems,
+    fit_geometry,
     other_interpretations,
     sample_pixels,
 )
@@ -101,6 +102,20 @@ def test_interpretations_undo_what_users_do():
         assert np.allclose(back.T_world_camera, frame.T_world_camera, atol=1e-9)
         assert np.allclose(back.T_world_projector, frame.T_world_projector, atol=1e-9)
         assert np.allclose(back.uv_projector, frame.uv_projector)
+
+
+def test_spread_is_the_distance_between_the_frames_surfaces():
+    frames = frames_of(poses())
+    fit = fit_geometry(frames, PROJECTOR)
+    assert fit.typical_px < 0.5
+    assert np.median(np.linalg.norm(fit.clouds[0], axis=1)) == pytest.approx(40, abs=0.5)
+    apart = []
+    for index, frame in enumerate(frames):
+        away = np.eye(4)
+        away[0, 3] = 1e4 * index
+        poses_away = {name: away @ getattr(frame, name) for name in ("T_world_camera", "T_world_projector")}
+        apart.append(replace(frame, **poses_away))
+    assert np.allclose(fit_geometry(apart, PROJECTOR).spread * fit.depth, 1e4, rtol=0.02)
 
 
 @pytest.mark.parametrize("scene", [poses, rigid_rig])

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from sphere_scan import edit
 from test_check_conventions import disturbed, undo
 
+from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.check import check_folder
 from sl_nerfstudio.scan.check_conventions import Interpretation, convention_problems
 
@@ -74,3 +76,21 @@ def test_faults_planted_in_real_captures(tmp_path):
         ("transforms.json", "frame_00005", "transform_matrix"),
         ("transforms.json", "frame_00007", "file_path"),
     }
+
+
+@pytest.mark.slow
+def test_the_memory_of_the_check_does_not_grow_with_the_number_of_frames(tmp_path):
+    scan = read_scan(folder("elephant"))
+    one_frame = scan.frames[0].camera.h * scan.frames[0].camera.w * (8 + 3)  # bytes: coordinates and image
+    peaks = []
+    for count in (3, 12):
+        root = Path(shutil.copytree(scan.root, tmp_path / str(count)))
+        edit(root, lambda document, count=count: document.update(frames=document["frames"][:count]))
+        tracemalloc.start()
+        try:
+            assert check_folder(root).faults == ()
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    assert peaks[1] < peaks[0] + one_frame / 2
+    assert peaks[1] < 12 * one_frame

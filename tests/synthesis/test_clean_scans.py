@@ -103,6 +103,23 @@ def test_the_mesh_is_the_cone_and_the_cylinder_to_a_thousandth_of_a_pixel(fine_s
         assert np.median(error) < 1e-4
 
 
+def test_the_captured_image_shows_the_pattern_where_the_coordinates_say(fine_scan):
+    """Warping the pattern through the coordinates gives the captured image up to shading; the rest is dark."""
+    pattern = cv2.imread(str(fine_scan / "pattern.png"), cv2.IMREAD_UNCHANGED) / 255
+    pattern = cv2.GaussianBlur(pattern, (0, 0), 2.2)  # about the footprint of a camera pixel
+    for frame, (*_, coords, mask) in enumerate(_frames(fine_scan)):
+        image, shown = (
+            cv2.imread(str(fine_scan / f"{kind}/frame_{frame:05d}.png"), cv2.IMREAD_UNCHANGED) / 255
+            for kind in ("images", "patterns")
+        )
+        at = np.where(mask[..., None], coords, 0).astype(np.float32)
+        warped = cv2.remap(pattern, at[..., 0] - 0.5, at[..., 1] - 0.5, cv2.INTER_LINEAR)
+        inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3))) > 0
+        assert np.corrcoef(warped[inner], shown[inner])[0, 1] > 0.8
+        outer = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5))) == 0
+        assert image[outer].max() < 0.15 < 0.3 < image[inner].max()
+
+
 def test_coordinates_exist_exactly_on_the_mask_and_poses_are_the_true_ones(scan):
     for *_, coords, mask in _frames(scan):
         assert np.array_equal(np.isfinite(coords).all(-1), mask)

@@ -15,6 +15,7 @@ from sl_nerfstudio.synthesis.devices import (
     disturb_image,
     disturb_poses,
     disturb_relative,
+    look_at,
     make_devices,
     make_paths,
     pose_sigma,
@@ -93,6 +94,20 @@ def test_a_static_projector_stands_still_and_the_camera_does_not(seed):
     baseline = np.linalg.norm(_relative(poses)[:, :3, 3], axis=1)
     assert baseline.min() > 60 and baseline.max() < 300
     assert np.linalg.norm(np.diff(poses.T_world_camera[:, :3, 3], axis=0), axis=1).min() > 5
+
+
+def test_cameras_roll():
+    T = _paths("hand-held", 0).T_world_camera
+    roll = np.degrees(np.arcsin(T[:, 2, 0]))  # height of the camera's right-hand side
+    assert np.ptp(roll) > 10 and np.abs(roll).max() < 30
+
+
+def test_look_at_from_above_and_with_a_roll():
+    T = look_at(np.array([[0.0, 0, 9]]), np.zeros(3), np.zeros(1))[0]
+    np.testing.assert_allclose(T[:3, 2], (0, 0, 1))
+    assert np.isfinite(T).all() and np.linalg.det(T[:3, :3]) == pytest.approx(1)
+    T = look_at(np.array([5.0, 0, 0]), np.zeros(3), np.array(np.pi / 2))
+    np.testing.assert_allclose(T[:3, 0], (0, 0, 1), atol=1e-12)  # its right-hand side is up
 
 
 def test_neighbouring_frames_move_smoothly():
@@ -238,6 +253,26 @@ def test_sigma_is_the_error_along_each_axis(scene, truth):
     assert sigma.camera_rotation_deg == pytest.approx(0.7, rel=0.05)
     assert sigma.relative_translation == pytest.approx(0.5, rel=0.05)
     assert sigma.relative_rotation_deg == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_baseline_too_long_moves_both_devices_away_from_the_object(scene, truth, rig):
+    start = _start(truth, scene, rig, PoseNoise(0.0, 0.0, 0.0, 0.0, 0.02))
+    longer = np.linalg.norm(_relative(start)[:, :3, 3], axis=1) / np.linalg.norm(_relative(truth)[:, :3, 3], axis=1)
+    assert np.ptp(longer) > 0.03
+    for before, after in (
+        (truth.T_world_camera, start.T_world_camera),
+        (truth.T_world_projector, start.T_world_projector),
+    ):
+        distances = [np.linalg.norm(T[:, :3, 3] - scene.centre, axis=1) for T in (before, after)]
+        np.testing.assert_allclose(distances[1] / distances[0], longer, atol=1e-3)
+    turned = truth.T_world_camera[:, :3, :3].transpose(0, 2, 1) @ start.T_world_camera[:, :3, :3]
+    assert _angles(turned).max() < 0.02
+
+
+def test_sigma_has_no_zeros_where_only_registration_errs(scene, truth, rig):
+    sigma = pose_sigma(truth, _start(truth, scene, rig, PoseNoise(1.0, 3.0, 0.0, 0.0, 0.0)), scene.centre)
+    assert 0 < sigma.relative_translation < 1e-3 and 0 < sigma.relative_rotation_deg < 1e-3
+    assert sigma.camera_translation == pytest.approx(3.0 / np.sqrt(3), rel=1e-6)
 
 
 _CELLS = NoisyCells(period=20.0, x0=10.0, y0=10.0, rows=40, columns=40, w=800, h=800)
